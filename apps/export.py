@@ -23,7 +23,7 @@ from capture.input_error import InputError
 from preprocess.body.body_pose import BodyPose
 
 if TYPE_CHECKING:  # torch is loaded after --help has been answered
-    from avatar.deformation.rig import Rig
+    from avatar.rig import Rig
 
 CHECK_VIEWS = 4
 """Synthetic views that validate a package without frames."""

@@ -1,7 +1,7 @@
 """Chooses the backend of a device: the fastest one that passes a self-test on this machine.
 
-The CPU has compiled kernels for every operation (`avatar.numba_kernels.numba_backend`); a GPU runs
-the reference in plain torch. The self-test compares a backend with the reference on small inputs.
+The CPU has compiled kernels for every operation (`avatar.kernels.numba_backend`); a GPU runs the
+reference in plain torch. The self-test compares a backend with the reference on small inputs.
 """
 
 import functools
@@ -9,12 +9,13 @@ import math
 import os
 import threading
 import warnings
+from typing import final
 
 import numpy as np
 import torch
 from jaxtyping import Float32
 
-from avatar.deformation.rig import Rig
+from avatar.kernels import torch_correspondence, torch_reference
 from avatar.kernels.backend_protocol import (
     FEATURES_PER_LEVEL,
     Backend,
@@ -26,11 +27,61 @@ from avatar.kernels.backend_protocol import (
     RaySamples,
     SolvedCorrespondences,
 )
-from avatar.kernels.torch_backend import TorchBackend
-from avatar.kernels.torch_skinning import skin_points
+from avatar.rig import Rig
 from capture.input_error import InputError
 
 _SELF_TEST_LOCK = threading.Lock()
+
+
+@final
+class TorchBackend:
+    """The reference itself, on any device torch knows; `Backend` states shapes and meanings.
+
+    Gradients are those of sums: handed slopes, autograd would load a package of symbolic algebra.
+    """
+
+    name = "torch"
+    solve_correspondences = staticmethod(torch_correspondence.solve_correspondences)
+    march_resumable = staticmethod(torch_reference.march)
+    mean_normals = staticmethod(torch_reference.mean_normals)
+    scatter_max_density = staticmethod(torch_reference.scatter_max_density)
+    bone_wrenches = staticmethod(torch_correspondence.bone_wrenches)
+    update_roots = staticmethod(torch_correspondence.update_roots)
+
+    def encode(self, points, table, levels):
+        with torch.no_grad():
+            return torch_reference.encode(points, table, levels)
+
+    def encode_backward(self, points, grad_features, levels, grad_table):
+        table = torch.zeros_like(grad_table, requires_grad=True)
+        with torch.enable_grad():
+            features = torch_reference.encode(points, table, levels)
+            (grad,) = torch.autograd.grad((features * grad_features).sum(), table)
+        grad_table += grad
+
+    def encode_points_backward(self, points, grad_features, table, levels):
+        leaf = points.detach().requires_grad_()
+        with torch.enable_grad():
+            features = torch_reference.encode(leaf, table.detach(), levels)
+            (grad,) = torch.autograd.grad((features * grad_features).sum(), leaf)
+        return grad
+
+    def march(self, rays, cells, grid, how):
+        return self.march_resumable(rays, cells, grid, how)[0]
+
+    def composite(self, raw, samples, step_m):
+        with torch.no_grad():
+            return torch_reference.composite(raw, samples.offsets, samples.counts, step_m)
+
+    def composite_loss(self, raw, samples, step_m, target, background, alpha_weight, hard_weight):
+        leaf = raw.detach().requires_grad_()
+        with torch.enable_grad():
+            rendered = torch_reference.composite(leaf, samples.offsets, samples.counts, step_m)
+            loss = torch_reference.loss_per_ray(
+                rendered, target, background, alpha_weight, hard_weight
+            )
+            (grad,) = torch.autograd.grad(loss.mean(), leaf)
+        return rendered.detach(), loss.detach(), grad
 
 
 def backend_for(device: torch.device) -> Backend:
@@ -58,7 +109,7 @@ def backend_for(device: torch.device) -> Backend:
 
 
 def _numba_backend() -> Backend:
-    from avatar.numba_kernels.numba_backend import NumbaBackend  # compiles at its import
+    from avatar.kernels.numba_backend import NumbaBackend  # compiles at its import
 
     return NumbaBackend()
 
@@ -182,7 +233,7 @@ def _march_to_seeds(
 ) -> Float32[torch.Tensor, "points 3"]:
     """Canonical points that marching finds for skinned points; 0 where it finds none."""
     low, nodes_per_m = torch.from_numpy(rig.box_low), torch.from_numpy(rig.nodes_per_m)
-    posed = skin_points(
+    posed = torch_correspondence.skin_points(
         canonical, torch.from_numpy(rig.weights), low, nodes_per_m, torch.from_numpy(bones)
     )
     full = torch.ones(rig.skin_distance.shape)

@@ -14,8 +14,12 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
-from avatar.deformation.correspondence_check import CorrespondenceCheck
-from avatar.deformation.correspondence_grid import CorrespondenceGrid, cull_cells, screen_bounds
+from avatar.correspondence_grid import (
+    CorrespondenceCheck,
+    CorrespondenceGrid,
+    cull_cells,
+    screen_bounds,
+)
 from avatar.field.avatar_model import Avatar
 from avatar.field.orientation_shading import OrientationShading
 from avatar.field.radiance_field import RadianceField
@@ -149,7 +153,7 @@ def render(
 
     The image differs by at most `MIN_TRANSMITTANCE`, and single-precision rounding, from the sum
     over all lattice samples in `avatar.rendering_grid()` whose correspondences are valid
-    (`avatar.deformation.correspondence_check`).
+    (`avatar.correspondence_grid`).
 
     Args:
         avatar: Avatar to render.

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import torch
 
-from avatar.deformation.correspondence_grid import CorrespondenceGrid
-from avatar.deformation.rig import Rig
+from avatar.correspondence_grid import CorrespondenceGrid
+from avatar.rig import Rig
 from benchmarks.hardware import ROOT
 from benchmarks.measurements import Measurement
 from benchmarks.sample_training import open_sample

@@ -32,8 +32,7 @@ from preprocess.cameras.camera_file import CameraTrack, read_cameras
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.open_capture import open_capture
 from preprocess.poses.pose_file import read_motion
-from preprocess.sfm.camera_solution import CameraSolution
-from preprocess.sfm.quality_gates import fit_similarity
+from preprocess.sfm.camera_solution import CameraSolution, fit_similarity
 from studio.shoot import ShootConfig, film_capture
 
 MOST_CENTER_CM, MOST_ROTATION_DEG, MOST_SCALE, MOST_SCALE_STATED = 1.0, 0.2, 0.03, 0.01
@@ -175,7 +174,7 @@ def psnr_by_cameras(capture: Path, runs: Path) -> dict[str, float]:
     """Held-out PSNR, dB, of short runs that differ in their cameras alone."""
     import torch
 
-    from avatar.deformation.rig import Rig
+    from avatar.rig import Rig
     from avatar.training.warmup import warm_up
     from benchmarks.sample_training import load_trainer, train_for_core_seconds, training_config
     from benchmarks.stopwatch import limit_threads

@@ -13,9 +13,8 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import Motion
-from preprocess.body.parametric_body import betas_for_motion
+from preprocess.body.parametric_body import betas_for_motion, load_body_model
 from preprocess.poses.pose_file import read_motion, write_motion
 
 Corruption = Callable[[Path], None]

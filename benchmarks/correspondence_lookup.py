@@ -13,8 +13,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float32
 
-from avatar.deformation.correspondence_grid import CorrespondenceGrid
-from avatar.deformation.rig import Rig
+from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.kernels.backend_protocol import (
     CorrespondenceTables,
     DensityGrid,
@@ -22,10 +21,10 @@ from avatar.kernels.backend_protocol import (
     RayBatch,
     RaySamples,
 )
-from avatar.numba_kernels.kernel_compiler import FAST_MATH, compile_kernel
-from avatar.numba_kernels.numba_broyden import solve_root
-from avatar.numba_kernels.numba_skinning import MATRIX_LANES, transform_point
+from avatar.kernels.kernel_compiler import FAST_MATH, compile_kernel
+from avatar.kernels.numba_skinning import MATRIX_LANES, solve_root, transform_point
 from avatar.render import correspondence_tables
+from avatar.rig import Rig
 from baselines.instant_avatar.broyden_kernels import START_BONES
 from benchmarks.measurements import Measurement
 from benchmarks.sample_training import LoadedTrainer

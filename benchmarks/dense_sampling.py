@@ -18,7 +18,7 @@ from jaxtyping import Float32, Int32
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from avatar.deformation.correspondence_grid import CorrespondenceGrid
+from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.kernels.backend_protocol import (
     Backend,
     CorrespondenceTables,

@@ -22,9 +22,9 @@ def main() -> None:
 
     from apps.cli.device import set_threads
     from avatar.config import TrainConfig
-    from avatar.deformation.rig import Rig
     from avatar.evaluation.held_out import HeldOutFrame
     from avatar.events import Stepped
+    from avatar.rig import Rig
     from avatar.training.frame_stream import prepare_stream
     from avatar.training.train import Trainer, train
     from avatar.training.warmup import warm_up

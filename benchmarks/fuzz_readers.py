@@ -97,13 +97,13 @@ def readers(seeds: Path) -> dict[str, Callable[[Path], object]]:
     from apps.checks.capture_validation import check_capture
     from capture.source_opening import open_source
     from export.player import Player
-    from preprocess.body.body_file import load_body_model, read_shaped_body
+    from preprocess.body.parametric_body import load_body_model, read_shaped_body
     from preprocess.cameras.camera_file import read_cameras
     from preprocess.capture_session import CaptureInputs
     from preprocess.file_content import read_untrusted_file
     from preprocess.masks.mask_files import open_masks, read_mask
     from preprocess.open_capture import open_capture
-    from preprocess.pose_formats.pose_format_registry import read_poses
+    from preprocess.poses.pose_format_registry import read_poses
 
     embedded, film = load_body_model(), open_source(seeds / "captures" / "film")
 

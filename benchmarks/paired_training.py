@@ -9,9 +9,9 @@ import numpy as np
 import torch
 
 from avatar.config import TrainConfig
-from avatar.deformation.rig import Rig
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.events import HeldOutScore
+from avatar.rig import Rig
 from avatar.training.optimizer import cosine_decay
 from avatar.training.trainer import Trainer
 from avatar.training.training_frame import TrainingFrame

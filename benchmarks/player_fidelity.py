@@ -23,7 +23,7 @@ from export.player import Player
 from preprocess.body.body_pose import BodyPose
 from preprocess.capture_session import Capture
 from preprocess.observation import Observation
-from preprocess.pose_formats.pose_format_registry import read_poses
+from preprocess.poses.pose_format_registry import read_poses
 
 DANCE_POSES = 16
 TARGETS = {"hq": (("≥ 40", "≥ 43"), ("< 0.4", "< 0.1")), "lite": (("", ""), ("< 1.2", "< 0.5"))}

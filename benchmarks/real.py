@@ -29,7 +29,7 @@ from benchmarks.real_scores import (
     rest_joint_distance_cm,
     score_novel_poses,
 )
-from preprocess.body.body_file import load_body_model
+from preprocess.body.parametric_body import load_body_model
 from studio.shoot import ShootConfig, film_capture
 
 Figures = dict[str, float | None]

@@ -15,11 +15,9 @@ from avatar.training.saved_frames import LAST_RUN_FILE, SavedFrames
 from avatar.training.trainer import Trainer
 from baselines.systems.compared_capture import novel_observations
 from capture.camera import Camera
-from preprocess.body.body_file import load_body_model, read_shaped_body
 from preprocess.body.body_pose import BodyPose
-from preprocess.body.kinematics import rotation_matrices
-from preprocess.body.parametric_body import ShapedBody
-from preprocess.body.rotations import axis_angles_from_matrices
+from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
+from preprocess.body.parametric_body import ShapedBody, load_body_model, read_shaped_body
 from preprocess.cameras.camera_file import read_cameras
 from preprocess.poses.pose_file import read_motion
 

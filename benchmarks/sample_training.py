@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import torch
 
 from avatar.config import TrainConfig
-from avatar.deformation.rig import Rig
 from avatar.evaluation.held_out import HeldOutFrame
+from avatar.rig import Rig
 from avatar.training.frame_stream import prepare_stream
 from avatar.training.optimizer import cosine_decay
 from avatar.training.train import Trainer

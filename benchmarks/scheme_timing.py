@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from avatar.deformation.correspondence_grid import CorrespondenceGrid
+from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.held_out import HeldOutFrame, score_rendering
 from avatar.field.avatar_model import Avatar
 from avatar.render import render

@@ -8,10 +8,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from avatar.deformation.correspondence_grid import CorrespondenceGrid
-from avatar.deformation.rig import Rig
+from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.held_out import HeldOutFrame, subsample_evenly
 from avatar.field.avatar_model import Avatar
+from avatar.rig import Rig
 from avatar.training.frame_stream import is_held_out, prepare_stream
 from avatar.training.optimizer import cosine_decay
 from avatar.training.train import train
@@ -24,7 +24,7 @@ from benchmarks.stopwatch import limit_threads
 from benchmarks.training_quality import mean_psnr
 from capture.inbox import Inbox
 from preprocess.capture_session import Capture
-from preprocess.observe import DroppedFrame
+from preprocess.observation import DroppedFrame
 
 EARLY_S, EARLY_EVERY_S, LATE_EVERY_S = 8.0, 0.5, 2.5
 USABLE_DB = 25.0

@@ -15,10 +15,10 @@ from avatar.training.saved_frames import LAST_RUN_FILE, SavedFrames
 from benchmarks.real_scores import TRACKED_JOINTS
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.silhouette_objective import mean_with_missing, sample_masks
-from preprocess.body.silhouette import SkinPoints, soft_iou
+from preprocess.body.body_surface import SkinPoints, soft_iou
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.masks.mask_files import open_masks
-from preprocess.observe import associate_cameras, associate_masks
+from preprocess.observation import associate_cameras, associate_masks
 from preprocess.open_capture import open_capture
 
 SIDES = ((1, 2), (16, 17))

@@ -20,7 +20,7 @@ import tyro
 
 from apps.cli.device import resolve_device
 from apps.cli.exit_codes import run_command
-from avatar.deformation.rig import Rig
+from avatar.rig import Rig
 from benchmarks.builds import build_marks
 from benchmarks.correspondence_lookup import warp_marks
 from benchmarks.empty_space_skipping import skipping_marks

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 
 from avatar.config import TrainConfig
-from avatar.deformation.correspondence_grid import CorrespondenceGrid
-from avatar.deformation.rig import Rig
+from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.field.avatar_model import Avatar
+from avatar.rig import Rig
 from avatar.training.frame_stream import prepare_stream
 from avatar.training.train import Trainer, train
 from avatar.training.warmup import warm_up

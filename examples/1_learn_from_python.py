@@ -20,7 +20,7 @@ try:
     from avatar.config import TrainConfig
     from avatar.events import Evaluated, Finished, Warned
     from avatar.training.frame_stream import prepare_stream
-    from avatar.deformation.rig import Rig
+    from avatar.rig import Rig
     from avatar.training.train import train
     from avatar.training.trainer import Trainer
     from avatar.training.warmup import warm_up

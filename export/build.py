@@ -17,9 +17,9 @@ import torch
 from jaxtyping import Float32, UInt8
 from PIL import Image
 
-from avatar.deformation.rig import Rig
 from avatar.field.avatar_model import Avatar
 from avatar.render import render
+from avatar.rig import Rig
 from capture.camera import Camera
 from capture.input_error import InputError
 from export.bake.bake_tables import BakeConfig, bake_tables, sample_field

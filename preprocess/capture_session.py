@@ -25,8 +25,7 @@ from preprocess.live.tracked_stream import LiveTracking
 from preprocess.masks.given_mask_refinement import GivenMaskRefiner
 from preprocess.masks.mask_files import Masks
 from preprocess.masks.mask_origin import Segmenter, segmenter_name
-from preprocess.observation import Observation
-from preprocess.observe import DroppedFrame, observation_builder
+from preprocess.observation import DroppedFrame, Observation, observation_builder
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,9 +21,8 @@ from preprocess.alignment.capture_alignment import (
 )
 from preprocess.alignment.capture_evidence import CaptureEvidence
 from preprocess.alignment.mask_alignment import body_height_m, rescale_motion, scale_to_height
-from preprocess.body.body_file import load_body_model, read_shaped_body
 from preprocess.body.body_pose import Motion
-from preprocess.body.parametric_body import ShapedBody
+from preprocess.body.parametric_body import ShapedBody, load_body_model, read_shaped_body
 from preprocess.body.proportion_space import shape_for_motion
 from preprocess.cameras.camera_file import CameraTrack, assume_static_camera
 from preprocess.cameras.camera_orientation import read_upright_cameras
@@ -40,12 +39,12 @@ from preprocess.masks.mask_origin import (
     make_segmenter,
     segmenter_name,
 )
-from preprocess.pose_formats.pose_format_registry import read_poses
 from preprocess.poses.plausibility import (
     lost_pose_warnings,
     plausibility_warnings,
     require_plausible,
 )
+from preprocess.poses.pose_format_registry import read_poses
 from preprocess.poses.root_placement import place_in_camera_world
 
 

@@ -8,7 +8,7 @@ from capture.input_error import InputError
 from capture.source import FrameSource, PacingClock, RealtimePlayback
 from capture.source_opening import open_live_source, open_source
 from preprocess.alignment.capture_alignment import BodyAlignment
-from preprocess.body.body_file import load_body_model, read_shaped_body
+from preprocess.body.parametric_body import load_body_model, read_shaped_body
 from preprocess.cameras.camera_orientation import assume_camera
 from preprocess.capture_paths import CapturePaths, find_own_cameras, find_own_masks
 from preprocess.capture_session import Capture, CaptureInputs
@@ -16,7 +16,7 @@ from preprocess.live.live_masks import LiveMasks, check_mask_folder
 from preprocess.live.tracked_stream import LiveTracking, MaskReader, TrackedStream
 from preprocess.masks.mask_files import open_masks
 from preprocess.masks.mask_origin import MaskOrigin, choose_mask_origin, make_segmenter
-from preprocess.observe import alpha_channel_mask, associate_masks
+from preprocess.observation import alpha_channel_mask, associate_masks
 from preprocess.open_capture import describe_capture, make_mask_refiner
 from preprocess.tracking.person_tracker import PersonTracker
 from preprocess.tracking.video_tracking import MaskRefinement

@@ -15,10 +15,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, KDTree
 
 from capture.camera import Camera
-from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.body_surface import vertex_normals
-from preprocess.body.parametric_body import BodyModel, ShapedBody
+from preprocess.body.parametric_body import BodyModel, ShapedBody, load_body_model
 from studio.lighting import LAMP_STRENGTH, bake_light, composite_over, rasterize, shade_pixels
 from studio.outfit import EYE, HAIR, OUTFITS, SHIRT, SHOE, SKIN, TROUSERS, BodyProportions, Outfit
 

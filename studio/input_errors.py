@@ -16,10 +16,9 @@ from scipy.ndimage import gaussian_filter1d
 
 from capture.camera import Camera
 from preprocess.body.body_pose import Motion
-from preprocess.body.kinematics import PARENTS, rotation_matrices
+from preprocess.body.body_surface import signed_distance_px
+from preprocess.body.kinematics import PARENTS, axis_angles_from_matrices, rotation_matrices
 from preprocess.body.parametric_body import ShapedBody
-from preprocess.body.rotations import axis_angles_from_matrices
-from preprocess.body.silhouette import signed_distance_px
 from preprocess.poses.root_placement import place_by_pixels, transform_motion
 
 BORDER_NOISE_SCALE_PX = 6.0

@@ -15,7 +15,7 @@ from typing import final
 import numpy as np
 from jaxtyping import Float, Float32, Int32, UInt8
 
-from avatar.numba_kernels.kernel_compiler import compile_kernel
+from avatar.kernels.kernel_compiler import compile_kernel
 from capture.camera import Camera
 from studio.outfit import is_visible
 from studio.procedural_albedo import albedo_at

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32
 
-from avatar.numba_kernels.kernel_compiler import compile_kernel
+from avatar.kernels.kernel_compiler import compile_kernel
 from preprocess.body.kinematics import PARENTS
 
 SKIN, SHIRT, TROUSERS, SHOE, HAIR, EYE = 0, 1, 2, 3, 4, 5

@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32, UInt8
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.body_surface import vertex_normals
-from preprocess.body.rotations import slerp
+from preprocess.body.kinematics import slerp
 from studio.actor import Actor
 from studio.input_errors import smooth_noise
 from studio.lighting import LAMP_RGB, RenderedFrame, composite_over, lamp_visibility

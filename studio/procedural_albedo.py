@@ -7,7 +7,7 @@ to the body in every pose and are as sharp as the picture can show.
 import numpy as np
 from jaxtyping import Float32
 
-from avatar.numba_kernels.kernel_compiler import compile_kernel
+from avatar.kernels.kernel_compiler import compile_kernel
 from studio.outfit import (
     BELT_Y,
     CUFF,

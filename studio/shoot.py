@@ -18,12 +18,11 @@ from capture.camera import Camera
 from capture.image_folder import write_png
 from capture.input_error import InputError
 from capture.video_encoder import lossless_video, video_encoder
-from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import BodyPose, Motion
-from preprocess.body.parametric_body import ShapedBody
+from preprocess.body.parametric_body import ShapedBody, load_body_model
 from preprocess.cameras.camera_file import CameraTrack, write_cameras
-from preprocess.pose_formats.pose_format_registry import read_poses
 from preprocess.poses.pose_file import write_motion
+from preprocess.poses.pose_format_registry import read_poses
 from studio import actor_motions, studio_cameras
 from studio.actor import Actor
 from studio.input_errors import (

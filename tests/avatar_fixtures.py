@@ -9,19 +9,18 @@ import pytest
 import torch
 
 from avatar.config import TrainConfig
-from avatar.deformation.correspondence_grid import CorrespondenceGrid
-from avatar.deformation.rig import Rig
+from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.events import HeldOutScore
 from avatar.kernels.backend_protocol import HashLevels
+from avatar.rig import Rig
 from avatar.training.frame_stream import prepare_stream
 from avatar.training.optimizer import cosine_decay
 from avatar.training.trainer import Trainer
 from capture.camera import Camera
 from capture.source import Frame
-from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import BodyPose
-from preprocess.body.parametric_body import ShapedBody
+from preprocess.body.parametric_body import ShapedBody, load_body_model
 from preprocess.observation import Observation
 from studio import actor_motions
 from studio.actor import Actor

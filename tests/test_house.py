@@ -96,12 +96,12 @@ def test_imports_point_back_along_the_data_flow():
 @pytest.mark.parametrize(
     ("stage", "line", "is_wrong"),
     [
-        ("capture", "import avatar.deformation.rig", True),
+        ("capture", "import avatar.rig", True),
         ("preprocess", "def f():\n from export.player import Player", True),
         ("avatar", "from . import rig", True),
         ("export", "from avatar import rig", False),
         ("apps", "import capture, preprocess, avatar, export", False),
-        ("avatar", "import avatar.deformation.rig, exporters", False),
+        ("avatar", "import avatar.rig, exporters", False),
     ],
 )
 def test_the_check_of_imports_can_fail(stage, line, is_wrong):
@@ -156,7 +156,7 @@ def test_the_player_loads_with_numpy_and_onnxruntime_alone():
 
 
 def test_the_checks_of_what_is_loaded_can_fail():
-    assert loads(["avatar.deformation.rig", "capture.video"], ("scipy", "cv2", "onnx")) == [
+    assert loads(["avatar.rig", "capture.video"], ("scipy", "cv2", "onnx")) == [
         "scipy",
         "cv2",
     ]

@@ -9,9 +9,9 @@ from jaxtyping import Float, Int
 from apps.cli.console import Console
 from capture.input_error import InputError
 from preprocess.body.body_pose import BodyPose, Motion
-from preprocess.body.rotations import slerp
-from preprocess.pose_formats.pose_format_registry import read_poses
+from preprocess.body.kinematics import slerp
 from preprocess.poses.plausibility import plausibility_warnings, require_plausible
+from preprocess.poses.pose_format_registry import read_poses
 from preprocess.poses.root_placement import anchor_at_pelvis
 
 

@@ -31,10 +31,10 @@ from preprocess.alignment.silhouette_objective import (
     mean_score,
     sample_masks,
 )
-from preprocess.body.silhouette import SkinPoints
+from preprocess.body.body_surface import SkinPoints
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.masks.mask_files import Masks
-from preprocess.observe import associate_cameras, associate_masks
+from preprocess.observation import associate_cameras, associate_masks
 from preprocess.open_capture import open_capture
 from preprocess.poses.plausibility import implausibility_reason
 

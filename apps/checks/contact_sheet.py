@@ -14,7 +14,7 @@ from capture.camera import same_aspect_ratio
 from capture.source import Frame
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.silhouette_objective import mean_score, spaced_indices
-from preprocess.body.silhouette import SkinPoints, splat_silhouette
+from preprocess.body.body_surface import SkinPoints, splat_silhouette
 
 COLUMNS = 6
 """Frames per row."""

@@ -28,7 +28,7 @@ from apps.evaluation.dataset_subject import (
 from capture.image_folder import list_images
 from capture.input_error import InputError
 from preprocess.cameras.camera_file import CameraTrack, write_cameras
-from preprocess.cameras.colmap import find_colmap_model, read_colmap_model
+from preprocess.cameras.camera_registry import find_colmap_model, read_colmap_model
 from preprocess.cameras.named_camera import NamedCamera
 from preprocess.file_content import read_npz
 from preprocess.masks.mask_files import Masks, open_masks

@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float, Float32, Int
 from scipy.spatial import KDTree
 
-from avatar.deformation.rig import canonical_rotations
 from avatar.evaluation.coverage import MIN_WELL_SEEN_COSINE, Coverage
 from avatar.evaluation.skin_patches import pose_patches
+from avatar.rig import canonical_rotations
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.body_surface import visible_points
 from preprocess.body.parametric_body import ShapedBody

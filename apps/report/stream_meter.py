@@ -10,8 +10,7 @@ from apps.report.report_schema import DroppedFrameEntry, Percentiles, StreamStat
 from avatar.training.frame_stream import RedundantFrame
 from capture.process_metrics import ReservoirSample
 from capture.source import Frame, FrameSource
-from preprocess.observation import Observation
-from preprocess.observe import DroppedFrame
+from preprocess.observation import DroppedFrame, Observation
 
 Item = TypeVar("Item")
 

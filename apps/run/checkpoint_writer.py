@@ -8,7 +8,7 @@ from apps.run.run_folder import RunFolder
 from avatar.training import checkpoint
 from avatar.training.trainer import Trainer
 from capture.atomic_files import atomic_file
-from preprocess.body.body_file import write_shaped_body
+from preprocess.body.parametric_body import write_shaped_body
 from preprocess.capture_session import Capture
 
 CHECKPOINT_INTERVAL_S = 5.0

@@ -15,7 +15,7 @@ from export.bake.render_targets import PosedView
 from export.build import ExportReport, export_avatar
 from export.package.package_file import update_metrics
 from preprocess.capture_session import Capture
-from preprocess.observe import shrink_to_longer_side
+from preprocess.observation import shrink_to_longer_side
 
 VALIDATION_VIEWS = 4
 """Views that a package is validated with."""

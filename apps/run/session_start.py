@@ -20,8 +20,8 @@ from apps.run.training_session import TrainingSession
 from apps.tracking.tracked_run import remove_unused_tracking
 from avatar.backends import backend_for
 from avatar.config import HELD_OUT_STRIDE, TrainConfig
-from avatar.deformation.rig import Rig
 from avatar.evaluation.held_out import MAX_HELD_OUT
+from avatar.rig import Rig
 from avatar.training import checkpoint, warmup
 from avatar.training.trainer import Trainer
 from capture.input_error import InputError

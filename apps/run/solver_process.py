@@ -30,15 +30,13 @@ from jaxtyping import Bool
 from apps.cli.console import Console
 from capture.input_error import InputError
 from capture.source import Frame
-from preprocess.body.silhouette import MeshSilhouette
+from preprocess.body.body_surface import MeshSilhouette
 from preprocess.capture_session import Capture, CaptureInputs
-from preprocess.observe import alpha_channel_mask, associate_masks, associate_poses
+from preprocess.observation import alpha_channel_mask, associate_masks, associate_poses
 from preprocess.open_capture import open_capture
 from preprocess.sfm.camera_solution import CameraSolution
-from preprocess.sfm.camera_solver import SolverSettings, solve_cameras
-from preprocess.sfm.colmap_mapping import require_pycolmap
-from preprocess.sfm.sfm_keyframes import PersonMaskFn
-from preprocess.sfm.stage_cache import STAGES_FILE, StageProgressFn
+from preprocess.sfm.camera_solver import STAGES_FILE, SolverSettings, StageProgressFn, solve_cameras
+from preprocess.sfm.colmap_mapping import PersonMaskFn, require_pycolmap
 
 METHOD_VERSION = 4
 """Version of the solver and of its files; stages of another version are not taken up."""

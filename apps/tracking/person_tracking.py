@@ -19,9 +19,9 @@ from capture.source import FrameSource
 from capture.source_opening import open_source
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.silhouette_objective import sample_masks
-from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import Motion
-from preprocess.body.silhouette import SkinPoints
+from preprocess.body.body_surface import SkinPoints
+from preprocess.body.parametric_body import load_body_model
 from preprocess.cameras.camera_orientation import assume_camera
 from preprocess.capture_paths import find_live_poses, find_own_masks, find_own_poses
 from preprocess.capture_session import Capture, CaptureInputs
@@ -29,7 +29,7 @@ from preprocess.fitting.capture_fitting import fit_capture, fitted_motion
 from preprocess.masks.mask_files import open_masks
 from preprocess.masks.mask_origin import segmenter_name
 from preprocess.masks.mask_refinement import MaskRefiner
-from preprocess.observe import associate_cameras, associate_masks
+from preprocess.observation import associate_cameras, associate_masks
 from preprocess.open_capture import open_capture
 from preprocess.open_stream import open_tracked_stream
 from preprocess.poses.pose_file import read_motion, write_motion

@@ -10,10 +10,9 @@ from jaxtyping import UInt8
 
 from capture.atomic_files import atomic_file
 from capture.video_encoder import video_encoder
-from preprocess.body.silhouette import SkinPoints, splat_silhouette
+from preprocess.body.body_surface import SkinPoints, splat_silhouette
 from preprocess.capture_session import Capture
-from preprocess.observation import Observation
-from preprocess.observe import shrink_to_longer_side
+from preprocess.observation import Observation, shrink_to_longer_side
 
 LONGER_SIDE_PX = 720
 """Longer side of the film, px."""

@@ -16,7 +16,7 @@ from apps.run.run_folder import RunFolder
 from apps.run.training_observer import ObservableSession
 from apps.view.preview_poses import DANCE, FILMED, NEWEST, PreviewPoses
 from apps.view.viser_page import BACKGROUND_RGB, FRAME_PX, BrowserCamera, ViserPage
-from avatar.deformation.correspondence_grid import CorrespondenceGrid
+from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.coverage_advice import coverage_advice
 from avatar.events import Evaluated, Finished, TrainEvent
 from avatar.field.avatar_model import Avatar

@@ -9,7 +9,7 @@ from typing import final
 import numpy as np
 
 from apps.animation.driving_motion import demo_motion
-from avatar.deformation.rig import canonical_rotations
+from avatar.rig import canonical_rotations
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.kinematics import rotation_matrices

@@ -15,8 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Int
 
-from avatar.deformation.correspondence_grid import CorrespondenceGrid
-from avatar.deformation.rig import Rig
+from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.image_metrics import (
     MASK_THRESHOLD,
     composite_on_white,
@@ -31,6 +30,7 @@ from avatar.evaluation.sharpness import BlurCalibration, calibrate_blur, equival
 from avatar.events import HeldOutScore
 from avatar.field.avatar_model import Avatar
 from avatar.render import PosedAvatar, render
+from avatar.rig import Rig
 from preprocess.observation import Observation
 
 Item = TypeVar("Item")

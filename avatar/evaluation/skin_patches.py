@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from scipy.spatial import KDTree
 
-from avatar.deformation.rig import PART_OF_JOINT
 from avatar.evaluation.image_metrics import psnr_of_errors, silhouette_of
+from avatar.rig import PART_OF_JOINT
 from preprocess.body.body_surface import vertex_areas, vertex_normals, visible_points
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.observation import Observation
@@ -18,7 +18,7 @@ PART_NAMES = (
     "head", "left upper arm", "right upper arm", "left forearm", "right forearm", "left hand",
     "right hand",
 )  # fmt: skip
-"""The 14 body parts of `avatar.deformation.rig.PARTS`; left is the person's left."""
+"""The 14 body parts of `avatar.rig.PARTS`; left is the person's left."""
 SIDE_NAMES = ("front", "back", "left", "right", "top", "under")
 """Where a patch looks while the person stands in the T-pose; `under` is the underside."""
 ARM_PARTS, FOOT_PARTS = slice(8, 14), slice(5, 7)

@@ -6,12 +6,12 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from avatar.deformation.rig import Rig
 from avatar.field.occupancy_grid import OccupancyGrid, in_occupied_cells
 from avatar.field.orientation_shading import OrientationShading
 from avatar.field.radiance_field import RadianceField
 from avatar.kernels.backend_protocol import DensityGrid
 from avatar.kernels.torch_reference import activate
+from avatar.rig import Rig
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

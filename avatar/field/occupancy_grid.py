@@ -16,9 +16,9 @@ from scipy.ndimage import label
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from avatar.deformation.rig import CLOTHING_BAND_M, Rig
 from avatar.kernels.backend_protocol import DensityGrid
 from avatar.kernels.torch_reference import MAX_LOG_DENSITY
+from avatar.rig import CLOTHING_BAND_M, Rig
 
 OCCUPANCY_DECAY = 0.9
 """Factor of a probed cell's cached density. At 0.6 thin surfaces vanish."""
@@ -233,7 +233,7 @@ MAX_LEG_DISTANCE_M = 0.3
 MAX_DIRECTION_COSINE = 0.5
 """Cosine of the smallest angle (60°) between the directions to both legs from a place between."""
 LEFT_LEG_PARTS = (1, 3, 5)
-"""Body parts of the left leg (`avatar.deformation.rig.PART_OF_JOINT`)."""
+"""Body parts of the left leg (`avatar.rig.PART_OF_JOINT`)."""
 RIGHT_LEG_PARTS = (2, 4, 6)
 """Body parts of the right leg."""
 

@@ -14,7 +14,6 @@ from jaxtyping import Float32, Float64
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
-from avatar.deformation.rig import Rig
 from avatar.kernels.backend_protocol import (
     Backend,
     CorrespondenceTables,
@@ -24,6 +23,7 @@ from avatar.kernels.backend_protocol import (
     RayBatch,
     RaySamples,
 )
+from avatar.rig import Rig
 
 HARMONICS = 4
 """Spherical harmonics up to the first order."""

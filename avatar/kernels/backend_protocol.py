@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float32, Int32, Int64, UInt8
 from torch import Tensor
 
-from avatar.deformation.rig import Rig
+from avatar.rig import Rig
 
 FEATURES_PER_LEVEL = 4
 """Features per entry. Fixed: the kernels are compiled for it (16 bytes are one vector)."""
@@ -187,7 +187,7 @@ class DensityGrid(NamedTuple):
 
 
 class SkinningVolume(NamedTuple):
-    """The volume of skinning weights (`avatar.deformation.rig.Rig`).
+    """The volume of skinning weights (`avatar.rig.Rig`).
 
     Attributes:
         weights: Weights of the 24 bones at the nodes of the canonical box.
@@ -237,7 +237,10 @@ class MarchSettings(NamedTuple):
 
 @runtime_checkable
 class Backend(Protocol):
-    """The operations of a training step; `avatar.kernels.torch_reference` defines each of them."""
+    """The operations of a training step, each defined by its reference in `torch_*`.
+
+    Backends leave out what is stated here: shapes, types and meanings.
+    """
 
     name: str
 
@@ -272,7 +275,7 @@ class Backend(Protocol):
         self, rays: RayBatch, cells: CorrespondenceTables, grid: DensityGrid, how: MarchSettings
     ) -> RaySamples:
         """Canonical samples along rays."""
-        ...
+        return self.march_resumable(rays, cells, grid, how)[0]
 
     def march_resumable(
         self, rays: RayBatch, cells: CorrespondenceTables, grid: DensityGrid, how: MarchSettings

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from avatar.config import TrainConfig
-from avatar.deformation.rig import Rig
+from avatar.rig import Rig
 from avatar.training.trainer import Trainer
 from capture.atomic_files import atomic_file
 from capture.input_error import InputError

@@ -7,12 +7,11 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from avatar.config import TrainConfig
-from avatar.deformation.rig import Rig
 from avatar.evaluation.held_out import HeldOutFrame
+from avatar.rig import Rig
 from avatar.training.training_frame import TrainingFrame, prepare_frame
 from preprocess.body.body_pose import BodyPose
-from preprocess.observation import Observation
-from preprocess.observe import DroppedFrame
+from preprocess.observation import DroppedFrame, Observation
 
 JOINT_ANGLE_WEIGHT = 0.5
 """Weight of a radian of joint rotation relative to a radian of view direction."""

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from avatar.deformation.correspondence_grid import CorrespondenceGrid
+from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.held_out import HeldOutFrame, score_fine_sample
 from avatar.pose.pose_optimizer import PoseOptimizer
 from avatar.pose.temporal_prior import interpolate_correction

@@ -13,10 +13,10 @@ import torch
 from jaxtyping import Float, Float32, Int32, Int64, UInt8
 from torch import Tensor
 
-from avatar.deformation.correspondence_grid import CORRESPONDENCE_CELL_M, CorrespondenceGrid
-from avatar.deformation.rig import Rig
+from avatar.correspondence_grid import CORRESPONDENCE_CELL_M, CorrespondenceGrid
 from avatar.kernels.backend_protocol import CorrespondenceTables, RayBatch
 from avatar.pose.pose_optimizer import RootCorrection
+from avatar.rig import Rig
 from avatar.training.frame_stream import view_descriptor
 from avatar.training.training_frame import PixelRuns, RayView, TrainingFrame, camera_in_body
 from capture.camera import Camera

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from avatar.deformation.rig import Rig
 from avatar.evaluation.held_out import HeldOutFrame, subsample_evenly
+from avatar.rig import Rig
 from avatar.training.checkpoint import save_atomically
 from avatar.training.replay_buffer import ReplayBuffer, ReplayFrame
 from avatar.training.training_frame import RayView, TrainingFrame, rebuild_frame

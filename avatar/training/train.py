@@ -26,7 +26,7 @@ from avatar.training.frame_stream import RedundantFrame, StreamItem
 from avatar.training.optimizer import cosine_decay
 from avatar.training.trainer import Trainer
 from capture.inbox import Inbox
-from preprocess.observe import DroppedFrame
+from preprocess.observation import DroppedFrame
 
 READING_FIRST_AFTER_SHARE = 0.5
 """Share of the time budget after which reading the video takes precedence over training."""

@@ -12,14 +12,14 @@ from jaxtyping import Float
 
 from avatar.backends import backend_for
 from avatar.config import COARSEST_M, NOMINAL_STEPS_PER_S, TrainConfig
-from avatar.deformation.correspondence_grid import CorrespondenceGrid
-from avatar.deformation.rig import Rig
+from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.field.avatar_model import Avatar
 from avatar.field.occupancy_grid import INITIAL_OCCUPANCY_DECAY, OCCUPANCY_DECAY, OccupancyGrid
 from avatar.field.orientation_shading import OrientationShading
 from avatar.field.radiance_field import RadianceField
 from avatar.kernels.backend_protocol import Backend, HashLevels
 from avatar.pose.pose_optimizer import PoseOptimizer
+from avatar.rig import Rig
 from avatar.training.frame_exposure import FrameExposures
 from avatar.training.optimizer import UncompiledAdam, update_ema
 from avatar.training.replay_buffer import ReplayBuffer

@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
 
-from avatar.deformation.correspondence_grid import CorrespondenceGrid
-from avatar.deformation.rig import Rig
+from avatar.correspondence_grid import CorrespondenceGrid
+from avatar.rig import Rig
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import body_from_rest

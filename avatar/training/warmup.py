@@ -6,9 +6,9 @@ import time
 import numpy as np
 from jaxtyping import UInt8
 
-from avatar.deformation.rig import Rig
 from avatar.pose.pose_optimizer import FIRST_CORRECTION_STEPS
 from avatar.render import render
+from avatar.rig import Rig
 from avatar.training.trainer import Trainer
 from avatar.training.training_frame import RayView, TrainingFrame, rebuild_frame
 from capture.camera import Camera

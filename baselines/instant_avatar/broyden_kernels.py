@@ -9,10 +9,9 @@ from numba import prange
 from torch import Tensor
 
 from avatar.kernels.backend_protocol import Backend
-from avatar.kernels.torch_skinning import broyden_roots
-from avatar.numba_kernels.kernel_compiler import FAST_MATH, compile_kernel
-from avatar.numba_kernels.numba_broyden import solve_root
-from avatar.numba_kernels.numba_skinning import MATRIX_LANES, transform_point
+from avatar.kernels.kernel_compiler import FAST_MATH, compile_kernel
+from avatar.kernels.numba_skinning import MATRIX_LANES, solve_root, transform_point
+from avatar.kernels.torch_correspondence import broyden_roots
 
 F32 = np.float32
 START_BONES = (0, 1, 2, 4, 5, 16, 17, 18, 19)

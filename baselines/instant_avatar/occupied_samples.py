@@ -10,8 +10,8 @@ from numba import prange
 from torch import Tensor
 
 from avatar.kernels.backend_protocol import Backend, RayBatch
-from avatar.numba_kernels.kernel_compiler import FAST_MATH, compile_kernel
-from avatar.numba_kernels.numba_rendering import nonzero
+from avatar.kernels.kernel_compiler import FAST_MATH, compile_kernel
+from avatar.kernels.numba_rendering import nonzero
 
 F32, I32 = np.float32, np.int32
 

@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Bool, Float32, Int32
 from torch import Tensor
 
-from avatar.deformation.rig import Rig
 from avatar.field.occupancy_grid import OccupancyGrid, in_occupied_cells
 from avatar.field.radiance_field import RadianceField
 from avatar.kernels.backend_protocol import (
@@ -18,6 +17,7 @@ from avatar.kernels.backend_protocol import (
     RayBatch,
 )
 from avatar.kernels.torch_reference import MAX_LOG_DENSITY
+from avatar.rig import Rig
 from baselines.instant_avatar.broyden_kernels import (
     START_BONES,
     BlendedTransforms,

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float32, Int64, UInt8
 from torch import Tensor
 
-from avatar.deformation.rig import Rig
 from avatar.field.occupancy_grid import OccupancyGrid
 from avatar.kernels.backend_protocol import CorrespondenceTables
+from avatar.rig import Rig
 from baselines.instant_avatar.occupied_samples import PosedOccupancy
 from baselines.instant_avatar.posed_field import PosedField
 

@@ -12,7 +12,6 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from avatar.config import TrainConfig
-from avatar.deformation.rig import Rig
 from avatar.field.avatar_model import Avatar
 from avatar.kernels.backend_protocol import (
     Backend,
@@ -21,6 +20,7 @@ from avatar.kernels.backend_protocol import (
     RayBatch,
     RaySamples,
 )
+from avatar.rig import Rig
 from avatar.training.trainer import Trainer
 from avatar.training.training_frame import TrainingFrame
 from avatar.training.training_step import OccupancySampler, RaySampler, StepResult

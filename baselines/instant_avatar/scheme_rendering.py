@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from avatar.deformation.correspondence_grid import CorrespondenceGrid
+from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.field.avatar_model import Avatar
 from avatar.field.radiance_field import RadianceField
 from avatar.kernels.backend_protocol import CorrespondenceTables, RayBatch, RaySamples

@@ -12,8 +12,8 @@ from jaxtyping import Float32, Int64
 from scipy.spatial import KDTree
 from torch import Tensor, nn
 
-from avatar.deformation.rig import Rig
 from avatar.kernels.torch_reference import MAX_LOG_DENSITY
+from avatar.rig import Rig
 from baselines.systems.method_settings import MethodSettings, NerfNetwork
 from baselines.systems.posed_person import (
     OccupiedCells,

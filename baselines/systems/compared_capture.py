@@ -7,15 +7,14 @@ from pathlib import Path
 import torch
 
 from avatar.config import HELD_OUT_STRIDE, TrainConfig
-from avatar.deformation.rig import Rig
 from avatar.evaluation.held_out import HeldOutFrame
+from avatar.rig import Rig
 from avatar.training.frame_stream import prepare_stream
 from avatar.training.trainer import Trainer
 from avatar.training.training_frame import TrainingFrame
 from avatar.training.warmup import warm_up
 from capture.input_error import InputError
-from preprocess.body.body_file import load_body_model
-from preprocess.body.parametric_body import ShapedBody
+from preprocess.body.parametric_body import ShapedBody, load_body_model
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.fitting.capture_fitting import apply_fit, fit_capture
 from preprocess.observation import Observation

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Float32, Int64
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor, nn
 
-from avatar.deformation.rig import Rig
+from avatar.rig import Rig
 from avatar.training.training_frame import TrainingFrame
 from preprocess.body.kinematics import body_from_rest
 from preprocess.body.parametric_body import ShapedBody

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from avatar.numba_kernels.kernel_compiler import compile_kernel
+from avatar.kernels.kernel_compiler import compile_kernel
 from export.bake.grid_filters import dilate
 
 F32, I32 = np.float32, np.int32

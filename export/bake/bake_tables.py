@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, Int64, Shaped, UInt8, UInt16
 
-from avatar.deformation.rig import Rig
+from avatar.rig import Rig
 from export.bake.bake_kernels import mark_visible_nodes
 from export.bake.field_grid import MIN_DENSITY, FieldFunction, FieldGrid, sample_field_grid
 from export.bake.grid_filters import dilate

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Float32, Int, UInt8
 
-from avatar.deformation.rig import Rig
+from avatar.rig import Rig
 from export.bake.bake_kernels import dilate_colors
 from export.package.player_tables import BRICK_SIZE, LOG_DENSITY_RANGE
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from avatar.deformation.rig import Rig
+from avatar.rig import Rig
 from export.bake.render_targets import (
     PosedView,
     RenderFunction,

@@ -8,7 +8,7 @@ from typing import final
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from avatar.deformation.rig import Rig
+from avatar.rig import Rig
 from capture.camera import Camera
 from export.package.player_tables import PlayerTables
 from export.package.render_settings import RenderSettings

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32
 
-from avatar.numba_kernels.kernel_compiler import compile_kernel
+from avatar.kernels.kernel_compiler import compile_kernel
 from export.package.player_tables import BRICK_SIZE, LOG_DENSITY_RANGE, BrickTable
 from export.package.render_settings import RenderSettings
 from export.reference.ray_segments import RaySegments

@@ -28,9 +28,9 @@ from preprocess.alignment.mask_alignment import (
 )
 from preprocess.alignment.silhouette_objective import SilhouetteObjective, mean_score
 from preprocess.body.body_pose import Motion
+from preprocess.body.body_surface import SkinPoints
 from preprocess.body.parametric_body import BodyModel, ShapedBody
 from preprocess.body.proportion_space import shape_for_motion
-from preprocess.body.silhouette import SkinPoints
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.poses.root_placement import place_in_camera_world
 

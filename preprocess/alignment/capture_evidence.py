@@ -8,10 +8,10 @@ from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.image_alignment import estimate_silhouettes, sample_video
 from preprocess.alignment.silhouette_objective import SilhouetteObjective, sample_masks
 from preprocess.body.body_pose import Motion
-from preprocess.body.silhouette import SILHOUETTE_PERSON_PX, SkinPoints
+from preprocess.body.body_surface import SILHOUETTE_PERSON_PX, SkinPoints
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.masks.mask_files import Masks
-from preprocess.observe import associate_cameras, associate_masks
+from preprocess.observation import associate_cameras, associate_masks
 
 
 class CaptureEvidence(NamedTuple):

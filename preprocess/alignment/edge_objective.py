@@ -14,7 +14,7 @@ from capture.source import FrameSource
 from capture.source_opening import open_source
 from preprocess.alignment.capture_geometry import FULL_WINDOW, CaptureGeometry, VideoTransform
 from preprocess.alignment.silhouette_objective import spaced_indices
-from preprocess.body.silhouette import signed_distance_px
+from preprocess.body.body_surface import signed_distance_px
 
 EDGE_BLUR_PX = 1.0
 """Gaussian σ, px, before gradients are taken."""

@@ -21,7 +21,7 @@ from preprocess.alignment.silhouette_objective import (
     spaced_indices,
 )
 from preprocess.body.body_pose import BodyPose
-from preprocess.body.silhouette import (
+from preprocess.body.body_surface import (
     NEAR_PLANE_M,
     SILHOUETTE_PERSON_PX,
     SkinPoints,
@@ -30,7 +30,7 @@ from preprocess.body.silhouette import (
 )
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.masks.mask_origin import DEFAULT_SEGMENTER, make_segmenter
-from preprocess.observe import associate_cameras
+from preprocess.observation import associate_cameras
 
 IMAGE_PERSON_PX = 130
 """Height of the person in the reduced images by the poses, px."""

@@ -13,9 +13,9 @@ from jaxtyping import Float, Float32
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.silhouette_objective import MaskSample, SilhouetteObjective, mean_score
 from preprocess.body.body_pose import Motion
+from preprocess.body.body_surface import soft_iou, splat_silhouette
 from preprocess.body.kinematics import rotation_matrices
 from preprocess.body.parametric_body import ShapedBody
-from preprocess.body.silhouette import soft_iou, splat_silhouette
 
 MIN_HEIGHT_CM = 40.0
 """Least height that a user may state, cm."""

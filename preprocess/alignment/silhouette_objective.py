@@ -12,9 +12,14 @@ from capture.input_error import InputError
 from capture.source import Frame, FrameSource
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.body.body_pose import Motion
-from preprocess.body.silhouette import SILHOUETTE_PERSON_PX, SkinPoints, soft_iou, splat_silhouette
+from preprocess.body.body_surface import (
+    SILHOUETTE_PERSON_PX,
+    SkinPoints,
+    soft_iou,
+    splat_silhouette,
+)
 from preprocess.masks.mask_files import Masks
-from preprocess.observe import alpha_channel_mask
+from preprocess.observation import alpha_channel_mask
 
 SAMPLED_FRAMES = 16
 """Number of frames that are sampled."""

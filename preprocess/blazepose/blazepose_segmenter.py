@@ -16,8 +16,8 @@ from capture.source import Frame
 from preprocess.blazepose.blazepose_landmarks import BlazePoseLandmarks
 from preprocess.blazepose.person_square import PersonSquare
 from preprocess.body.body_pose import BodyPose
+from preprocess.body.body_surface import NEAR_PLANE_M, SkinPoints
 from preprocess.body.parametric_body import ShapedBody
-from preprocess.body.silhouette import NEAR_PLANE_M, SkinPoints
 from preprocess.masks.mask_refinement import MaskRefiner
 from preprocess.tracking.dark_film import DarkFilmBrightener
 from preprocess.tracking.keypoints import CroppedMask

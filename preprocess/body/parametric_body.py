@@ -1,15 +1,22 @@
-"""A parametric body in three stages: the model, a shape of it, and a pose of that shape."""
+"""A parametric body in three stages: the model, a shape of it, and a pose of that shape.
+
+Models are read from SMPL's keys (.npz or .pkl); the resting body of an avatar is written and read.
+"""
 
 import json
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float64, Int, Shaped
 
+from capture.input_error import InputError
 from preprocess.body.body_pose import BodyPose, Motion
-from preprocess.body.kinematics import body_from_rest, rotation_matrices, world_from_body
+from preprocess.body.kinematics import PARENTS, body_from_rest, rotation_matrices, world_from_body
+from preprocess.file_content import read_npz
+from preprocess.safe_pickle import read_pickled_arrays
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -129,3 +136,164 @@ def smpl_rest_joints() -> Float[np.ndarray, "24 3"]:
     """Rest joints of SMPL's mean shape, metres (public; see data/LICENSE-body24.md)."""
     text = (files("preprocess") / "data" / "smpl_rest_joints.json").read_text(encoding="utf-8")
     return np.array(json.loads(text)["neutral"], dtype=np.float64)
+
+
+REQUIRED_BODY_KEYS = ("v_template", "shapedirs", "weights", "kintree_table", "f")
+"""Keys of SMPL's body files that must exist."""
+
+BODY_KEYS = (*REQUIRED_BODY_KEYS, "J_regressor", "J", "J_shapedirs", "posedirs")
+"""All keys of body files that are read."""
+
+Arrays = dict[str, Shaped[np.ndarray, "..."]]
+
+
+def load_body_model(path: Path | None = None) -> BodyModel:
+    """Reads a 24-joint body, SMPL's or ours; the embedded body if no path is given.
+
+    Keys: v_template (V, 3), shapedirs (V, 3, B), weights (V, 24), kintree_table (2, 24), f (F, 3),
+    and either J_regressor (24, V), which makes it SMPL's, or J (24, 3) and J_shapedirs (24, 3, B);
+    posedirs (V, 3, 207) if there are any. A .pkl is read without executing it.
+
+    Raises:
+        InputError: If there is no such file, or it holds no such body, or code.
+    """
+    path = path or Path(str(files("preprocess") / "data" / "body24.npz"))
+    if not path.is_file():
+        what = "is no file" if path.exists() else "does not exist"
+        raise InputError(
+            f"{path} {what}; a body file was expected. Leave --body out for the embedded body."
+        )
+    if path.suffix.lower() == ".npz":
+        arrays = read_npz(path, BODY_KEYS)
+    elif path.suffix.lower() == ".pkl":
+        arrays = read_pickled_arrays(path, BODY_KEYS)
+    else:
+        raise InputError(f"{path} ends in {path.suffix!r}; a body file ends in .npz or .pkl.")
+    return _parse_body(arrays, path)
+
+
+def _parse_body(arrays: Arrays, path: Path) -> BodyModel:
+    missing = [key for key in REQUIRED_BODY_KEYS if key not in arrays]
+    if missing or not ("J_regressor" in arrays or {"J", "J_shapedirs"} <= arrays.keys()):
+        raise InputError(
+            f"{path} is no body file: it lacks {', '.join(missing) or 'J_regressor'}. "
+            f"Expected {', '.join(REQUIRED_BODY_KEYS)} and J_regressor (or J with J_shapedirs)."
+        )
+    template = _read_array(arrays, "v_template", (-1, 3), path)
+    directions = _read_array(arrays, "shapedirs", (len(template), 3, -1), path)
+    weights = _read_array(arrays, "weights", (len(template), -1), path)
+    if weights.shape[1] != len(PARENTS):
+        raise InputError(
+            f"{path} has {weights.shape[1]} joints; a body of SMPL's {len(PARENTS)} joints was "
+            "expected (not SMPL+H or SMPL-X)."
+        )
+    if "J_regressor" in arrays:
+        regressor = _read_array(arrays, "J_regressor", (24, len(template)), path)
+        joints = regressor @ template
+        joint_directions = np.einsum("jv,vab->jab", regressor, directions)
+    else:
+        joints = _read_array(arrays, "J", (24, 3), path)
+        joint_directions = _read_array(arrays, "J_shapedirs", (24, 3, directions.shape[2]), path)
+    return BodyModel(
+        family="smpl" if "J_regressor" in arrays else "body24",
+        template=template,
+        faces=_faces(arrays, len(template), path),
+        weights=_normalize_weights(weights, path),
+        joints=joints,
+        parents=_parents(arrays, path),
+        shape_directions=directions,
+        joint_directions=joint_directions,
+        pose_directions=_read_array(arrays, "posedirs", (len(template), 3, 207), path)
+        if "posedirs" in arrays
+        else None,
+    )
+
+
+def _read_array(
+    arrays: Arrays, key: str, shape: tuple[int, ...], path: Path
+) -> Float64[np.ndarray, "..."]:
+    """One array as float64, of the shape given (-1: any length)."""
+    array = arrays[key]
+    if array.dtype.kind not in "biuf":
+        raise InputError(f"`{key}` in {path} holds no numbers.")
+    fits = array.ndim == len(shape) and all(
+        wanted in (-1, length) for wanted, length in zip(shape, array.shape, strict=False)
+    )
+    if not fits:
+        expected = " x ".join("any" if n < 0 else str(n) for n in shape)
+        raise InputError(f"`{key}` in {path} has the shape {array.shape}; expected {expected}.")
+    if not np.isfinite(array).all():
+        raise InputError(f"`{key}` in {path} holds NaN or infinite numbers; the file is damaged.")
+    return np.ascontiguousarray(array, dtype=np.float64)
+
+
+def _parents(arrays: Arrays, path: Path) -> Int[np.ndarray, "24"]:
+    """Parents as integers; the root's, 2³² - 1 in unsigned files, becomes -1."""
+    parents = _read_array(arrays, "kintree_table", (2, 24), path)[0].astype(np.int64)
+    parents = np.where(parents == 2**32 - 1, -1, parents)
+    if tuple(parents) != PARENTS:
+        raise InputError(
+            f"The joints of {path} form another tree than SMPL's: their parents are "
+            f"{parents.tolist()}, expected {list(PARENTS)}."
+        )
+    return parents
+
+
+def _faces(arrays: Arrays, vertices: int, path: Path) -> Int[np.ndarray, "faces 3"]:
+    faces = _read_array(arrays, "f", (-1, 3), path).astype(np.int64)
+    if faces.size and not 0 <= faces.min() <= faces.max() < vertices:
+        raise InputError(f"`f` in {path} names vertices that the body does not have.")
+    return faces
+
+
+def _normalize_weights(
+    weights: Float[np.ndarray, "vertices 24"], path: Path
+) -> Float[np.ndarray, "vertices 24"]:
+    """Weights whose rows sum to 1 exactly."""
+    sums = weights.sum(axis=1, keepdims=True)
+    if weights.min() < 0.0 or np.abs(sums - 1.0).max() > 0.02:
+        raise InputError(f"`weights` in {path} are no skinning weights: rows must sum to 1.")
+    return weights / sums
+
+
+SHAPED_BODY_KEYS = ("family", "vertices", "joints")
+"""Keys of a file that holds an avatar's person."""
+
+
+def write_shaped_body(path: Path, person: ShapedBody) -> None:
+    """Writes the resting vertices and joints, and whose betas would shape the body.
+
+    Raises:
+        OSError: If the disk is full.
+    """
+    np.savez(
+        path,
+        family=np.array(person.body.family),
+        vertices=person.vertices.astype(np.float32),
+        joints=person.joints,
+    )
+
+
+def read_shaped_body(path: Path, body: BodyModel) -> ShapedBody:
+    """The person that `write_shaped_body` wrote, on the same body.
+
+    Args:
+        path: The file.
+        body: What the user names now (--body), or the embedded body.
+
+    Raises:
+        InputError: If it is another body than then, or the file cannot be read.
+    """
+    arrays = read_npz(path)
+    if not set(SHAPED_BODY_KEYS) <= arrays.keys() or arrays["joints"].shape != (24, 3):
+        raise InputError(
+            f"{path} holds no person; expected {', '.join(SHAPED_BODY_KEYS)}. Is it ours?"
+        )
+    family, vertices = str(arrays["family"]), arrays["vertices"].astype(np.float64)
+    if family != body.family or vertices.shape != body.template.shape:
+        raise InputError(
+            f"{path}: the avatar was learnt on a {family!r} body of {len(vertices)} vertices, "
+            f"now it is {body.family!r} with {len(body.template)}. Give the same --body as then "
+            "(none is the embedded body), or train the avatar from the start (--overwrite)."
+        )
+    return ShapedBody(body=body, vertices=vertices, joints=arrays["joints"].astype(np.float64))

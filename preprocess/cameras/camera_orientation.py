@@ -12,7 +12,7 @@ from capture.input_error import InputError
 from capture.source import FrameSource
 from preprocess.body.body_pose import RelativeFocalLength
 from preprocess.cameras.camera_file import DEFAULT_FOCAL_RATIO, CameraTrack, read_cameras
-from preprocess.cameras.colmap import find_colmap_model
+from preprocess.cameras.camera_registry import find_colmap_model
 from preprocess.capture_paths import find_own_cameras
 
 MIRRORED_EXIF_QUARTER_TURNS = {2: 0, 4: 2, 5: 1, 7: 3}

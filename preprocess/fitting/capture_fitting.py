@@ -19,9 +19,9 @@ from preprocess.alignment.silhouette_objective import (
     reduce_masks,
 )
 from preprocess.body.body_pose import Motion
+from preprocess.body.body_surface import SkinPoints
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.proportion_space import SIGMA_BETA, ProportionSpace
-from preprocess.body.silhouette import SkinPoints
 from preprocess.capture_session import Capture
 from preprocess.fitting.capture_fit import CaptureFit
 from preprocess.fitting.clip_fitting import (
@@ -34,8 +34,7 @@ from preprocess.fitting.clip_fitting import (
     FitParameters,
 )
 from preprocess.fitting.outlines import OUTLINE_PERSON_PX, OutlineDistances
-from preprocess.observation import Observation
-from preprocess.observe import associate_cameras
+from preprocess.observation import Observation, associate_cameras
 
 KEY_FRAMES = 120
 """Frames, evenly spread, whose masks are fitted; poses between them follow their neighbors."""

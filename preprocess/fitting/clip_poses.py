@@ -9,8 +9,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from preprocess.body.body_pose import BodyPose, Motion
-from preprocess.body.kinematics import rigid_transform, rotation_matrices
-from preprocess.body.rotations import axis_angles_from_matrices
+from preprocess.body.kinematics import axis_angles_from_matrices, rigid_transform, rotation_matrices
 
 
 class PosedJoints(NamedTuple):

@@ -14,10 +14,14 @@ from jaxtyping import Float, Float32, Int
 from scipy.spatial import KDTree
 
 from capture.camera import Camera
-from preprocess.body.body_surface import vertex_normals
+from preprocess.body.body_surface import (
+    SkinPoints,
+    signed_distance_px,
+    splat_silhouette,
+    vertex_normals,
+)
 from preprocess.body.kinematics import descendant_matrix
 from preprocess.body.proportion_space import ProportionSpace
-from preprocess.body.silhouette import SkinPoints, signed_distance_px, splat_silhouette
 
 OUTLINE_PERSON_PX = 128
 """Height of a person in the reduced masks, px: a pixel is about 1.4 cm."""

@@ -30,11 +30,10 @@ from preprocess.alignment.mask_alignment import (
 )
 from preprocess.alignment.silhouette_objective import MaskSample, SilhouetteObjective
 from preprocess.body.body_pose import BodyPose, Motion
+from preprocess.body.body_surface import SILHOUETTE_PERSON_PX, SkinPoints
 from preprocess.body.kinematics import rotation_matrices
 from preprocess.body.parametric_body import ShapedBody
-from preprocess.body.silhouette import SILHOUETTE_PERSON_PX, SkinPoints
-from preprocess.observation import Observation
-from preprocess.observe import DroppedFrame
+from preprocess.observation import DroppedFrame, Observation
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

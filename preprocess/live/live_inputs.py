@@ -14,9 +14,9 @@ from preprocess.live.live_masks import LiveMasks, check_mask_folder
 from preprocess.live.live_poses import LivePoses
 from preprocess.masks.given_mask_refinement import GivenMaskRefiner
 from preprocess.masks.mask_origin import MaskOrigin, Segmenter, choose_mask_origin
-from preprocess.observation import Observation
-from preprocess.observe import (
+from preprocess.observation import (
     DroppedFrame,
+    Observation,
     alpha_channel_mask,
     compose_observation_builder,
     shrink_to_longer_side,

@@ -9,8 +9,8 @@ import numpy as np
 from capture.input_error import InputError
 from capture.source import Frame, PacingClock
 from preprocess.body.body_pose import BodyPose, Motion
-from preprocess.pose_formats.pose_format_registry import read_poses
 from preprocess.poses.plausibility import invalidate_implausible_rows, require_plausible
+from preprocess.poses.pose_format_registry import read_poses
 
 MAX_WAIT_S = 2.0
 """So long after it was filmed a frame waits for its pose or its mask; then it is left out."""

@@ -33,8 +33,12 @@ from preprocess.fitting.tracked_frames import (
 from preprocess.live.live_alignment import LiveAlignment
 from preprocess.masks.given_mask_refinement import GivenMaskRefiner
 from preprocess.masks.mask_origin import Segmenter
-from preprocess.observation import Observation
-from preprocess.observe import DroppedFrame, compose_observation_builder, shrink_to_longer_side
+from preprocess.observation import (
+    DroppedFrame,
+    Observation,
+    compose_observation_builder,
+    shrink_to_longer_side,
+)
 from preprocess.tracking.person_tracker import PersonTracker
 from preprocess.tracking.video_tracking import MaskRefinement
 

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Shaped
 
-from preprocess.body.silhouette import signed_distance_px
+from preprocess.body.body_surface import signed_distance_px
 
 BORDER_SIGMA_PX = 0.35
 """Standard deviation of a mask's border error, px."""

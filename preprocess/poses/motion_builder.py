@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from preprocess.body.body_pose import Motion, PoseSpace, RelativeFocalLength, RootAnchor
-from preprocess.body.rotations import slerp, stack_axis_angles
+from preprocess.body.kinematics import slerp, stack_axis_angles
 
 MotionByPerson = dict[str, Motion]
 """By the name that the file gives each, in the file's order."""

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from capture.input_error import InputError
 from preprocess.body.body_pose import Motion, PoseSpace
-from preprocess.body.rotations import stack_axis_angles
+from preprocess.body.kinematics import stack_axis_angles
 from preprocess.file_content import read_npz
 from preprocess.tracking.keypoint_track import KeypointTrack
 

@@ -11,9 +11,8 @@ from jaxtyping import Float
 
 from capture.camera import Camera
 from preprocess.body.body_pose import Motion
-from preprocess.body.kinematics import rotation_matrices
+from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
 from preprocess.body.parametric_body import ShapedBody
-from preprocess.body.rotations import axis_angles_from_matrices
 from preprocess.cameras.camera_file import CameraTrack, tracker_intrinsic_matrix
 from preprocess.cameras.named_camera import invert_rigid
 

@@ -2,47 +2,132 @@
 
 Key frames, features, matches, the global mapping, the incremental one as a second opinion, then
 the frames in between. Two mappings that agree, and points followed from key frame to key frame
-that land where the next camera sees them: less is not believed.
+that land where the next camera sees them: less is not believed. Finished stages are not repeated.
 """
 
+import json
 import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, final
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from capture.atomic_files import write_text_atomically
 from capture.input_error import InputError
+from capture.process_metrics import peak_memory_mb
 from capture.source import FrameSource
 from preprocess.frame_association import interpolate_missing_cameras
 from preprocess.sfm import colmap_mapping
 from preprocess.sfm.camera_solution import (
     INTERPOLATED,
     KEY,
+    MIN_REGISTERED_FRACTION,
     MISSING,
     PLACED,
     CameraSolution,
-    SparseModel,
-)
-from preprocess.sfm.colmap_mapping import ColmapWorkspace
-from preprocess.sfm.point_tracking import StaticCameraTest, detect_static_camera
-from preprocess.sfm.quality_gates import (
-    MIN_REGISTERED_FRACTION,
     QualityGate,
+    SparseModel,
     compare_models,
     evaluate_gates,
     find_outlier_cameras,
 )
-from preprocess.sfm.resection import ResectionResult, resect_intermediate_frames
-from preprocess.sfm.sfm_keyframes import (
+from preprocess.sfm.colmap_mapping import (
     MAX_KEYFRAMES,
+    ColmapWorkspace,
     PersonMaskFn,
     SfmKeyframe,
     read_keyframes,
     select_keyframes,
     write_keyframes,
 )
-from preprocess.sfm.stage_cache import StageCache, StageProgressFn
+from preprocess.sfm.point_tracking import (
+    ResectionResult,
+    StaticCameraTest,
+    detect_static_camera,
+    resect_intermediate_frames,
+)
+
+STAGES_FILE = "stages.json"
+"""What the folder's stages have cost, by name."""
+StageProgressFn = Callable[[str, float], None]
+"""Called now and then with a stage's name and how much of it is done, in [0, 1]."""
+
+
+@final
+class StageCache:
+    """Names the parts of the work, times them, and remembers which are done.
+
+    A stage writes to a name that passes (`.part`); its result takes its own name when it is whole.
+
+    Attributes:
+        folder: Where results lie.
+        costs: Of each finished stage: wall and core seconds, also from an earlier process.
+    """
+
+    def __init__(self, folder: Path, told: StageProgressFn) -> None:
+        """Takes up what lies in the folder."""
+        folder.mkdir(parents=True, exist_ok=True)
+        self.folder, self._told = folder, told
+        self._notes = folder / STAGES_FILE
+        self.costs: dict[str, dict[str, float]] = {}
+        if self._notes.exists():
+            self.costs = json.loads(self._notes.read_text(encoding="utf-8"))
+
+    def run_or_reuse(
+        self, name: str, make: Callable[[Path, Callable[[float], None]], None]
+    ) -> Path:
+        """The file or folder of a stage, made if it is not there yet.
+
+        Args:
+            name: Of the result.
+            make: Writes it to a path, telling how far it is.
+        """
+        path = self.folder / name
+        if path.exists() and name in self.costs:
+            return path
+        part = self.folder / f"part.{name}"
+        for old in (part, path):
+            _remove(old)
+        with self._timed(name):
+            make(part, lambda share: self._told(name, share))
+            part.rename(path)
+        return path
+
+    @contextmanager
+    def _timed(self, name: str) -> Iterator[None]:
+        wall, core = time.perf_counter(), time.process_time()
+        self._told(name, 0.0)
+        yield
+        self._told(name, 1.0)
+        self.costs[name] = {
+            "wall_seconds": time.perf_counter() - wall,
+            "cpu_seconds": time.process_time() - core,
+            "peak_memory_mb": peak_memory_mb(),
+        }
+        write_text_atomically(self._notes, json.dumps(self.costs, indent=1))
+
+    def totals(self) -> dict[str, Any]:
+        """Time and memory of all stages together, for the report."""
+        return {
+            "wall_seconds": sum(cost["wall_seconds"] for cost in self.costs.values()),
+            "cpu_seconds": sum(cost["cpu_seconds"] for cost in self.costs.values()),
+            "peak_memory_mb": max(
+                (cost["peak_memory_mb"] for cost in self.costs.values()), default=0.0
+            ),
+        }
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
 
 SEED_OFFSETS = (0, 1)
 """Added to the seed for each pair of mappings; the second pair is made if the first disagrees."""

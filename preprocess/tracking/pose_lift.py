@@ -12,9 +12,8 @@ from jaxtyping import Float
 
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose, Motion
-from preprocess.body.kinematics import rotation_matrices
+from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
 from preprocess.body.parametric_body import ShapedBody
-from preprocess.body.rotations import axis_angles_from_matrices
 from preprocess.poses.motion_builder import fill_gaps
 from preprocess.poses.root_placement import place_by_pixels
 from preprocess.tracking.keypoint_track import KeypointTrack

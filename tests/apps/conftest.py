@@ -10,7 +10,7 @@ import pytest
 
 from apps import ingest, play
 from apps.run import package_snapshot, report_writer, session_start
-from avatar.deformation.rig import Rig
+from avatar.rig import Rig
 from avatar.training import held_out_pose_fitting, warmup
 from capture.atomic_files import write_text_atomically
 from export.bake import bake_tables, fine_tuning

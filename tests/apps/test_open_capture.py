@@ -11,11 +11,10 @@ from PIL import Image
 
 from benchmarks import capture_corruptions
 from capture.input_error import InputError
-from preprocess.body.kinematics import rotation_matrices
-from preprocess.body.rotations import axis_angles_from_matrices
+from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.open_capture import open_capture
-from preprocess.pose_formats.pose_format_registry import read_poses
+from preprocess.poses.pose_format_registry import read_poses
 from preprocess.poses.root_placement import SMPLX_PELVIS, place_in_camera_world
 
 

@@ -4,10 +4,9 @@ import pytest
 import torch
 
 from avatar import backends
-from avatar.backends import backend_for, failing_operation
+from avatar.backends import TorchBackend, backend_for, failing_operation
 from avatar.kernels.backend_protocol import RaySamples, SolvedCorrespondences
-from avatar.kernels.torch_backend import TorchBackend
-from avatar.numba_kernels.numba_backend import NumbaBackend
+from avatar.kernels.numba_backend import NumbaBackend
 
 
 class Spoiled:

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from avatar import render as render_module
 from avatar.config import TrainConfig
-from avatar.deformation.correspondence_check import CorrespondenceCheck
+from avatar.correspondence_grid import CorrespondenceCheck
 from avatar.kernels.backend_protocol import MarchSettings, RayBatch
 from avatar.render import MIN_TRANSMITTANCE, BodyFrameRays, correspondence_tables, render
 from avatar.training.trainer import Trainer

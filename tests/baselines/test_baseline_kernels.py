@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from avatar.backends import TorchBackend
 from avatar.config import TrainConfig
 from avatar.kernels.backend_protocol import RayBatch
-from avatar.kernels.torch_backend import TorchBackend
-from avatar.numba_kernels.numba_backend import NumbaBackend
+from avatar.kernels.numba_backend import NumbaBackend
 from avatar.training.trainer import Trainer
 from baselines.instant_avatar.broyden_kernels import SAME_ROOT_M, find_all_roots
 from baselines.instant_avatar.occupied_samples import PosedOccupancy, sample_occupied_cells

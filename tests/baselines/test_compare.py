@@ -10,7 +10,7 @@ import pytest
 from baselines import compare, comparison_scores
 from baselines.comparison_table import comparison_table, time_to_reach, with_better_poses
 from baselines.systems import compared_capture
-from preprocess.body.body_file import load_body_model
+from preprocess.body.parametric_body import load_body_model
 from studio.shoot import ShootConfig, film_capture
 
 

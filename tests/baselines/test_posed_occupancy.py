@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from avatar.config import TrainConfig
-from avatar.deformation.correspondence_grid import CorrespondenceGrid
+from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.render import correspondence_tables
 from avatar.training.trainer import Trainer
 from baselines.instant_avatar.posed_field import CanonicalPoints, CorrespondenceWarp, PosedField

@@ -34,7 +34,7 @@ from capture.image_folder import write_png
 from capture.source_opening import open_source
 from capture.video_encoder import lossless_video
 from preprocess.body.body_pose import Motion
-from preprocess.body.silhouette import MeshSilhouette
+from preprocess.body.body_surface import MeshSilhouette
 from preprocess.cameras.camera_file import CameraTrack, write_cameras
 from preprocess.capture_paths import find_own_masks, find_own_poses
 from preprocess.poses.pose_file import write_motion

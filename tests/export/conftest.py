@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.spatial import KDTree
 
-from avatar.deformation.rig import Rig
+from avatar.rig import Rig
 from capture.camera import Camera
 from export.bake.bake_tables import BakeConfig, bake_field
 from export.build import ExportReport, export_field

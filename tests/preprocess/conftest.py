@@ -12,10 +12,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from capture.camera import Camera
-from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import PARENTS
-from preprocess.body.parametric_body import ShapedBody
+from preprocess.body.parametric_body import ShapedBody, load_body_model
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.fitting.keypoint_rows import KEYPOINT_JOINTS, KeypointModel
 from preprocess.tracking.keypoint_track import KeypointTrack

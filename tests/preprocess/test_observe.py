@@ -12,8 +12,13 @@ from capture.source_opening import open_source
 from preprocess.body.body_pose import Motion
 from preprocess.cameras.camera_file import CameraTrack, assume_static_camera
 from preprocess.masks.mask_files import open_masks
-from preprocess.observation import Observation
-from preprocess.observe import DroppedFrame, associate_poses, observe, shrink_to_longer_side
+from preprocess.observation import (
+    DroppedFrame,
+    Observation,
+    associate_poses,
+    observe,
+    shrink_to_longer_side,
+)
 
 SIZE = (48, 64)
 COUNT = 8

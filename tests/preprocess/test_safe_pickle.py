@@ -20,7 +20,7 @@ from scipy import sparse
 
 from capture.input_error import InputError
 from preprocess import safe_pickle
-from preprocess.body.body_file import load_body_model
+from preprocess.body.parametric_body import load_body_model
 from preprocess.safe_pickle import read_pickled_arrays
 
 

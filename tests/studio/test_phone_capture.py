@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from capture.input_error import InputError
-from preprocess.body.body_file import load_body_model
-from preprocess.body.kinematics import rotation_matrices
-from preprocess.body.rotations import axis_angles_from_matrices
-from preprocess.body.silhouette import MeshSilhouette, soft_iou
+from preprocess.body.body_surface import MeshSilhouette, soft_iou
+from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
+from preprocess.body.parametric_body import load_body_model
 from preprocess.cameras.camera_file import read_cameras
 from preprocess.capture_session import CaptureInputs
 from preprocess.observation import Observation

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from capture.atomic_files import LIST_NAME as LIST
 from capture.input_error import InputError
 from capture.source_opening import open_source
-from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import BodyPose, Motion
+from preprocess.body.parametric_body import load_body_model
 from preprocess.poses.pose_file import read_motion, write_motion
 from studio import actor_motions
 from studio.actor import A_POSE, Actor, build_layers

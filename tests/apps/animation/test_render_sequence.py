@@ -15,8 +15,7 @@ from apps.animation.following_camera import FollowingCamera, canonical_pose_of
 from apps.animation.viewpoint import Viewpoint
 from apps.report import hardware
 from export.player import Player
-from preprocess.body.kinematics import rotation_matrices
-from preprocess.body.rotations import axis_angles_from_matrices
+from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
 from preprocess.poses.pose_file import read_motion
 
 SIZE = 96

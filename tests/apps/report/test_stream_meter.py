@@ -9,7 +9,7 @@ import pytest
 
 from apps.report.stream_meter import MAX_DROPPED_LISTED, StreamMeter
 from capture.source import Frame, FrameSelection
-from preprocess.observe import DroppedFrame
+from preprocess.observation import DroppedFrame
 
 
 class Recorded:

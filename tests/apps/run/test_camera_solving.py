@@ -29,8 +29,7 @@ from preprocess.cameras.camera_file import read_cameras, write_cameras
 from preprocess.capture_session import CaptureInputs
 from preprocess.open_capture import open_capture
 from preprocess.poses.pose_file import read_motion
-from preprocess.sfm.camera_solution import CameraSolution
-from preprocess.sfm.quality_gates import fit_similarity
+from preprocess.sfm.camera_solution import CameraSolution, fit_similarity
 from studio.shoot import ShootConfig, film_capture
 
 FRAMES = 14

@@ -9,7 +9,7 @@ import torch
 
 from avatar.training import checkpoint
 from preprocess.alignment.mask_alignment import body_height_m
-from preprocess.body.body_file import load_body_model, read_shaped_body
+from preprocess.body.parametric_body import load_body_model, read_shaped_body
 
 GIVEN = "--no-refine-poses"
 """What is shown here is not how poses are refined; fits of held-out frames take a while."""

@@ -11,14 +11,14 @@ from apps.view.live_viewer import render_preview
 from apps.view.preview_poses import DANCE, FILMED, NEWEST, POSE_CHOICES, STANDING, PreviewPoses
 from apps.view.viser_page import BACKGROUND_RGB, BrowserCamera
 from avatar.config import TrainConfig
-from avatar.deformation.correspondence_grid import CorrespondenceGrid
+from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.coverage import Coverage
 from avatar.render import render
 from avatar.training.frame_stream import separate_held_out
 from avatar.training.trainer import Trainer
 from preprocess.body.kinematics import rotation_matrices
 from preprocess.capture_session import Capture, CaptureInputs
-from preprocess.observe import DroppedFrame
+from preprocess.observation import DroppedFrame
 from preprocess.open_capture import open_capture
 
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from avatar.config import TrainConfig
-from avatar.deformation.correspondence_grid import CorrespondenceGrid
+from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.held_out import (
     HeldOutFrame,
     add_held_out,
@@ -25,8 +25,7 @@ from avatar.training.training_frame import TrainingFrame
 from capture.camera import Camera
 from capture.source import Frame
 from preprocess.body.body_pose import BodyPose
-from preprocess.observation import Observation
-from preprocess.observe import DroppedFrame
+from preprocess.observation import DroppedFrame, Observation
 
 
 def held_of(total, every=10):

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.deformation.rig import PART_OF_JOINT
 from avatar.field.occupancy_grid import (
     INTERIOR_DEPTH_M,
     MIN_STEP_OPACITY,
@@ -19,6 +18,7 @@ from avatar.field.occupancy_grid import (
     find_floaters,
     inner_leg_cells,
 )
+from avatar.rig import PART_OF_JOINT
 
 CPU = torch.device("cpu")
 STEP_M = 0.01

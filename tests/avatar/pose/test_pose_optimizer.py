@@ -7,18 +7,18 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from avatar.backends import TorchBackend
 from avatar.config import TrainConfig
-from avatar.deformation.correspondence_grid import CorrespondenceGrid
+from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
-from avatar.kernels import torch_skinning
+from avatar.kernels import torch_correspondence
 from avatar.kernels.backend_protocol import (
     FEATURES_PER_LEVEL,
     CorrespondenceTables,
     HashLevels,
     RaySamples,
 )
-from avatar.kernels.torch_backend import TorchBackend
-from avatar.numba_kernels.numba_backend import NumbaBackend
+from avatar.kernels.numba_backend import NumbaBackend
 from avatar.pose.pose_optimizer import (
     FIRST_CORRECTION_STEPS,
     FREEZE_AFTER_STEPS,
@@ -73,7 +73,7 @@ def samples_near_the_skin(rig, count, generator):
 def jacobians(table, points, slot):
     """Inverse Jacobians of skinning at the points, by autograd."""
     leaf = points.clone().requires_grad_()
-    posed = torch_skinning.skin_points(leaf, *table.skinning, table.bones[slot])
+    posed = torch_correspondence.skin_points(leaf, *table.skinning, table.bones[slot])
     rows = [torch.autograd.grad(posed[:, k].sum(), leaf, retain_graph=True)[0] for k in range(3)]
     return torch.linalg.inv(torch.stack(rows, dim=1))
 
@@ -143,7 +143,7 @@ def residual(rig, table, cells, roots, bones):
     """How far each root, skinned, is from its cell's centre."""
     place = np.argwhere(cells.packed_cells > 0)
     rows = cells.packed_cells[tuple(place.T)] >> 3
-    posed = torch_skinning.skin_points(roots[rows, :3], *table.skinning, bones).numpy()
+    posed = torch_correspondence.skin_points(roots[rows, :3], *table.skinning, bones).numpy()
     return np.linalg.norm(posed - (cells.low + (place + 0.5) * cells.cell_m), axis=1)
 
 
@@ -161,7 +161,9 @@ def test_the_poses_gradient_is_what_the_roots_do_when_the_pose_moves(rig, table,
     table.accumulate(slots.long(), wrenches, torch.ones(1))
     (gradient,) = table.pose_gradients(1)
     given = (
-        torch_skinning.skin_points(samples.points, *table.skinning, table.bones[1]).double().numpy()
+        torch_correspondence.skin_points(samples.points, *table.skinning, table.bones[1])
+        .double()
+        .numpy()
     )
 
     def pulled(joint: int, axis: int, size: float) -> float:
@@ -171,7 +173,7 @@ def test_the_poses_gradient_is_what_the_roots_do_when_the_pose_moves(rig, table,
         target = root.pivot + (given - root.pivot - root.shift) @ root.rotation
         x = samples.points.clone()
         for _ in range(8):
-            off = torch.from_numpy(target).float() - torch_skinning.skin_points(
+            off = torch.from_numpy(target).float() - torch_correspondence.skin_points(
                 x, *table.skinning, table.bones[1]
             )
             x = x + (roots[1, :, 3:].unflatten(1, (3, 3)) @ off[..., None])[..., 0]

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from avatar.config import TrainConfig
-from avatar.deformation.rig import Rig
 from avatar.render import render
+from avatar.rig import Rig
 from avatar.training import checkpoint
 from avatar.training.trainer import Trainer
 from avatar.training.training_frame import prepare_frame

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import torch
 
+from avatar.backends import TorchBackend
 from avatar.config import TrainConfig
-from avatar.deformation.rig import Rig
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.evaluation.image_metrics import soft_iou
 from avatar.field.avatar_model import Avatar
@@ -26,10 +26,10 @@ from avatar.kernels.backend_protocol import (
     MarchSettings,
     RayBatch,
 )
-from avatar.kernels.torch_backend import TorchBackend
+from avatar.kernels.numba_backend import NumbaBackend
 from avatar.kernels.torch_reference import OPAQUE_DEPTH
-from avatar.numba_kernels.numba_backend import NumbaBackend
 from avatar.render import render
+from avatar.rig import Rig
 from avatar.training.frame_stream import prepare_stream
 from avatar.training.optimizer import cosine_decay
 from avatar.training.trainer import Trainer

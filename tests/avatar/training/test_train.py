@@ -20,7 +20,7 @@ from avatar.training.train import train
 from avatar.training.trainer import Trainer
 from avatar.training.training_frame import prepare_frame
 from capture.inbox import Inbox
-from preprocess.observe import DroppedFrame
+from preprocess.observation import DroppedFrame
 
 CPU = torch.device("cpu")
 QUICK = TrainConfig(

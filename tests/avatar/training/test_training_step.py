@@ -6,12 +6,12 @@ import math
 import pytest
 import torch
 
+from avatar.backends import TorchBackend
 from avatar.config import MAX_SAMPLE_STEP_M, TrainConfig
 from avatar.field import field_priors
 from avatar.kernels import torch_reference
 from avatar.kernels.backend_protocol import MarchSettings, RaySamples
-from avatar.kernels.torch_backend import TorchBackend
-from avatar.numba_kernels.numba_backend import NumbaBackend
+from avatar.kernels.numba_backend import NumbaBackend
 from avatar.pose.pose_optimizer import PoseOptimizer
 from avatar.training.optimizer import cosine_decay
 from avatar.training.trainer import Trainer

@@ -11,10 +11,10 @@ from capture.camera import Camera
 from capture.source_opening import open_source
 from preprocess.alignment.capture_alignment import place_motion
 from preprocess.alignment.capture_evidence import CaptureEvidence
-from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import Motion
+from preprocess.body.body_surface import SkinPoints, splat_silhouette
+from preprocess.body.parametric_body import load_body_model
 from preprocess.body.proportion_space import shape_for_motion
-from preprocess.body.silhouette import SkinPoints, splat_silhouette
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.masks.mask_files import open_masks
 

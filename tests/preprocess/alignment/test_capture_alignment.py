@@ -12,11 +12,16 @@ from capture.source_opening import open_source
 from preprocess.alignment.capture_alignment import BodyAlignment, align_body, align_to_person
 from preprocess.alignment.capture_evidence import CaptureEvidence
 from preprocess.alignment.mask_alignment import body_height_m, scale_to_height
-from preprocess.body.body_file import load_body_model, read_shaped_body, write_shaped_body
 from preprocess.body.body_pose import Motion
-from preprocess.body.parametric_body import BodyModel, ShapedBody
+from preprocess.body.body_surface import SkinPoints, splat_silhouette
+from preprocess.body.parametric_body import (
+    BodyModel,
+    ShapedBody,
+    load_body_model,
+    read_shaped_body,
+    write_shaped_body,
+)
 from preprocess.body.proportion_space import shape_for_motion
-from preprocess.body.silhouette import SkinPoints, splat_silhouette
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.live.live_alignment import LiveAlignment
 from preprocess.masks.mask_files import open_masks

@@ -9,11 +9,15 @@ from capture.camera import Camera
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.mask_alignment import BodyPlacement, place_body_on_masks
 from preprocess.alignment.silhouette_objective import MaskSample, SilhouetteObjective
-from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import Motion
-from preprocess.body.parametric_body import ShapedBody, smpl_rest_joints, with_smpl_joints
+from preprocess.body.body_surface import SkinPoints, splat_silhouette
+from preprocess.body.parametric_body import (
+    ShapedBody,
+    load_body_model,
+    smpl_rest_joints,
+    with_smpl_joints,
+)
 from preprocess.body.proportion_space import shape_for_motion
-from preprocess.body.silhouette import SkinPoints, splat_silhouette
 
 SIZE = (96, 128)
 FRAMES = 6

@@ -14,7 +14,7 @@ from preprocess.blazepose.blazepose_segmenter import (
     _limit_to_body,
 )
 from preprocess.body.body_pose import BodyPose
-from preprocess.body.silhouette import soft_iou
+from preprocess.body.body_surface import soft_iou
 from preprocess.tracking.keypoints import CroppedMask
 from studio import actor_motions
 from studio.actor import Actor

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from capture.input_error import InputError
-from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import PARENTS
-from preprocess.body.parametric_body import BodyModel
+from preprocess.body.parametric_body import BodyModel, load_body_model
 
 
 @pytest.fixture

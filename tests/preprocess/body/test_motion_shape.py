@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from capture.input_error import InputError
-from preprocess.body.body_file import load_body_model
+from preprocess.body.parametric_body import load_body_model
 from preprocess.body.proportion_space import ProportionSpace, shape_for_motion
 
 

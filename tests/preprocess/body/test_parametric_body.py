@@ -8,10 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import preprocess
-from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import JOINT_NAMES
-from preprocess.body.parametric_body import BodyModel, betas_for_motion
+from preprocess.body.parametric_body import BodyModel, betas_for_motion, load_body_model
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,8 @@ import pytest
 
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
+from preprocess.body.body_surface import MeshSilhouette, SkinPoints, soft_iou, splat_silhouette
 from preprocess.body.kinematics import rotation_matrices
-from preprocess.body.silhouette import MeshSilhouette, SkinPoints, soft_iou, splat_silhouette
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from preprocess.body.kinematics import rotation_matrices
+from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
 from preprocess.body.proportion_space import ProportionSpace
-from preprocess.body.rotations import axis_angles_from_matrices
 from preprocess.capture_session import CaptureInputs
 from preprocess.fitting.capture_fit import CaptureFit
 from preprocess.fitting.capture_fitting import apply_fit, fit_capture

@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from capture.camera import Camera
-from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import BodyPose, Motion
+from preprocess.body.body_surface import SkinPoints, splat_silhouette
+from preprocess.body.parametric_body import load_body_model
 from preprocess.body.proportion_space import ProportionSpace
-from preprocess.body.silhouette import SkinPoints, splat_silhouette
 from preprocess.fitting.clip_fitting import ClipFitter, ClipFrame, FitParameters
 from preprocess.fitting.outlines import OUTLINE_SKIN_POINTS, OutlineDistances
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from capture.camera import Camera
-from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import BodyPose
+from preprocess.body.body_surface import SkinPoints, splat_silhouette
 from preprocess.body.kinematics import joint_transforms, rotation_matrices
+from preprocess.body.parametric_body import load_body_model
 from preprocess.body.proportion_space import ProportionSpace
-from preprocess.body.silhouette import SkinPoints, splat_silhouette
 from preprocess.fitting.clip_fitting import correct_pose
 from preprocess.fitting.outlines import OUTLINE_SKIN_POINTS, OutlineDistances, OutlineModel
 

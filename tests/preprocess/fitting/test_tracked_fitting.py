@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from preprocess.body.body_file import load_body_model
 from preprocess.body.body_pose import BodyPose, Motion, RelativeFocalLength
-from preprocess.body.parametric_body import ShapedBody
+from preprocess.body.parametric_body import ShapedBody, load_body_model
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.fitting import capture_fitting
 from preprocess.fitting.capture_fitting import apply_fit, fit_capture, fitted_motion

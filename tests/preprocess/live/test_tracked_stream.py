@@ -8,14 +8,13 @@ import pytest
 
 from capture.input_error import InputError
 from capture.source import Frame
-from preprocess.body.body_file import load_body_model
-from preprocess.body.silhouette import splat_silhouette
+from preprocess.body.body_surface import splat_silhouette
+from preprocess.body.parametric_body import load_body_model
 from preprocess.cameras.camera_orientation import assume_camera
 from preprocess.fitting.tracked_frames import LAG_FRAMES
 from preprocess.live import tracked_stream
 from preprocess.live.tracked_stream import NOT_FOUND, LiveTracking, TrackedStream
-from preprocess.observation import Observation
-from preprocess.observe import DroppedFrame
+from preprocess.observation import DroppedFrame, Observation
 from preprocess.tracking.keypoints import CroppedMask, PersonKeypoints
 
 COUNT = 24

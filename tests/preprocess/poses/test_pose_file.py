@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from capture.input_error import InputError
-from preprocess.pose_formats.pose_format_registry import read_poses
 from preprocess.poses.pose_file import read_motion, write_motion
+from preprocess.poses.pose_format_registry import read_poses
 from preprocess.tracking.keypoint_track import KeypointTrack
 
 

@@ -12,9 +12,15 @@ from scipy.spatial.transform import Rotation
 from capture.input_error import InputError
 from capture.source_opening import open_source
 from preprocess.sfm import camera_solver, colmap_mapping
-from preprocess.sfm.camera_solution import INTERPOLATED, KEY, PLACED, CameraSolution, SparseModel
+from preprocess.sfm.camera_solution import (
+    INTERPOLATED,
+    KEY,
+    PLACED,
+    CameraSolution,
+    SparseModel,
+    fit_similarity,
+)
 from preprocess.sfm.camera_solver import SolverSettings, solve_cameras
-from preprocess.sfm.quality_gates import fit_similarity
 
 SIZE = (320, 240)
 FRAMES, KEYS = 20, 10

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from preprocess.sfm.quality_gates import (
+from preprocess.sfm.camera_solution import (
     compare_models,
     evaluate_gates,
     find_outlier_cameras,

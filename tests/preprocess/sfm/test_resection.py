@@ -8,9 +8,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from capture.source_opening import open_source
-from preprocess.sfm.point_tracking import detect_corners, detect_static_camera, track_points
-from preprocess.sfm.resection import resect_camera, resect_intermediate_frames
-from preprocess.sfm.sfm_keyframes import SfmKeyframe
+from preprocess.sfm.colmap_mapping import SfmKeyframe
+from preprocess.sfm.point_tracking import (
+    detect_corners,
+    detect_static_camera,
+    resect_camera,
+    resect_intermediate_frames,
+    track_points,
+)
 
 
 def apart(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:

@@ -6,7 +6,7 @@ import pytest
 
 from capture.input_error import InputError
 from capture.source_opening import open_source
-from preprocess.sfm.sfm_keyframes import (
+from preprocess.sfm.colmap_mapping import (
     dilate_person,
     read_keyframes,
     select_keyframes,

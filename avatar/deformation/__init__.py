@@ -1,1 +1,0 @@
-"""Deformation: the rig, skinning and its inverse."""

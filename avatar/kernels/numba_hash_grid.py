@@ -1,0 +1,199 @@
+"""Hash-grid encoding and its gradients, compiled for the CPU.
+
+Points are worked on in blocks that stay in the nearest cache: first where all of a block's corners
+lie, in loops over points that LLVM vectorises, then the entries themselves, four features at once.
+Threads own blocks of points or, where the table's gradient is summed, whole levels, so that no two
+write to one place: no atomics, and the same sums for any number of threads.
+"""
+
+import numpy as np
+from numba import get_num_threads, prange
+
+from avatar.kernels.backend_protocol import FEATURES_PER_LEVEL, PRIMES
+from avatar.kernels.kernel_compiler import (
+    FAST_MATH,
+    add4,
+    compile_kernel,
+    dot4,
+    load4,
+    scale4,
+    store4,
+)
+
+POINTS_PER_BLOCK = 256
+F32, I32, U32 = np.float32, np.int32, np.uint32
+PRIME_Y, PRIME_Z = U32(PRIMES[1]), U32(PRIMES[2])
+
+
+@compile_kernel(inline="always")
+def _box_coordinates(points, start, stop, low, places):
+    """Where the points of a block lie in the box, metres."""
+    for i in range(stop - start):
+        for axis in range(3):
+            places[axis, i] = points[start + i, axis] - low[axis]
+
+
+@compile_kernel(inline="always")
+def _locate_cells(places, number, scale, counts, cells, within):
+    """The cell of each place on one level, and where in it the place lies."""
+    for axis in range(3):
+        last = I32(counts[axis] - 2)
+        for i in range(number):
+            place = places[axis, i] * scale
+            cell = min(max(I32(place), I32(0)), last)
+            cells[axis, i] = cell
+            within[axis, i] = place - F32(cell)
+
+
+@compile_kernel(inline="always")
+def _corner_entries(cells, number, counts, dense, first, size, entries):
+    """Entries of the corners of each cell, x fastest."""
+    if dense == 1:
+        along_y, along_z = counts[0], counts[0] * counts[1]
+        for i in range(number):
+            near = I32(first + cells[0, i] + along_y * cells[1, i] + along_z * cells[2, i])
+            far = I32(near + along_z)
+            entries[0, i], entries[1, i] = near, near + 1
+            entries[2, i], entries[3, i] = near + along_y, near + along_y + 1
+            entries[4, i], entries[5, i] = far, far + 1
+            entries[6, i], entries[7, i] = far + along_y, far + along_y + 1
+    else:
+        mask = U32(size - 1)
+        for i in range(number):
+            x0, x1 = U32(cells[0, i]), U32(cells[0, i] + 1)
+            y0, z0 = U32(U32(cells[1, i]) * PRIME_Y), U32(U32(cells[2, i]) * PRIME_Z)
+            y1, z1 = U32(y0 + PRIME_Y), U32(z0 + PRIME_Z)
+            a, b, c, d = U32(y0 ^ z0), U32(y1 ^ z0), U32(y0 ^ z1), U32(y1 ^ z1)
+            entries[0, i], entries[1, i] = first + ((x0 ^ a) & mask), first + ((x1 ^ a) & mask)
+            entries[2, i], entries[3, i] = first + ((x0 ^ b) & mask), first + ((x1 ^ b) & mask)
+            entries[4, i], entries[5, i] = first + ((x0 ^ c) & mask), first + ((x1 ^ c) & mask)
+            entries[6, i], entries[7, i] = first + ((x0 ^ d) & mask), first + ((x1 ^ d) & mask)
+
+
+@compile_kernel(inline="always")
+def _trilinear_weights(within, number, weights):
+    """Trilinear weights of the corners."""
+    for i in range(number):
+        x, y, z = within[0, i], within[1, i], within[2, i]
+        u, v, w = F32(1) - x, F32(1) - y, F32(1) - z
+        a, b, c, d = u * v, x * v, u * y, x * y
+        weights[0, i], weights[1, i], weights[2, i], weights[3, i] = a * w, b * w, c * w, d * w
+        weights[4, i], weights[5, i], weights[6, i], weights[7, i] = a * z, b * z, c * z, d * z
+
+
+@compile_kernel(parallel=True, **FAST_MATH)
+def encode(points, low, cells_per_m, counts, dense, offsets, table, features):
+    """Trilinear features of all levels; points outside the box extrapolate from its border."""
+    for block in prange((points.shape[0] + POINTS_PER_BLOCK - 1) // POINTS_PER_BLOCK):
+        start = block * POINTS_PER_BLOCK
+        number = min(points.shape[0] - start, POINTS_PER_BLOCK)
+        places, within = np.empty((3, POINTS_PER_BLOCK), F32), np.empty((3, POINTS_PER_BLOCK), F32)
+        cells = np.empty((3, POINTS_PER_BLOCK), I32)
+        entries, weights = (
+            np.empty((8, POINTS_PER_BLOCK), I32),
+            np.empty((8, POINTS_PER_BLOCK), F32),
+        )
+        _box_coordinates(points, start, start + number, low, places)
+        for level in range(cells_per_m.shape[0]):
+            first, size = offsets[level], offsets[level + 1] - offsets[level]
+            _locate_cells(places, number, cells_per_m[level], counts[level], cells, within)
+            _corner_entries(cells, number, counts[level], dense[level], first, size, entries)
+            _trilinear_weights(within, number, weights)
+            for i in range(number):
+                total = scale4(weights[0, i], load4(table, entries[0, i], 0))
+                for corner in range(1, 8):
+                    entry = load4(table, entries[corner, i], 0)
+                    total = add4(total, scale4(weights[corner, i], entry))
+                store4(features, start + i, level * FEATURES_PER_LEVEL, total)
+
+
+@compile_kernel(parallel=True, **FAST_MATH)
+def _encode_backward(
+    points, low, cells_per_m, counts, dense, offsets, grad_features, grad_table, threads
+):
+    for thread in prange(threads):
+        places, within = np.empty((3, POINTS_PER_BLOCK), F32), np.empty((3, POINTS_PER_BLOCK), F32)
+        cells = np.empty((3, POINTS_PER_BLOCK), I32)
+        entries, weights = (
+            np.empty((8, POINTS_PER_BLOCK), I32),
+            np.empty((8, POINTS_PER_BLOCK), F32),
+        )
+        for start in range(0, points.shape[0], POINTS_PER_BLOCK):
+            number = min(points.shape[0] - start, POINTS_PER_BLOCK)
+            _box_coordinates(points, start, start + number, low, places)
+            for level in range(thread, cells_per_m.shape[0], threads):
+                first, size = offsets[level], offsets[level + 1] - offsets[level]
+                _locate_cells(places, number, cells_per_m[level], counts[level], cells, within)
+                _corner_entries(cells, number, counts[level], dense[level], first, size, entries)
+                _trilinear_weights(within, number, weights)
+                for i in range(number):
+                    grad = load4(grad_features, start + i, level * FEATURES_PER_LEVEL)
+                    for corner in range(8):
+                        entry = entries[corner, i]
+                        added = scale4(weights[corner, i], grad)
+                        store4(grad_table, entry, 0, add4(load4(grad_table, entry, 0), added))
+
+
+def encode_backward(
+    points, low, cells_per_m, counts, dense, offsets, grad_features, grad_table
+) -> None:
+    """Adds the gradient of `encode` with respect to its table to `grad_table`."""
+    _encode_backward(
+        points, low, cells_per_m, counts, dense, offsets, grad_features, grad_table,
+        get_num_threads(),
+    )  # fmt: skip
+
+
+@compile_kernel(inline="always")
+def _add_point_gradient(within, corner_gradients, number, scale, total):
+    """Adds one level's gradient, from what pulls at the corners of each cell."""
+    for i in range(number):
+        x, y, z = within[0, i], within[1, i], within[2, i]
+        u, v, w = F32(1) - x, F32(1) - y, F32(1) - z
+        p0, p1, p2, p3 = (
+            corner_gradients[0, i],
+            corner_gradients[1, i],
+            corner_gradients[2, i],
+            corner_gradients[3, i],
+        )
+        p4, p5, p6, p7 = (
+            corner_gradients[4, i],
+            corner_gradients[5, i],
+            corner_gradients[6, i],
+            corner_gradients[7, i],
+        )
+        total[0, i] += scale * (
+            v * w * (p1 - p0) + y * w * (p3 - p2) + v * z * (p5 - p4) + y * z * (p7 - p6)
+        )
+        total[1, i] += scale * (
+            u * w * (p2 - p0) + x * w * (p3 - p1) + u * z * (p6 - p4) + x * z * (p7 - p5)
+        )
+        total[2, i] += scale * (
+            u * v * (p4 - p0) + x * v * (p5 - p1) + u * y * (p6 - p2) + x * y * (p7 - p3)
+        )
+
+
+@compile_kernel(parallel=True, **FAST_MATH)
+def encode_points_backward(
+    points, low, cells_per_m, counts, dense, offsets, table, grad_features, grad_points
+):
+    """Gradient of `encode` with respect to its points, written to `grad_points`."""
+    for block in prange((points.shape[0] + POINTS_PER_BLOCK - 1) // POINTS_PER_BLOCK):
+        start = block * POINTS_PER_BLOCK
+        number = min(points.shape[0] - start, POINTS_PER_BLOCK)
+        places, within = np.empty((3, POINTS_PER_BLOCK), F32), np.empty((3, POINTS_PER_BLOCK), F32)
+        cells, entries = np.empty((3, POINTS_PER_BLOCK), I32), np.empty((8, POINTS_PER_BLOCK), I32)
+        pulls, total = np.empty((8, POINTS_PER_BLOCK), F32), np.zeros((3, POINTS_PER_BLOCK), F32)
+        _box_coordinates(points, start, start + number, low, places)
+        for level in range(cells_per_m.shape[0]):
+            first, size = offsets[level], offsets[level + 1] - offsets[level]
+            _locate_cells(places, number, cells_per_m[level], counts[level], cells, within)
+            _corner_entries(cells, number, counts[level], dense[level], first, size, entries)
+            for i in range(number):
+                grad = load4(grad_features, start + i, level * FEATURES_PER_LEVEL)
+                for corner in range(8):
+                    pulls[corner, i] = dot4(load4(table, entries[corner, i], 0), grad)
+            _add_point_gradient(within, pulls, number, cells_per_m[level], total)
+        for i in range(number):
+            for axis in range(3):
+                grad_points[start + i, axis] = total[axis, i]

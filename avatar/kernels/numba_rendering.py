@@ -1,0 +1,331 @@
+"""Ray marching, volume rendering, its losses and their gradient, compiled for the CPU."""
+
+import numpy as np
+from numba import prange
+
+from avatar.kernels.kernel_compiler import FAST_MATH, NO_ALLOCATION, compile_kernel
+from avatar.kernels.torch_reference import (
+    ALPHA_DEAD_ZONE,
+    COLOR_HUBER_DELTA,
+    MAX_LOG_DENSITY,
+    MIN_NORMAL_DEPTH,
+    OPAQUE_DEPTH,
+)
+
+F32, I32, U32 = np.float32, np.int32, np.uint32
+UNLIMITED_STEPS = 10**9
+"""Opaque margin, in samples, from which a ray does not end at a surface (exact rendering)."""
+
+
+@compile_kernel(inline="always")
+def nonzero(x):
+    """A ray direction's component, kept away from zero so that it can be divided by."""
+    return x if abs(x) > F32(1e-7) else F32(1e-7)
+
+
+@compile_kernel(inline="always", **FAST_MATH)
+def _cell_index(g, count):
+    """Cell along one axis of a position, in cells, that is inside except for rounding."""
+    return U32(min(max(I32(g), I32(0)), count - I32(1)))
+
+
+@compile_kernel(inline="always", **FAST_MATH)
+def _second_order_term(roots, slot, row, x, y, z):
+    """Second-order term Σ c_ij d_i d_j of a bent cell at (x, y, z) from its center."""
+    a, b = row + U32(1), row + U32(2)
+    xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+    return (
+        xx * roots[slot, a, U32(0)] + yy * roots[slot, a, U32(3)] + zz * roots[slot, a, U32(6)]
+        + xy * roots[slot, a, U32(9)] + xz * roots[slot, b, U32(0)] + yz * roots[slot, b, U32(3)],
+        xx * roots[slot, a, U32(1)] + yy * roots[slot, a, U32(4)] + zz * roots[slot, a, U32(7)]
+        + xy * roots[slot, a, U32(10)] + xz * roots[slot, b, U32(1)] + yz * roots[slot, b, U32(4)],
+        xx * roots[slot, a, U32(2)] + yy * roots[slot, a, U32(5)] + zz * roots[slot, a, U32(8)]
+        + xy * roots[slot, a, U32(11)] + xz * roots[slot, b, U32(2)] + yz * roots[slot, b, U32(5)],
+    )  # fmt: skip
+
+
+@compile_kernel(inline="always", **FAST_MATH)
+def canonical_point(roots, slot, row, bent, x, y, z):
+    """The canonical point of what lies (x, y, z) from the centre of a cell with a root."""
+    u = roots[slot, row, U32(0)] + (
+        roots[slot, row, U32(3)] * x + roots[slot, row, U32(4)] * y + roots[slot, row, U32(5)] * z
+    )
+    v = roots[slot, row, U32(1)] + (
+        roots[slot, row, U32(6)] * x + roots[slot, row, U32(7)] * y + roots[slot, row, U32(8)] * z
+    )
+    w = roots[slot, row, U32(2)] + (
+        roots[slot, row, U32(9)] * x + roots[slot, row, U32(10)] * y + roots[slot, row, U32(11)] * z
+    )
+    if bent:
+        a, b, c = _second_order_term(roots, slot, row, x, y, z)
+        u, v, w = u + a, v + b, w + c
+    return u, v, w
+
+
+@compile_kernel(inline="always", **FAST_MATH)
+def _cached_density(occupied, density, low, cells_per_m, x, y, z, needs_density):
+    """Cached density of the canonical cell of a point, 1/m; -1 in empty cells.
+
+    Unless `needs_density`, 0 stands for it: the occupancy alone fits a core's cache.
+    """
+    a = U32(I32(np.floor((x - low[0]) * cells_per_m[0])))  # negative indices wrap to large ones
+    b = U32(I32(np.floor((y - low[1]) * cells_per_m[1])))
+    c = U32(I32(np.floor((z - low[2]) * cells_per_m[2])))
+    if a >= U32(occupied.shape[0]) or b >= U32(occupied.shape[1]) or c >= U32(occupied.shape[2]):
+        return F32(-1)
+    if occupied[a, b, c] == 0:
+        return F32(-1)
+    return density[a, b, c] if needs_density else F32(0)
+
+
+@compile_kernel(parallel=True, **NO_ALLOCATION)
+def march(
+    origins, directions, slots, jitter, sample_step_m,
+    cell_index, cell_roots, cell_low, cell_shape, cell_m,
+    occupied, density, low, cells_per_m, opaque_margin_steps, points, rows, counts, next_steps,
+):  # fmt: skip
+    """Canonical samples along body-frame rays, and the root row that each was warped with.
+
+    Samples lie on the lattice `t = entry + (k + jitter) sample_step_m`. A sample is kept if its
+    cell has a root whose canonical cell is occupied; of several roots the one of highest cached
+    density is used. A ray ends `opaque_margin_steps` samples after its cached optical depth passes
+    `OPAQUE_DEPTH`, or when `points` is full; `next_steps` is the lattice step that continues it.
+    """
+    most = U32(points.shape[1])
+    ends = opaque_margin_steps < UNLIMITED_STEPS
+    cells_a_m, steps_a_m = F32(1) / cell_m, F32(1) / sample_step_m
+    for ray in prange(origins.shape[0]):
+        slot = U32(slots[ray])
+        nx, ny, nz = cell_shape[slot, 0], cell_shape[slot, 1], cell_shape[slot, 2]
+        # positions on the ray are in cells, t is in metres: g = o + t d, and ix = dt / dg_x
+        ox = (origins[ray, 0] - cell_low[slot, 0]) * cells_a_m
+        oy = (origins[ray, 1] - cell_low[slot, 1]) * cells_a_m
+        oz = (origins[ray, 2] - cell_low[slot, 2]) * cells_a_m
+        dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
+        ix, iy, iz = cell_m / nonzero(dx), cell_m / nonzero(dy), cell_m / nonzero(dz)
+        dx, dy, dz = dx * cells_a_m, dy * cells_a_m, dz * cells_a_m
+        ax, ay, az = -ox * ix, -oy * iy, -oz * iz
+        bx, by, bz = (F32(nx) - ox) * ix, (F32(ny) - oy) * iy, (F32(nz) - oz) * iz
+        enter = max(max(min(ax, bx), min(ay, by)), max(min(az, bz), F32(0)))
+        leave = min(min(max(ax, bx), max(ay, by)), max(az, bz))
+        wx = F32(1) if ix > 0 else F32(0)  # the far wall of a cell
+        wy = F32(1) if iy > 0 else F32(0)
+        wz = F32(1) if iz > 0 else F32(0)
+        optical, left, kept, step = F32(0), opaque_margin_steps, U32(0), F32(0)
+        while kept < most:
+            t = enter + (step + jitter[ray]) * sample_step_m
+            if t >= leave:
+                break
+            gx, gy, gz = ox + t * dx, oy + t * dy, oz + t * dz
+            i, j, k = _cell_index(gx, nx), _cell_index(gy, ny), _cell_index(gz, nz)
+            packed = cell_index[slot, (i * U32(ny) + j) * U32(nz) + k]
+            if packed <= 0:
+                way_x, way_y = (F32(i) + wx - gx) * ix, (F32(j) + wy - gy) * iy
+                way = min(min(way_x, way_y), (F32(k) + wz - gz) * iz)
+                if packed < -1:  # empty within -packed - 1 more cells in every direction
+                    more = F32(-packed - 1)
+                    way = min(way_x + more * abs(ix), way_y + more * abs(iy))
+                    way = min(way, (F32(k) + wz - gz) * iz + more * abs(iz))
+                step += max(F32(1), np.ceil(way * steps_a_m))
+                continue
+            ex = (gx - (F32(i) + F32(0.5))) * cell_m
+            ey = (gy - (F32(j) + F32(0.5))) * cell_m
+            ez = (gz - (F32(k) + F32(0.5))) * cell_m
+            best, chosen = F32(-1), U32(0)
+            px, py, pz = F32(0), F32(0), F32(0)
+            row, bent = U32(packed >> 3), packed & 4
+            asked = ends or packed & 3 > 1
+            for _ in range(packed & 3):
+                x, y, z = canonical_point(cell_roots, slot, row, bent, ex, ey, ez)
+                here = _cached_density(occupied, density, low, cells_per_m, x, y, z, asked)
+                if here > best:
+                    best, chosen = here, row
+                    px, py, pz = x, y, z
+                row += U32(3) if bent else U32(1)
+            if best >= F32(0):
+                points[ray, kept, 0] = px
+                points[ray, kept, 1] = py
+                points[ray, kept, 2] = pz
+                rows[ray, kept] = chosen
+                kept += U32(1)
+                optical += best * sample_step_m
+                if optical > F32(OPAQUE_DEPTH):
+                    left -= 1
+                    if left < 0:
+                        break
+            step += F32(1)
+        counts[ray] = kept
+        next_steps[ray] = I32(step)
+
+
+@compile_kernel(**NO_ALLOCATION)
+def prefix_sum(counts, first):
+    """Writes where each ray's samples begin when they stand without gaps; how many there are."""
+    total = 0
+    for ray in range(counts.shape[0]):
+        first[ray] = total
+        total += counts[ray]
+    return total
+
+
+@compile_kernel(parallel=True, nogil=True)
+def pack_samples(padded, padded_rows, first, counts, points, rows):
+    """Copies each ray's samples from its own line to one list without gaps."""
+    for ray in prange(counts.shape[0]):
+        for n in range(counts[ray]):
+            rows[first[ray] + n] = padded_rows[ray, n]
+            for axis in range(3):
+                points[first[ray] + n, axis] = padded[ray, n, axis]
+
+
+@compile_kernel(nogil=True, fastmath=True)
+def scatter_max_density(points, log_density, low, cells_per_m, density):
+    """Raises the cached density of each sample's cell to the sample's own density."""
+    nx, ny, nz = density.shape
+    for i in range(points.shape[0]):
+        a = I32((points[i, 0] - low[0]) * cells_per_m[0])
+        b = I32((points[i, 1] - low[1]) * cells_per_m[1])
+        c = I32((points[i, 2] - low[2]) * cells_per_m[2])
+        if 0 <= a < nx and 0 <= b < ny and 0 <= c < nz:
+            here = np.exp(min(log_density[i], F32(MAX_LOG_DENSITY)))
+            if here > density[a, b, c]:
+                density[a, b, c] = here
+
+
+@compile_kernel(inline="always")
+def _sigmoid(x):
+    return F32(1) / (F32(1) + np.exp(-x))
+
+
+@compile_kernel(parallel=True, **FAST_MATH)
+def composite(raw, offsets, counts, sample_step_m, rendered):
+    """Premultiplied color and alpha of each ray from its samples, front to back."""
+    for ray in prange(offsets.shape[0]):
+        through = F32(1)
+        red, green, blue = F32(0), F32(0), F32(0)
+        for i in range(offsets[ray], offsets[ray] + counts[ray]):
+            kept = np.exp(-np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * sample_step_m)
+            weight = through * (F32(1) - kept)
+            through *= kept
+            red += weight * _sigmoid(raw[i, 0])
+            green += weight * _sigmoid(raw[i, 1])
+            blue += weight * _sigmoid(raw[i, 2])
+        rendered[ray, 0] = red
+        rendered[ray, 1] = green
+        rendered[ray, 2] = blue
+        rendered[ray, 3] = F32(1) - through
+
+
+@compile_kernel(parallel=True, **NO_ALLOCATION)
+def mean_normals(
+    raw, points, offsets, counts, rows, slots, cell_roots, sample_step_m,
+    normals, low, cells_per_m, mean,
+):  # fmt: skip
+    """Normals at each ray's samples, in the body frame, composited front to back."""
+    nx, ny, nz, _ = normals.shape
+    for ray in prange(offsets.shape[0]):
+        slot, through = slots[ray], F32(1)
+        x, y, z = F32(0), F32(0), F32(0)
+        for i in range(offsets[ray], offsets[ray] + counts[ray]):
+            optical = np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * sample_step_m
+            before = through
+            through *= np.exp(-optical)
+            if optical <= F32(MIN_NORMAL_DEPTH):
+                continue
+            a = _cell_index((points[i, 0] - low[0]) * cells_per_m[0], I32(nx))
+            b = _cell_index((points[i, 1] - low[1]) * cells_per_m[1], I32(ny))
+            c = _cell_index((points[i, 2] - low[2]) * cells_per_m[2], I32(nz))
+            n = U32(rows[i])
+            p, q, r = normals[a, b, c, 0], normals[a, b, c, 1], normals[a, b, c, 2]
+            u = cell_roots[slot, n, 3] * p + cell_roots[slot, n, 6] * q + cell_roots[slot, n, 9] * r
+            v = (
+                cell_roots[slot, n, 4] * p + cell_roots[slot, n, 7] * q
+                + cell_roots[slot, n, 10] * r
+            )  # fmt: skip
+            w = (
+                cell_roots[slot, n, 5] * p + cell_roots[slot, n, 8] * q
+                + cell_roots[slot, n, 11] * r
+            )  # fmt: skip
+            weight = (before - through) / max(np.sqrt(u * u + v * v + w * w), F32(1e-12))
+            x, y, z = x + weight * u, y + weight * v, z + weight * w
+        mean[ray, 0], mean[ray, 1], mean[ray, 2] = x, y, z
+
+
+@compile_kernel(inline="always")
+def _huber_slope(error, scale):
+    return max(F32(-1), min(F32(1), error * F32(1.0 / COLOR_HUBER_DELTA))) * scale
+
+
+@compile_kernel(inline="always")
+def _huber(error):
+    size = abs(error)
+    if size <= F32(COLOR_HUBER_DELTA):
+        return size * size * F32(0.5 / COLOR_HUBER_DELTA)
+    return size - F32(0.5 * COLOR_HUBER_DELTA)
+
+
+@compile_kernel(parallel=True, **FAST_MATH)
+def composite_loss(
+    raw, offsets, counts, sample_step_m, target, background, alpha_weight, hard_surface_weight,
+    rendered, loss, grad_raw,
+):  # fmt: skip
+    """Composite, loss of every ray, and the gradient of the mean loss with respect to `raw`.
+
+    A density's gradient needs the sum over the samples behind it, so a second pass runs from back
+    to front. (Totals less the sum of what is in front would need no such order, but behind an
+    opaque sample nothing would be left of them but rounding, times an optical depth of up to 81.)
+    In between, `grad_raw` holds each sample's color and the transmittance behind it.
+    """
+    share = F32(1) / F32(offsets.shape[0])
+    for ray in prange(offsets.shape[0]):
+        start, stop = offsets[ray], offsets[ray] + counts[ray]
+        through = F32(1)
+        red, green, blue = F32(0), F32(0), F32(0)
+        for i in range(start, stop):
+            kept = np.exp(-np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * sample_step_m)
+            weight = through * (F32(1) - kept)
+            through *= kept
+            q0, q1, q2 = _sigmoid(raw[i, 0]), _sigmoid(raw[i, 1]), _sigmoid(raw[i, 2])
+            grad_raw[i, 0] = q0
+            grad_raw[i, 1] = q1
+            grad_raw[i, 2] = q2
+            grad_raw[i, 3] = through
+            red += weight * q0
+            green += weight * q1
+            blue += weight * q2
+        alpha = F32(1) - through
+        rendered[ray, 0] = red
+        rendered[ray, 1] = green
+        rendered[ray, 2] = blue
+        rendered[ray, 3] = alpha
+
+        b0, b1, b2 = background[ray, 0], background[ray, 1], background[ray, 2]
+        clear = F32(1) - target[ray, 3]
+        d0 = red + through * b0 - (target[ray, 0] + clear * b0)
+        d1 = green + through * b1 - (target[ray, 1] + clear * b1)
+        d2 = blue + through * b2 - (target[ray, 2] + clear * b2)
+        g0, g1, g2 = _huber_slope(d0, share), _huber_slope(d1, share), _huber_slope(d2, share)
+        off = alpha - target[ray, 3]
+        g_alpha = F32(0)
+        if abs(off) > F32(ALPHA_DEAD_ZONE):
+            g_alpha = alpha_weight * share * (F32(1) if off > F32(0) else F32(-1))
+        solid, empty = np.exp(-alpha), np.exp(alpha - F32(1))
+        g_alpha += hard_surface_weight * share * (solid - empty) / (solid + empty)
+        loss[ray] = (
+            _huber(d0) + _huber(d1) + _huber(d2)
+            + alpha_weight * max(F32(0), abs(off) - F32(ALPHA_DEAD_ZONE))
+            - hard_surface_weight * np.log(solid + empty)
+        )  # fmt: skip
+
+        behind = F32(0)
+        for i in range(stop - 1, start - 1, -1):
+            q0, q1, q2, through = grad_raw[i, 0], grad_raw[i, 1], grad_raw[i, 2], grad_raw[i, 3]
+            weight = (grad_raw[i - 1, 3] if i > start else F32(1)) - through
+            value = (q0 - b0) * g0 + (q1 - b1) * g1 + (q2 - b2) * g2 + g_alpha
+            grad_raw[i, 0] = weight * g0 * q0 * (F32(1) - q0)
+            grad_raw[i, 1] = weight * g1 * q1 * (F32(1) - q1)
+            grad_raw[i, 2] = weight * g2 * q2 * (F32(1) - q2)
+            optical = np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * sample_step_m
+            inside = raw[i, 3] < F32(MAX_LOG_DENSITY)
+            grad_raw[i, 3] = optical * (through * value - behind) if inside else F32(0)
+            behind += weight * value

@@ -1,0 +1,394 @@
+"""Linear blend skinning at one point, its root by Broyden's method, and the gradient of a pose.
+
+Compiled for the CPU. A sample's canonical point is x = warp(p; θ) with LBS(x; θ) = p. Where the
+loss pulls x with g_x, it pulls the posed point with g = J⁻ᵀ g_x, and by the implicit function
+theorem the pose feels -(∂LBS/∂θ)ᵀ g. A bone of weight w turns its share of the body rigidly, so
+that all of it is carried by one wrench a bone: the force Σ w g and the moment Σ w (B x) × g.
+"""
+
+import math
+
+import numpy as np
+from numba import prange
+
+from avatar.kernels.kernel_compiler import (
+    FAST_MATH,
+    NO_ALLOCATION,
+    add4,
+    compile_kernel,
+    load4,
+    scale4,
+    store4,
+)
+from avatar.kernels.torch_correspondence import MAX_PROBE_CORRECTION_M, MAX_ROOT_STEP_M
+
+F32, I32, U32 = np.float32, np.int32, np.uint32
+MATRIX_LANES = 16
+"""Floats that a 3×4 matrix takes in a volume of transforms: as many as a register and a cache line
+hold. The last four are nothing."""
+MIN_PULL_SHARE = 1e-3
+"""Pull on a sample, as a share of its ray's strongest, up to which it is left out."""
+
+
+@compile_kernel(inline="always", **FAST_MATH)
+def interpolate_at(volume, low, nodes_per_m, x, y, z, channels, out):
+    """Trilinear values of a volume (x, y, z, channels) at a point; the border's outside."""
+    a = min(max((x - low[0]) * nodes_per_m[0], F32(0)), F32(volume.shape[0] - 1.001))
+    b = min(max((y - low[1]) * nodes_per_m[1], F32(0)), F32(volume.shape[1] - 1.001))
+    c = min(max((z - low[2]) * nodes_per_m[2], F32(0)), F32(volume.shape[2] - 1.001))
+    i, j, k = U32(a), U32(b), U32(c)  # unsigned: spares the check for negative indices
+    i1, j1, k1 = i + U32(1), j + U32(1), k + U32(1)
+    a, b, c = a - F32(i), b - F32(j), c - F32(k)
+    u, v, w = F32(1) - a, F32(1) - b, F32(1) - c
+    w0, w1, w2, w3 = u * v * w, u * v * c, u * b * w, u * b * c
+    w4, w5, w6, w7 = a * v * w, a * v * c, a * b * w, a * b * c
+    for q in range(channels):
+        out[q] = (
+            w0 * volume[i, j, k, q] + w1 * volume[i, j, k1, q]
+            + w2 * volume[i, j1, k, q] + w3 * volume[i, j1, k1, q]
+            + w4 * volume[i1, j, k, q] + w5 * volume[i1, j, k1, q]
+            + w6 * volume[i1, j1, k, q] + w7 * volume[i1, j1, k1, q]
+        )  # fmt: skip
+
+
+@compile_kernel(inline="always", **FAST_MATH)
+def transform_point(m, x, y, z):
+    """A point moved by a row-major 3×4 matrix."""
+    return (
+        m[0] * x + m[1] * y + m[2] * z + m[3],
+        m[4] * x + m[5] * y + m[6] * z + m[7],
+        m[8] * x + m[9] * y + m[10] * z + m[11],
+    )
+
+
+@compile_kernel(**NO_ALLOCATION)
+def blend_nodes(nodes, first, joints, shares, bones, transforms):
+    """Blends the bones' matrices at some nodes of a volume (flat, `LANES`), in place.
+
+    Args:
+        nodes: Which nodes.
+        first, joints, shares: The bones that move each, and how much: those of node n stand from
+            `first[n]` to `first[n + 1]`.
+        bones: (24, `LANES`).
+        transforms: (nodes of the volume, `LANES`); only the named ones are written.
+    """
+    for n in range(nodes.shape[0]):
+        node = nodes[n]
+        for q in range(MATRIX_LANES):
+            transforms[node, q] = shares[first[n]] * bones[joints[first[n]], q]
+        for e in range(first[n] + 1, first[n + 1]):
+            joint, share = joints[e], shares[e]
+            for q in range(MATRIX_LANES):
+                transforms[node, q] += share * bones[joint, q]
+
+
+@compile_kernel(inline="always", **FAST_MATH)
+def _weights_at(weights, shape, low, nodes_per_m, x, y, z, out):
+    """Trilinear skinning weights at a point, four bones at once, in the first row of `out`.
+
+    Args:
+        weights: (nodes, 24).
+        shape: Nodes along each axis.
+        low, nodes_per_m: Corner and nodes per metre.
+        x, y, z: The point.
+        out: (rows, 24).
+    """
+    a = min(max((x - low[0]) * nodes_per_m[0], F32(0)), F32(shape[0]) - F32(1.001))
+    b = min(max((y - low[1]) * nodes_per_m[1], F32(0)), F32(shape[1]) - F32(1.001))
+    c = min(max((z - low[2]) * nodes_per_m[2], F32(0)), F32(shape[2]) - F32(1.001))
+    i, j, k = I32(a), I32(b), I32(c)
+    a, b, c = a - F32(i), b - F32(j), c - F32(k)
+    u, v, w = F32(1) - a, F32(1) - b, F32(1) - c
+    n00 = (i * shape[1] + j) * shape[2] + k
+    n01, n10 = n00 + shape[2], n00 + shape[1] * shape[2]
+    n11 = n10 + shape[2]
+    for q in range(0, 24, 4):
+        near = add4(
+            scale4(u * v * w, load4(weights, n00, q)), scale4(u * v * c, load4(weights, n00 + 1, q))
+        )
+        near = add4(near, scale4(u * b * w, load4(weights, n01, q)))
+        near = add4(near, scale4(u * b * c, load4(weights, n01 + 1, q)))
+        far = add4(
+            scale4(a * v * w, load4(weights, n10, q)), scale4(a * v * c, load4(weights, n10 + 1, q))
+        )
+        far = add4(far, scale4(a * b * w, load4(weights, n11, q)))
+        far = add4(far, scale4(a * b * c, load4(weights, n11 + 1, q)))
+        store4(out, 0, q, add4(near, far))
+
+
+@compile_kernel(parallel=True, **FAST_MATH)
+def bone_wrenches(
+    points, grad_points, rows, first, count, slots, cell_roots,
+    weights, shape, low, nodes_per_m, bones, out,
+):  # fmt: skip
+    """Adds up what each ray's samples exert on the bones that move them.
+
+    Args:
+        points, grad_points: Canonical samples and what pulls them.
+        rows: Root of `cell_roots[slot]` that each sample was warped with.
+        first, count, slots: Each ray's samples and its frame's slot.
+        cell_roots: Roots and inverse Jacobians (slots, roots, 12).
+        weights, shape, low, nodes_per_m: The skinning volume, as for `_weights_at`.
+        bones: Body-from-canonical matrices (slots, 24, 12).
+        out: (rays, 24, 6), zero before: force then moment about the body frame's origin.
+    """
+    for ray in prange(first.shape[0]):
+        share, slot = np.empty((1, 24), F32), slots[ray]
+        strongest = F32(0)
+        for i in range(first[ray], first[ray] + count[ray]):
+            a, b, c = grad_points[i, 0], grad_points[i, 1], grad_points[i, 2]
+            strongest = max(strongest, a * a + b * b + c * c)
+        for i in range(first[ray], first[ray] + count[ray]):
+            a, b, c = grad_points[i, 0], grad_points[i, 1], grad_points[i, 2]
+            if a * a + b * b + c * c <= F32(MIN_PULL_SHARE**2) * strongest:
+                continue
+            n = rows[i]
+            fx = (
+                cell_roots[slot, n, 3] * a + cell_roots[slot, n, 6] * b + cell_roots[slot, n, 9] * c
+            )
+            fy = (
+                cell_roots[slot, n, 4] * a + cell_roots[slot, n, 7] * b
+                + cell_roots[slot, n, 10] * c
+            )  # fmt: skip
+            fz = (
+                cell_roots[slot, n, 5] * a + cell_roots[slot, n, 8] * b
+                + cell_roots[slot, n, 11] * c
+            )  # fmt: skip
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            _weights_at(weights, shape, low, nodes_per_m, x, y, z, share)
+            for joint in range(24):
+                w = share[0, joint]
+                if w < F32(1e-3):
+                    continue
+                px, py, pz = transform_point(bones[slot, joint], x, y, z)
+                out[ray, joint, 0] += w * fx
+                out[ray, joint, 1] += w * fy
+                out[ray, joint, 2] += w * fz
+                out[ray, joint, 3] += w * (py * fz - pz * fy)
+                out[ray, joint, 4] += w * (pz * fx - px * fz)
+                out[ray, joint, 5] += w * (px * fy - py * fx)
+
+
+@compile_kernel(parallel=True, **FAST_MATH)
+def update_roots(
+    packed_cells, cells, grid_low, cell_m, roots, weights, shape, low, nodes_per_m, bones
+):
+    """Moves a frame's roots to follow its pose, by one chord step towards the cell's center.
+
+    Args:
+        packed_cells: Packed cells of the frame, flat.
+        cells, grid_low, cell_m: Shape, corner and cell size of their grid.
+        roots: Roots, updated in place; inverse Jacobians and second-order terms stay.
+        weights, shape, low, nodes_per_m: The skinning volume, as for `_weights_at`.
+        bones: The new pose's matrices (24, 12).
+    """
+    for i in prange(cells[0]):
+        room = np.empty((2, 24), F32)
+        for j in range(cells[1]):
+            for k in range(cells[2]):
+                packed = packed_cells[(i * cells[1] + j) * cells[2] + k]
+                if packed <= 0:
+                    continue
+                rows = 3 if packed & 4 else 1
+                for candidate in range(packed & 3):
+                    n = (packed >> 3) + candidate * rows
+                    x, y, z = roots[n, 0], roots[n, 1], roots[n, 2]
+                    _weights_at(weights, shape, low, nodes_per_m, x, y, z, room)
+                    one, two, three = load4(bones, 0, 0), load4(bones, 0, 4), load4(bones, 0, 8)
+                    w = room[0, 0]
+                    one, two, three = scale4(w, one), scale4(w, two), scale4(w, three)
+                    for joint in range(1, 24):
+                        w = room[0, joint]
+                        if w > F32(0):
+                            one = add4(one, scale4(w, load4(bones, joint, 0)))
+                            two = add4(two, scale4(w, load4(bones, joint, 4)))
+                            three = add4(three, scale4(w, load4(bones, joint, 8)))
+                    store4(room, 1, 0, one)
+                    store4(room, 1, 4, two)
+                    store4(room, 1, 8, three)
+                    sx, sy, sz = transform_point(room[1], x, y, z)
+                    ex = grid_low[0] + (F32(i) + F32(0.5)) * cell_m - sx
+                    ey = grid_low[1] + (F32(j) + F32(0.5)) * cell_m - sy
+                    ez = grid_low[2] + (F32(k) + F32(0.5)) * cell_m - sz
+                    dx = roots[n, 3] * ex + roots[n, 4] * ey + roots[n, 5] * ez
+                    dy = roots[n, 6] * ex + roots[n, 7] * ey + roots[n, 8] * ez
+                    dz = roots[n, 9] * ex + roots[n, 10] * ey + roots[n, 11] * ez
+                    if dx * dx + dy * dy + dz * dz <= F32(MAX_ROOT_STEP_M**2):
+                        roots[n, 0] = x + dx
+                        roots[n, 1] = y + dy
+                        roots[n, 2] = z + dz
+
+
+TOLERANCE_M = 1e-4
+ITERATIONS = 12
+LONGEST_STEP_M = 0.3
+
+
+@compile_kernel(inline="always", **FAST_MATH)
+def invert_rotation(m, out):
+    """Inverse of the 3×3 part of a row-major 3×4 matrix."""
+    a, b, c, d, e, f, g, h, i = m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]
+    p, q, r = e * i - f * h, f * g - d * i, d * h - e * g
+    det = a * p + b * q + c * r
+    s = F32(1) / (det if abs(det) > F32(1e-6) else F32(1e-6))
+    out[0], out[1], out[2] = p * s, (c * h - b * i) * s, (b * f - c * e) * s
+    out[3], out[4], out[5] = q * s, (a * i - c * g) * s, (c * d - a * f) * s
+    out[6], out[7], out[8] = r * s, (b * g - a * h) * s, (a * e - b * d) * s
+
+
+@compile_kernel(inline="always", **FAST_MATH)
+def rotate_vector(m, x, y, z):
+    """A vector turned by a row-major 3×3 matrix."""
+    return (
+        m[0] * x + m[1] * y + m[2] * z,
+        m[3] * x + m[4] * y + m[5] * z,
+        m[6] * x + m[7] * y + m[8] * z,
+    )
+
+
+@compile_kernel(inline="always", **FAST_MATH)
+def _broyden_update(inverse, dx, dy, dz, yx, yy, yz):
+    """Broyden's good update of an inverse Jacobian: a step d has changed the value by y."""
+    jx, jy, jz = rotate_vector(inverse, yx, yy, yz)
+    den = dx * jx + dy * jy + dz * jz
+    den = F32(1) / (den if abs(den) > F32(1e-12) else F32(1e-12))
+    rx = dx * inverse[0] + dy * inverse[3] + dz * inverse[6]
+    ry = dx * inverse[1] + dy * inverse[4] + dz * inverse[7]
+    rz = dx * inverse[2] + dy * inverse[5] + dz * inverse[8]
+    ux, uy, uz = (dx - jx) * den, (dy - jy) * den, (dz - jz) * den
+    inverse[0] += ux * rx
+    inverse[1] += ux * ry
+    inverse[2] += ux * rz
+    inverse[3] += uy * rx
+    inverse[4] += uy * ry
+    inverse[5] += uy * rz
+    inverse[6] += uz * rx
+    inverse[7] += uz * ry
+    inverse[8] += uz * rz
+
+
+@compile_kernel(inline="always", **FAST_MATH)
+def _blended_transform(transforms, low, nodes_per_m, x, y, z, out):
+    if transforms.shape[3] == MATRIX_LANES:
+        interpolate_at(transforms, low, nodes_per_m, x, y, z, MATRIX_LANES, out)
+    else:
+        interpolate_at(transforms, low, nodes_per_m, x, y, z, 12, out)
+
+
+@compile_kernel(**NO_ALLOCATION)
+def solve_root(transforms, low, nodes_per_m, p, x, blend, inverse, initialize_inverse):
+    """Broyden's method (good update) for LBS(x) = p, from x; True if it came to rest.
+
+    Args:
+        transforms: Blended 3×4 transforms on the weight volume's nodes (x, y, z, 12 or `LANES`).
+        low, nodes_per_m: Place and scale of those nodes.
+        p: The posed point.
+        x: Initial point, replaced by the root.
+        blend: Scratch for `MATRIX_LANES` floats.
+        inverse: Initial inverse Jacobian, row by row, replaced by the updated one.
+        initialize_inverse: Whether to start from the blended rotation's inverse instead.
+    """
+    _blended_transform(transforms, low, nodes_per_m, x[0], x[1], x[2], blend)
+    if initialize_inverse:
+        invert_rotation(blend, inverse)
+    sx, sy, sz = transform_point(blend, x[0], x[1], x[2])
+    fx, fy, fz = sx - p[0], sy - p[1], sz - p[2]
+    rests = False
+    for _ in range(ITERATIONS):
+        size = fx * fx + fy * fy + fz * fz
+        rests = size <= F32(TOLERANCE_M * TOLERANCE_M)
+        if size > F32(1):
+            return False
+        dx, dy, dz = rotate_vector(inverse, -fx, -fy, -fz)
+        if dx * dx + dy * dy + dz * dz > F32(LONGEST_STEP_M * LONGEST_STEP_M):
+            return False  # off the volume, or in a fold: nothing that follows would be sound
+        if rests and dx * dx + dy * dy + dz * dz > F32(TOLERANCE_M * MAX_PROBE_CORRECTION_M):
+            return True
+        x[0] += dx
+        x[1] += dy
+        x[2] += dz
+        if rests:  # the residual after the last step is not needed
+            return True
+        _blended_transform(transforms, low, nodes_per_m, x[0], x[1], x[2], blend)
+        sx, sy, sz = transform_point(blend, x[0], x[1], x[2])
+        gx, gy, gz = sx - p[0], sy - p[1], sz - p[2]
+        _broyden_update(inverse, dx, dy, dz, gx - fx, gy - fy, gz - fz)
+        fx, fy, fz = gx, gy, gz
+    return fx * fx + fy * fy + fz * fz <= F32(4 * TOLERANCE_M * TOLERANCE_M)
+
+
+@compile_kernel(inline="always", **FAST_MATH)
+def _probe_root(transforms, low, nodes_per_m, p, dx, dy, dz, x, inverse, blend):
+    """Where, relative to the root x of p, the root of p + d lies: linearly, and one chord step."""
+    ux, uy, uz = rotate_vector(inverse, dx, dy, dz)
+    interpolate_at(
+        transforms, low, nodes_per_m, x[0] + ux, x[1] + uy, x[2] + uz, MATRIX_LANES, blend
+    )
+    sx, sy, sz = transform_point(blend, x[0] + ux, x[1] + uy, x[2] + uz)
+    ex, ey, ez = rotate_vector(inverse, p[0] + dx - sx, p[1] + dy - sy, p[2] + dz - sz)
+    beyond = ex * ex + ey * ey + ez * ez > F32(MAX_PROBE_CORRECTION_M * MAX_PROBE_CORRECTION_M)
+    share = F32(0) if beyond else F32(1)
+    return ux + share * ex, uy + share * ey, uz + share * ez
+
+
+@compile_kernel(**NO_ALLOCATION)
+def probe_faces(transforms, low, nodes_per_m, p, t, x, inverse, blend, warp):
+    """How roots move about the root x of a cell's centre p, from probes t towards its six faces.
+
+    A root of p + d is x + A d + Σ c_ij d_i d_j. What is known of it after this: A and the c_ii.
+
+    Args:
+        transforms, low, nodes_per_m, blend: As in `solve`.
+        p, t: Cell's centre; how far from it the warp is probed.
+        x, inverse: Its root and about the inverse Jacobian there.
+        warp: (30) root, A row by row, c_xx c_yy c_zz c_xy c_xz c_yz; the first 21 are written.
+
+    Returns:
+        Norm of all c_ii: how bent the warp is, 1/m.
+    """
+    bend, half, over = F32(0), F32(0.5) / t, F32(0.5) / (t * t)
+    for axis in range(3):
+        dx = t if axis == 0 else F32(0)
+        dy = t if axis == 1 else F32(0)
+        dz = t if axis == 2 else F32(0)
+        ax, ay, az = _probe_root(transforms, low, nodes_per_m, p, dx, dy, dz, x, inverse, blend)
+        bx, by, bz = _probe_root(transforms, low, nodes_per_m, p, -dx, -dy, -dz, x, inverse, blend)
+        warp[axis] = x[axis]
+        warp[3 + axis], warp[6 + axis], warp[9 + axis] = (
+            (ax - bx) * half, (ay - by) * half, (az - bz) * half,
+        )  # fmt: skip
+        cx, cy, cz = (ax + bx) * over, (ay + by) * over, (az + bz) * over
+        warp[12 + 3 * axis], warp[13 + 3 * axis], warp[14 + 3 * axis] = cx, cy, cz
+        bend += cx * cx + cy * cy + cz * cz
+    return math.sqrt(bend)
+
+
+@compile_kernel(**NO_ALLOCATION)
+def probe_corners(transforms, low, nodes_per_m, p, t, x, inverse, blend, warp):
+    """Betters what `probe_faces` has written by probes towards the eight corners, and adds c_ij."""
+    for c in range(3, 12):
+        warp[c] *= F32(0.5)  # the mean of what faces say and of what corners say
+    for c in range(21, 30):
+        warp[c] = F32(0)
+    mean_x, mean_y, mean_z = F32(0), F32(0), F32(0)
+    for corner in range(8):
+        i = F32(1) if corner & 4 else F32(-1)
+        j = F32(1) if corner & 2 else F32(-1)
+        k = F32(1) if corner & 1 else F32(-1)
+        ux, uy, uz = _probe_root(
+            transforms, low, nodes_per_m, p, i * t, j * t, k * t, x, inverse, blend
+        )
+        ux, uy, uz = ux / (F32(8) * t * t), uy / (F32(8) * t * t), uz / (F32(8) * t * t)
+        mean_x, mean_y, mean_z = mean_x + ux, mean_y + uy, mean_z + uz
+        for c, u in enumerate((ux, uy, uz)):
+            warp[3 + 3 * c] += F32(0.5) * t * u * i
+            warp[4 + 3 * c] += F32(0.5) * t * u * j
+            warp[5 + 3 * c] += F32(0.5) * t * u * k
+            warp[21 + c] += u * i * j
+            warp[24 + c] += u * i * k
+            warp[27 + c] += u * j * k
+    for c, mean in enumerate((mean_x, mean_y, mean_z)):
+        more = (mean - warp[12 + c] - warp[15 + c] - warp[18 + c]) / F32(6)
+        warp[12 + c] += more
+        warp[15 + c] += more
+        warp[18 + c] += more

@@ -1,1 +1,0 @@
-"""Adapters: one module per program whose pose files are read."""

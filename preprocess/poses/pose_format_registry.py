@@ -1,0 +1,202 @@
+"""Read any pose file: recognise its tracker, choose the person, explain files that are not read."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from capture.image_folder import refuse_pipe
+from capture.input_error import InputError
+from preprocess.body.body_pose import Motion
+from preprocess.capture_paths import resolve_pose_path
+from preprocess.file_content import read_untrusted_file
+from preprocess.poses import mocap_formats, video_trackers
+from preprocess.poses.instant_avatar import parse_instant_avatar, parse_per_frame
+from preprocess.poses.motion_builder import MAX_GAP_FRAMES, MotionByPerson, fill_gaps
+from preprocess.poses.pose_file import read_motion
+
+ADVICE_BY_KEYS = (
+    (
+        {"mhr_model_params", "shape_params", "body_pose_params"},
+        "it is SAM 3D Body's, whose poses move another body (MHR); bring them to SMPL first "
+        "(facebookresearch/MHR converts).",
+    ),
+    (
+        {"pred_thetas", "pred_xyz_29", "pred_cam_root"},
+        "it is HybrIK's, whose places are in a crop of each picture; 4D-Humans, WHAM or GVHMR say "
+        "where people are in the whole picture.",
+    ),
+    (
+        {"pose_keypoints_2d", "keypoints", "landmarks", "people", "pose_landmarks"},
+        "it has joints in the picture, not a body's rotations; fit SMPL to them, or use a tracker "
+        "such as 4D-Humans, WHAM or GVHMR.",
+    ),
+    (
+        {"verts", "vertices", "pred_vertices"},
+        "it has vertices of meshes, not the rotations that made them.",
+    ),
+)
+"""Keys of files that are not read (one of a set is enough), and the advice for each."""
+
+ADVICE_BY_ROW_SIZE = {
+    322: "(N, 322) is Motion-X's: write root_orient = [:, :3], pose_body = [:, 3:66] and trans = "
+    "[:, 309:312] to an .npz.",
+    263: "(N, 263) is HumanML3D's, which has no rotations of SMPL.",
+    72: "(N, 72) alone does not say where the person is; write it as `poses`, with `trans` (N, 3) "
+    "in metres, to an .npz.",
+}
+"""Arrays by how many numbers a row has."""
+
+
+def describe_unknown_content(content: Any) -> str:
+    """What a file holds, and what could be done about it; a sentence."""
+    if isinstance(content, np.ndarray):
+        known = ADVICE_BY_ROW_SIZE.get(content.shape[-1]) if content.ndim == 2 else None
+        return known or f"it is an array of the shape {content.shape}."
+    keys = _keys(content)
+    for some, words in ADVICE_BY_KEYS:
+        if some & set(keys):
+            return words
+    if isinstance(content, dict):
+        listed = [key[:40] for key in keys]
+        return f"its keys are {', '.join(listed[:12]) or 'none'}{' …' if len(keys) > 12 else ''}."
+    return f"it is a {type(content).__name__}."
+
+
+def _keys(content: Any) -> list[str]:
+    """Keys of a file, or of the first of its items."""
+    if isinstance(content, (list, tuple)):
+        return _keys(content[0]) if content else []
+    if not isinstance(content, dict):
+        return []
+    keys = [str(key) for key in content]
+    first = next(iter(content.values()), None)
+    known = {key for some, _ in ADVICE_BY_KEYS for key in some}
+    return _keys(first) if isinstance(first, dict) and not known & set(keys) and (
+        known & set(_keys(first))
+    ) else keys  # fmt: skip
+
+
+TRACKERS: dict[str, Callable[[Any, bool], MotionByPerson | None]] = {
+    "PHALP (4D-Humans)": video_trackers.parse_phalp,
+    "WHAM": video_trackers.parse_wham,
+    "VIBE": video_trackers.parse_vibe,
+    "GVHMR": video_trackers.parse_gvhmr,
+    "PromptHMR": video_trackers.parse_prompthmr,
+    "TRAM": video_trackers.parse_tram,
+    "ROMP or BEV": video_trackers.parse_romp,
+    "EasyMocap": mocap_formats.parse_easymocap,
+    "SLAHMR or 3DPW": mocap_formats.parse_slahmr,
+    "AMASS or AIST++": mocap_formats.parse_amass,
+}
+"""Trackers by name, in the order in which they are asked whether a file is theirs."""
+
+MALFORMED_FILE_ERRORS = (
+    ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, MemoryError,
+)  # fmt: skip
+"""What adapters raise for a file that is nearly theirs: they read it as if it were whole."""
+
+
+def read_poses(
+    path: Path,
+    *,
+    default_model: str = "body24",
+    person: str | None = None,
+    prefer_world: bool = False,
+) -> Motion:
+    """Poses from a file, or a folder of files, of any tracker that is known (docs/formats.md).
+
+    Of several people the one with most poses is chosen, and the note names the others. Short gaps
+    of the tracker are interpolated and marked. The poses keep the file's anchor and space;
+    `preprocess.poses.root_placement` converts them for a body and its cameras.
+
+    Args:
+        path: The file or folder; of a capture folder the poses in it.
+        default_model: Body family of files that do not say theirs.
+        person: Whose poses, by the file's own number or name.
+        prefer_world: Reads poses in the world rather than in a camera, to drive an avatar.
+
+    Raises:
+        InputError: If there is no such file, it holds no known poses, or no person of
+            that name.
+    """
+    path = resolve_pose_path(path)
+    refuse_pipe(path)
+    if path.suffix.lower() == ".jsonl":
+        return read_motion(path, default_model=default_model)
+    content = read_untrusted_file(path)
+    tool, people = _recognize(content, path, default_model, prefer_world)
+    motion = _select_person(people, person, path)
+    if tool is None:
+        return motion
+    motion = fill_gaps(motion)
+    note = motion.note
+    if motion.interpolated is not None:
+        said = (
+            f"{int(motion.interpolated.sum())} poses that {tool} had lost were filled in between "
+            f"their neighbours (gaps of up to {MAX_GAP_FRAMES} frames)."
+        )
+        note = said if note is None else f"{note} {said}"
+    return replace(motion, note=note)
+
+
+def _recognize(
+    content: Any, path: Path, default_model: str, driving: bool
+) -> tuple[str | None, MotionByPerson]:
+    """Whose file it is (None: in the house's own keys), and the people in it."""
+    for tool, tracks in TRACKERS.items():
+        try:
+            people = tracks(content, driving)
+        except InputError:
+            raise
+        except MALFORMED_FILE_ERRORS as cause:
+            raise InputError(
+                f"{path} looks like a file of {tool}, but what it holds cannot be used: "
+                f"{type(cause).__name__} {cause}. Is it complete?"
+            ) from cause
+        if people:
+            return tool, people
+    people = parse_instant_avatar(content, path, default_model)
+    if people is not None:
+        return None, people
+    try:
+        people = parse_per_frame(content, path, default_model)
+    except InputError:
+        raise
+    except MALFORMED_FILE_ERRORS as cause:
+        raise InputError(
+            f"{path} holds a pose a frame that do not fit together ({cause})."
+        ) from cause
+    if people is None:
+        raise InputError(
+            f"{path} holds no poses that are known: {describe_unknown_content(content)} Expected "
+            "global_orient, body_pose and transl (or poses and trans), or a file of "
+            f"{', '.join(TRACKERS)}; see docs/formats.md."
+        )
+    return "its tracker", people
+
+
+def _select_person(people: MotionByPerson, person: str | None, path: Path) -> Motion:
+    """The person that is wanted, or the one with most poses."""
+    if person is not None and person not in people:
+        raise InputError(
+            f"{path} holds no person called {person!r} (--person); it holds {_list_people(people)}."
+        )
+    name = person or max(people, key=lambda known: int(people[known].valid.sum()))
+    motion = people[name]
+    if len(people) == 1 or person is not None:
+        return motion
+    others = {known: held for known, held in people.items() if known != name}
+    note = (
+        f"{path.name} holds {len(people)} people; {name} was taken, who has most poses "
+        f"({int(motion.valid.sum())}). The others: {_list_people(others)}. --person ID takes "
+        "another."
+    )
+    return replace(motion, note=note)
+
+
+def _list_people(people: MotionByPerson) -> str:
+    listed = [f"{name} ({int(held.valid.sum())} poses)" for name, held in people.items()]
+    return ", ".join(listed[:12]) + (f" and {len(listed) - 12} more" if len(listed) > 12 else "")

@@ -1,0 +1,75 @@
+"""Whatever needs no BLAS is bit-equal for any number of threads."""
+
+import numba
+import pytest
+import torch
+
+from avatar.kernels.backend_protocol import MarchSettings
+from avatar.kernels.numba_backend import NumbaBackend
+
+NUMBA = NumbaBackend()
+OPERATIONS = (
+    "encode", "encode_backward", "encode_points_backward", "march", "composite", "composite_loss",
+    "scatter_max_density", "bone_wrenches", "update_roots", "mean_normals",
+)  # fmt: skip
+
+
+def results_of(learnt) -> dict[str, list[torch.Tensor]]:
+    """What every operation of a step makes of one batch of rays."""
+    trainer, generator = learnt.trainer, torch.Generator().manual_seed(0)
+    field, poses = trainer.avatar.field, trainer.poses
+    batch, cells = trainer.replay.sample_rays(700, generator), trainer.replay.correspondences
+    grid = trainer.avatar.occupancy.density_grid
+    grid = grid._replace(density=grid.density.clone())
+    samples = NUMBA.march(batch.rays, cells, grid, MarchSettings(0.01, 0.06, 128))
+    points, count = samples.points, len(samples.points)
+    raw = torch.randn(count, 4, generator=generator)
+    slope = torch.randn(count, field.levels.feature_width, generator=generator)
+    background = torch.rand(700, 3, generator=generator)
+    grad_table = torch.zeros_like(field.table)
+    NUMBA.encode_backward(points, slope, field.levels, grad_table)
+    grad_points = NUMBA.encode_points_backward(points, slope, field.table, field.levels)
+    NUMBA.scatter_max_density(points, raw[:, 3].contiguous(), grid)
+    wrenches = NUMBA.bone_wrenches(
+        samples, grad_points, batch.rays.slots, cells, poses.skinning, poses.bones
+    )
+    moved = cells._replace(roots=cells.roots.clone())
+    NUMBA.update_roots(moved, 0, poses.skinning, poses.bones[0])
+    volume = trainer.learner.shading._normals
+    normals = NUMBA.mean_normals(raw, samples, 0.01, batch.rays.slots, cells, volume)
+    return {
+        "mean_normals": [normals],
+        "encode": [NUMBA.encode(points, field.table, field.levels)],
+        "encode_backward": [grad_table],
+        "encode_points_backward": [grad_points],
+        "march": list(samples),
+        "composite": [NUMBA.composite(raw, samples, 0.01)],
+        "composite_loss": list(
+            NUMBA.composite_loss(raw, samples, 0.01, batch.target, background, 0.1, 0.1)
+        ),
+        "scatter_max_density": [grid.density],
+        "bone_wrenches": [wrenches],
+        "update_roots": [moved.roots[0, : int((cells.packed_cells[0] >> 3).max())]],
+    }
+
+
+@pytest.fixture(scope="module")
+def by_threads(learnt) -> list[dict[str, list[torch.Tensor]]]:
+    before = numba.get_num_threads()
+    results = []
+    try:
+        for threads in range(1, numba.config.NUMBA_NUM_THREADS + 1):
+            numba.set_num_threads(threads)
+            results.append(results_of(learnt))
+    finally:
+        numba.set_num_threads(before)
+    return results
+
+
+@pytest.mark.parametrize("operation", OPERATIONS)
+def test_an_operation_is_bit_equal_for_any_number_of_threads(by_threads, operation):
+    alone = by_threads[0][operation]
+    assert all(float(part.float().abs().max()) > 0 for part in alone)
+    for results in by_threads[1:]:
+        for one, other in zip(alone, results[operation], strict=True):
+            assert torch.equal(one, other)

@@ -1,0 +1,183 @@
+"""Warp cells: canonical points come back from where skinning carried them."""
+
+import numpy as np
+import torch
+
+from avatar.correspondence_grid import CorrespondenceGrid
+from avatar.kernels import torch_correspondence, torch_reference
+
+
+def skinning(rig, rotations):
+    """The skinning volume and a pose's bones, as the reference takes them."""
+    nodes_per_m = (np.array(rig.weights.shape[:3]) - 1) / (rig.box_high - rig.box_low)
+    bones = rig.body_from_canonical(rotations)[:, :3].reshape(24, 12)
+    parts = rig.weights, rig.box_low, nodes_per_m, bones
+    return tuple(torch.from_numpy(part).float() for part in parts)
+
+
+def posed(rig, rotations, canonical):
+    """Skins canonical points, with the reference."""
+    return torch_correspondence.skin_points(torch.from_numpy(canonical), *skinning(rig, rotations))
+
+
+def nearest_root_error(cells, targets, canonical):
+    """How far the nearest of a cell's candidate roots is from where the point came from."""
+    return np.linalg.norm(candidates(cells, targets) - canonical[:, None], axis=2).min(axis=1)
+
+
+def candidates(cells, targets, bends=True):
+    """What each root of their cells makes of posed points; far off where there is no such root."""
+    place = np.floor((targets - cells.low) / cells.cell_m).astype(int)
+    packed = torch.from_numpy(cells.packed_cells[tuple(place.T)])
+    offset = torch.from_numpy(targets - (cells.low + (place + 0.5) * cells.cell_m)).float()
+    slot, roots = torch.zeros(len(targets), dtype=torch.int64), torch.from_numpy(cells.roots)[None]
+    found = []
+    for candidate in range(3):
+        row = torch_reference.root_row(packed, candidate)
+        bent = (packed & 4 > 0) & bends
+        point = torch_reference.canonical_points(roots, slot, row, bent, offset)
+        found.append(torch.where(row[:, None] > 0, point, 1e3))
+    return torch.stack(found, dim=1).numpy()
+
+
+def solved_roots(cells):
+    """Roots and inverse Jacobians, without the rows that say how bent cells bend."""
+    packed = torch.from_numpy(cells.packed_cells[cells.packed_cells > 0])
+    rows = torch.cat([torch_reference.root_row(packed, candidate) for candidate in range(3)])
+    return cells.roots[rows[rows > 0].numpy()]
+
+
+def around_the_skin(rig, rng, count=20000, spread=0.02):
+    seeds = rig.seeds[rng.integers(0, len(rig.seeds), count)]
+    return (seeds + rng.normal(size=(count, 3)) * spread).astype(np.float32)
+
+
+def test_the_canonical_pose_warps_to_itself(rig, rng):
+    canonical = around_the_skin(rig, rng)
+    cells = CorrespondenceGrid.solve(rig, rig.canonical_rotations)
+    error = nearest_root_error(cells, canonical, canonical)
+    assert np.quantile(error, 0.999) < 1e-4
+
+
+def test_points_come_back_from_a_bent_pose(rig, rng, bent_pose):
+    canonical = around_the_skin(rig, rng)
+    targets = posed(rig, bent_pose, canonical).numpy()
+    error = nearest_root_error(CorrespondenceGrid.solve(rig, bent_pose), targets, canonical)
+    assert np.median(error) < 1e-4
+    assert np.quantile(error, 0.95) < 2e-3
+    assert np.mean(error > 1e-2) < 2e-3
+
+
+def test_roots_at_cell_centers_agree_with_broyden_per_sample(rig, bent_pose):
+    cells = CorrespondenceGrid.solve(rig, bent_pose)
+    place = np.argwhere((cells.packed_cells & 3) == 1)[::37]
+    centers = torch.from_numpy((cells.low + (place + 0.5) * cells.cell_m).astype(np.float32))
+    roots = torch.from_numpy(cells.roots[cells.packed_cells[tuple(place.T)] >> 3])
+    found, rested = torch_correspondence.broyden_roots(
+        centers, roots[:, :3] + 0.004, *skinning(rig, bent_pose)
+    )
+    assert rested.float().mean() > 0.95
+    off = (found - roots[:, :3]).norm(dim=1)[rested]
+    assert float(off.quantile(0.95)) < 1e-3
+
+
+def test_the_inverse_jacobian_undoes_a_small_step(rig, bent_pose, rng):
+    cells = CorrespondenceGrid.solve(rig, bent_pose)
+    roots = solved_roots(cells)[::29]
+    step = rng.normal(size=(len(roots), 3)).astype(np.float32)
+    step *= 1e-3 / np.linalg.norm(step, axis=1, keepdims=True)
+    moved = posed(rig, bent_pose, roots[:, :3] + step) - posed(rig, bent_pose, roots[:, :3])
+    back = np.einsum("nab,nb->na", roots[:, 3:].reshape(-1, 3, 3), moved.numpy())
+    off = np.linalg.norm(back - step, axis=1)
+    assert np.quantile(off, 0.9) < 1e-4
+
+
+def test_no_cell_is_far_from_the_body(rig, bent_pose):
+    cells = CorrespondenceGrid.solve(rig, bent_pose, band_m=0.05)
+    place = (solved_roots(cells)[:, :3] - rig.box_low) / (rig.box_high - rig.box_low)
+    cell = (place * rig.skin_distance.shape).astype(int)
+    assert rig.skin_distance[tuple(cell.T)].max() <= 0.05 + 0.5 * cells.cell_m
+
+
+def test_wild_poses_are_solved_without_harm(rig, rng):
+    """Far from anything a body does: roots may be lost, but all that is kept is finite."""
+    for _ in range(20):
+        cells = CorrespondenceGrid.solve(rig, rng.normal(size=(23, 3)) * 2.0)
+        assert np.isfinite(cells.roots[1:]).all()
+        place = (solved_roots(cells)[:, :3] - rig.box_low) / (rig.box_high - rig.box_low)
+        assert ((place >= 0.0) & (place <= 1.0)).all()
+
+
+def test_only_nodes_near_the_skin_are_blended(rig):
+    near = rig.skinning_nodes_within(0.11)
+    assert len(near.node_indices) < 0.4 * rig.weights[..., 0].size
+    weights = np.zeros((len(near.node_indices), 24), dtype=np.float32)
+    weights[np.repeat(np.arange(len(near.node_indices)), np.diff(near.offsets)), near.joints] = (
+        near.weights
+    )
+    np.testing.assert_array_equal(weights, rig.weights.reshape(-1, 24)[near.node_indices])
+    assert len(rig.skinning_nodes_within(0.2).node_indices) > len(near.node_indices)
+
+
+def test_nothing_is_read_from_a_node_that_is_not_blended(rig, bent_pose, monkeypatch):
+    few = CorrespondenceGrid.solve(rig, bent_pose)
+    all_nodes = rig.skinning_nodes_within(9.0)
+    monkeypatch.setattr(type(rig), "skinning_nodes_within", lambda self, reach_m: all_nodes)
+    everywhere = CorrespondenceGrid.solve(rig, bent_pose)
+    np.testing.assert_array_equal(few.packed_cells, everywhere.packed_cells)
+    same = np.abs(few.roots - everywhere.roots).max(axis=1) < 1e-3
+    assert same.mean() > 0.995  # in folds rounding decides
+
+
+def test_the_second_order_term_betters_bent_cells_and_only_those_have_it(rig, rng, bent_pose):
+    canonical = around_the_skin(rig, rng)
+    targets = posed(rig, bent_pose, canonical).numpy()
+    cells = CorrespondenceGrid.solve(rig, bent_pose)
+    place = np.floor((targets - cells.low) / cells.cell_m).astype(int)
+    bent = (cells.packed_cells[tuple(place.T)] & 4) > 0
+    assert 0.02 < bent.mean() < 0.4
+    errors = [
+        np.linalg.norm(candidates(cells, targets[bent], on) - canonical[bent, None], axis=2).min(1)
+        for on in (False, True)
+    ]
+    assert np.median(errors[1]) < 0.4 * np.median(errors[0])
+    assert np.quantile(errors[1], 0.9) < 0.4 * np.quantile(errors[0], 0.9)
+
+
+def test_the_compiled_build_agrees_with_its_meaning(rig, rng, bent_pose, monkeypatch):
+    ours = CorrespondenceGrid.solve(rig, bent_pose)
+    monkeypatch.setenv("IA_BACKEND", "torch")
+    theirs = CorrespondenceGrid.solve(rig, bent_pose)
+    np.testing.assert_allclose(ours.low, theirs.low, atol=1e-5)
+    assert ours.packed_cells.shape == theirs.packed_cells.shape
+    assert np.mean((ours.packed_cells & 3) == (theirs.packed_cells & 3)) > 0.995
+    assert np.mean((ours.packed_cells & 4) == (theirs.packed_cells & 4)) > 0.98
+    targets = posed(rig, bent_pose, around_the_skin(rig, rng)).numpy()
+    found = [candidates(cells, targets)[:, :2] for cells in (ours, theirs)]
+    gap = np.linalg.norm(found[0][:, :, None] - found[1][:, None], axis=3).min(axis=2)[:, 0]
+    assert np.median(gap) < 2e-5
+    assert np.quantile(gap, 0.99) < 5e-4
+    assert np.mean(gap > 1e-2) < 2e-3
+
+
+def test_a_pose_is_solved_the_same_way_every_time(rig, bent_pose):
+    first, second = (
+        CorrespondenceGrid.solve(rig, bent_pose),
+        CorrespondenceGrid.solve(rig, bent_pose),
+    )
+    np.testing.assert_array_equal(first.packed_cells, second.packed_cells)
+    np.testing.assert_array_equal(first.roots, second.roots)
+
+
+def test_a_wider_band_holds_all_that_a_narrow_one_holds_and_more(rig, rng, bent_pose):
+    canonical = around_the_skin(rig, rng, spread=0.06)
+    place = (canonical - rig.box_low) / (rig.box_high - rig.box_low) * rig.skin_distance.shape
+    inside = ((place >= 0) & (place < rig.skin_distance.shape)).all(axis=1)
+    canonical, cell = canonical[inside], place[inside].astype(int)
+    off_skin = rig.skin_distance[tuple(cell.T)]
+    far = (off_skin > 0.1) & (off_skin < 0.14)
+    targets = posed(rig, rig.canonical_rotations + 0.02, canonical).numpy()
+    wide = CorrespondenceGrid.solve(rig, rig.canonical_rotations + 0.02, band_m=0.15)
+    error = nearest_root_error(wide, targets, canonical)
+    assert far.sum() > 1000
+    assert np.mean(error[far] < 2e-3) > 0.99

@@ -1,0 +1,181 @@
+"""The rig: weights, joints, box and volumes against the body they come from."""
+
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
+
+from avatar.rig import PART_OF_JOINT, canonical_rotations
+from preprocess.body.body_pose import BodyPose
+from preprocess.body.kinematics import PARENTS
+
+
+@pytest.fixture(params=range(5))
+def pose(request) -> BodyPose:
+    """Any pose, however unnatural, with the root at rest."""
+    rotations = np.random.default_rng(request.param).normal(size=(23, 3)) * 0.3 * request.param
+    return BodyPose(
+        root_rotation=np.zeros(3), root_translation=np.zeros(3), joint_rotations=rotations
+    )
+
+
+@pytest.fixture(scope="module")
+def canonical(shaped) -> BodyPose:
+    return BodyPose(
+        root_rotation=np.zeros(3),
+        root_translation=np.zeros(3),
+        joint_rotations=canonical_rotations(),
+    )
+
+
+@pytest.fixture(scope="module")
+def skin(shaped, canonical) -> np.ndarray:
+    """Vertices in the canonical pose."""
+    return shaped.with_pose(canonical).vertices()
+
+
+def carried(transforms, points):
+    return np.einsum("jab,jb->ja", transforms[:, :3, :3], points) + transforms[:, :3, 3]
+
+
+def test_the_canonical_pose_is_an_a_pose(rig, shaped, canonical):
+    joints = shaped.with_pose(canonical).joints()
+    hands, hips = joints[[22, 23]], joints[[1, 2]]
+    feet = joints[[10, 11]]
+    assert (hands[:, 1] < joints[[16, 17], 1] - 0.3).all()  # lowered, …
+    assert (np.abs(hands[:, 0]) > np.abs(hips[:, 0]) + 0.2).all()  # … and off the body
+    assert (np.abs(feet[:, 0]) > np.abs(hips[:, 0])).all()
+    np.testing.assert_array_equal(rig.canonical_rotations, canonical_rotations())
+
+
+def test_the_canonical_pose_moves_nothing(rig):
+    bones = rig.body_from_canonical(canonical_rotations())
+    np.testing.assert_allclose(bones, np.tile(np.eye(4), (24, 1, 1)), atol=1e-12)
+
+
+def test_bones_carry_each_canonical_joint_to_the_posed_one(rig, shaped, canonical, pose):
+    bones = rig.body_from_canonical(pose.joint_rotations)
+    found = carried(bones, shaped.with_pose(canonical).joints())
+    np.testing.assert_allclose(found, shaped.with_pose(pose).joints(), atol=1e-9)
+    squared = bones[:, :3, :3] @ bones[:, :3, :3].transpose(0, 2, 1)
+    np.testing.assert_allclose(squared, np.tile(np.eye(3), (24, 1, 1)), atol=1e-12)
+
+
+def test_skin_that_follows_one_bone_lands_where_the_body_has_it(rig, shaped, skin, pose):
+    weights = shaped.body.weights
+    stiff = np.flatnonzero(weights.max(axis=1) > 1.0 - 1e-9)
+    bones = rig.body_from_canonical(pose.joint_rotations)[weights[stiff].argmax(axis=1)]
+    expected = shaped.with_pose(pose).vertices()[stiff]
+    assert len(stiff) > 100
+    np.testing.assert_allclose(carried(bones, skin[stiff]), expected, atol=1e-7)
+
+
+def test_the_root_turns_about_the_pelvis(rig, rng):
+    turn, shift = rng.normal(size=(2, 3))
+    pose = BodyPose(root_rotation=turn, root_translation=shift, joint_rotations=np.zeros((23, 3)))
+    world_from_body = rig.world_from_body(pose)
+    pelvis = rig.rest_joints[0]
+    landed = world_from_body[:3, :3] @ pelvis + world_from_body[:3, 3]
+    np.testing.assert_allclose(landed, pelvis + shift, atol=1e-12)
+    expected = Rotation.from_rotvec(turn).as_matrix()
+    np.testing.assert_allclose(world_from_body[:3, :3], expected, atol=1e-12)
+
+
+def test_the_box_is_the_canonical_body_and_its_margin(rig, skin):
+    np.testing.assert_allclose(rig.box_low, skin.min(axis=0) - 0.17, atol=1e-6)
+    np.testing.assert_allclose(rig.box_high, skin.max(axis=0) + 0.17, atol=1e-6)
+
+
+def test_weights_are_shares(rig, rng):
+    assert rig.weights.min() >= 0.0
+    np.testing.assert_allclose(rig.weights.sum(axis=-1), 1.0, atol=1e-5)
+    inside = rng.uniform(rig.box_low, rig.box_high, (1000, 3))
+    np.testing.assert_allclose(rig.weights_at(inside).sum(axis=1), 1.0, atol=1e-5)
+
+
+def test_weights_on_the_nodes_are_those_that_are_stored(rig, rng):
+    shape = np.array(rig.weights.shape[:3])
+    node = (rng.random((200, 3)) * shape).astype(int)
+    points = rig.box_low + node / (shape - 1) * (rig.box_high - rig.box_low)
+    np.testing.assert_allclose(rig.weights_at(points), rig.weights[tuple(node.T)], atol=1e-4)
+
+
+def test_weights_outside_the_box_are_those_of_its_border(rig):
+    beyond = np.stack([rig.box_low - 1.0, rig.box_high + 1.0]).astype(np.float64)
+    expected = np.stack([rig.weights[0, 0, 0], rig.weights[-1, -1, -1]])
+    np.testing.assert_array_equal(rig.weights_at(beyond), expected)
+
+
+def test_on_the_skin_the_weights_are_close_to_the_vertices(rig, shaped, skin):
+    """Total variation: the share of the weight that sits on another joint than it should."""
+    strays = 0.5 * np.abs(rig.weights_at(skin) - shaped.body.weights).sum(axis=1)
+    assert strays.mean() < 0.05
+    assert np.quantile(strays, 0.99) < 0.35
+
+
+def test_far_from_creases_the_weights_are_those_of_the_nearest_vertex(rig, shaped, skin):
+    """Where all skin within 10 cm follows one bone, so does the space around it."""
+    weights = shaped.body.weights
+    bone, stiff = weights.argmax(axis=1), weights.max(axis=1) > 0.999
+    some = np.arange(0, len(skin), 10)
+    around = KDTree(skin).query_ball_point(skin[some], 0.10)
+    same = [stiff[near].all() and (bone[near] == bone[near[0]]).all() for near in around]
+    place = some[np.array(same)]
+    assert len(place) > 10
+    np.testing.assert_allclose(rig.weights_at(skin[place]), weights[place], atol=2e-3)
+
+
+def test_the_distance_is_that_to_the_nearest_vertex(rig, skin, rng):
+    shape = np.array(rig.skin_distance.shape)
+    cell = (rng.random((500, 3)) * shape).astype(int)
+    centers = rig.box_low + (cell + 0.5) / shape * (rig.box_high - rig.box_low)
+    expected = np.sqrt(((centers[:, None] - skin[None]) ** 2).sum(axis=-1)).min(axis=1)
+    found = rig.skin_distance[tuple(cell.T)]
+    near = expected < 0.18
+    assert near.any()
+    assert not near.all()
+    np.testing.assert_allclose(found[near], expected[near], atol=1e-5)
+    assert (found[expected > 0.2] == 1.0).all()
+
+
+def test_seeds_are_skin_and_leave_no_part_of_it_unseeded(rig, skin):
+    seeds = KDTree(rig.seeds)
+    on_skin, _ = KDTree(skin).query(rig.seeds)
+    reach, nearest = seeds.query(skin)
+    assert on_skin.max() < 1e-6
+    assert reach.max() < 0.02 * np.sqrt(3.0)  # a voxel's diagonal
+    assert set(rig.seed_parts) == set(PART_OF_JOINT)
+    assert len(np.unique(nearest)) == len(rig.seeds)
+
+
+def test_body_parts_mirror():
+    """Left and right joints belong to different parts unless both belong to the trunk."""
+    pairs = [(1, 2), (4, 5), (7, 8), (10, 11), (13, 14), (16, 17), (18, 19), (20, 21), (22, 23)]
+    for left, right in pairs:
+        assert (PART_OF_JOINT[left] == PART_OF_JOINT[right]) == (PART_OF_JOINT[left] == 0)
+        assert (PART_OF_JOINT[left] == PART_OF_JOINT[PARENTS[left]]) == (
+            PART_OF_JOINT[right] == PART_OF_JOINT[PARENTS[right]]
+        )
+
+
+def winding_number(points, vertices, faces) -> np.ndarray:
+    """How often a closed mesh winds about each point: its solid angle over 4π.
+
+    Van Oosterom and Strackee 1983.
+    """
+    a, b, c = (vertices[faces[:, k]][None] - points[:, None] for k in range(3))
+    la, lb, lc = (np.linalg.norm(side, axis=-1) for side in (a, b, c))
+    volume = np.einsum("pfk,pfk->pf", a, np.cross(b, c))
+    ab, bc, ca = ((x * y).sum(axis=-1) for x, y in ((a, b), (b, c), (c, a)))
+    angle = 2.0 * np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb)
+    return angle.sum(axis=1) / (4.0 * np.pi)
+
+
+def test_what_is_inside_is_where_the_skin_winds_about_it(rig, skin, shaped, rng):
+    shape = np.array(rig.skin_distance.shape)
+    off_skin = np.argwhere((rig.skin_distance > 0.015) & (rig.skin_distance < 0.1))
+    cell = off_skin[rng.integers(len(off_skin), size=200)]
+    centers = rig.box_low + (cell + 0.5) / shape * (rig.box_high - rig.box_low)
+    inside = winding_number(centers, skin, shaped.body.faces) > 0.5
+    assert 0.05 < inside.mean() < 0.5
+    assert (rig.inside_skin[tuple(cell.T)] == inside).mean() > 0.99
