@@ -305,8 +305,8 @@ def measure_real(job: TrackingJob, capture: Path) -> Iterator[Measurement]:
         )
     yield Measurement(
         name=f"{name}: body and tracked masks, IoU",
-        value=grade["iou_mean"],
-        context=grade["summary"],
+        value=body_iou(open_tracked(tracked, film)),
+        context=f"its own grade: {grade['summary']}",
     )
 
 
