@@ -4,6 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from capture.camera_device import camera_address
 from capture.input_error import InputError
 
 POSE_FILE_NAMES = [
@@ -114,6 +115,19 @@ def find_own_cameras(video: Path, poses: Path | None = None) -> Path | None:
     return _first_existing(_places_of_parts(video, poses), CAMERA_NAMES)
 
 
+def find_stream_cameras(video: Path, named: str | None) -> Path | None:
+    """The cameras of a video or a live source without poses; None without any.
+
+    Args:
+        video: Video file, folder of pictures, or `camera:…`.
+        named: Value of --cameras: a file, "static" or "solve", of which nothing is known yet, or
+            None.
+    """
+    if named in ("static", "solve"):
+        return None
+    return find_own_cameras(video) if named is None else Path(named)
+
+
 def find_live_poses(folder: Path) -> Path | None:
     """The poses in a folder to which a live source is written; None if there are none yet."""
     inside = folder.parent if folder.name == "images" else folder
@@ -123,7 +137,8 @@ def find_live_poses(folder: Path) -> Path | None:
 def _places_of_parts(video: Path, poses: Path | None) -> list[Path]:
     inside = video.is_dir() and video.name != "images"
     place = video if inside else video.parent
-    return [place] if poses is None else [place, poses.parent]
+    beside = [] if camera_address(video) is not None else [place]
+    return beside if poses is None else [*beside, poses.parent]
 
 
 def find_live_capture_paths(

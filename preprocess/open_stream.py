@@ -10,7 +10,7 @@ from capture.source_opening import open_live_source, open_source
 from preprocess.alignment.capture_alignment import BodyAlignment
 from preprocess.body.parametric_body import load_body_model, read_shaped_body
 from preprocess.cameras.camera_orientation import assume_camera
-from preprocess.capture_paths import CapturePaths, find_own_cameras, find_own_masks
+from preprocess.capture_paths import CapturePaths, find_own_masks, find_stream_cameras
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.live.live_masks import LiveMasks, check_mask_folder
 from preprocess.live.tracked_stream import LiveTracking, MaskReader, TrackedStream
@@ -62,7 +62,7 @@ def open_tracked_stream(
         shaped,
         assume_camera(wanted.video, wanted.cameras, stream),
         fixed_body=avatar_body is not None,
-        stated_focal=not source.live and _names_cameras(wanted),
+        stated_focal=find_stream_cameras(wanted.video, wanted.cameras) is not None,
     )
     segment, notes = None, ()
     if not choice.is_fallback:
@@ -83,13 +83,6 @@ def open_tracked_stream(
     )  # fmt: skip
 
 
-def _names_cameras(wanted: CaptureInputs) -> bool:
-    """Whether a recording comes with a file of cameras."""
-    if wanted.cameras is None:
-        return find_own_cameras(wanted.video) is not None
-    return wanted.cameras != "static"
-
-
 def _open_masks(
     wanted: CaptureInputs, source: FrameSource, pace: PacingClock
 ) -> tuple[MaskOrigin, MaskReader | None]:
@@ -99,8 +92,9 @@ def _open_masks(
         InputError: If masks that were named cannot be used.
     """
     camera = camera_address(wanted.video)
-    found = find_own_masks(wanted.video) if camera is None else None
-    choice = choose_mask_origin(wanted.masks, found, has_alpha=source.has_alpha)
+    choice = choose_mask_origin(
+        wanted.masks, find_own_masks(wanted.video), has_alpha=source.has_alpha
+    )
     source.has_alpha = choice.uses_alpha_channel
     if choice.path is None:
         return choice, alpha_channel_mask if choice.uses_alpha_channel else None

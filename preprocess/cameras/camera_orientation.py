@@ -13,7 +13,7 @@ from capture.source import FrameSource
 from preprocess.body.body_pose import RelativeFocalLength
 from preprocess.cameras.camera_file import DEFAULT_FOCAL_RATIO, CameraTrack, read_cameras
 from preprocess.cameras.camera_registry import find_colmap_model
-from preprocess.capture_paths import find_own_cameras
+from preprocess.capture_paths import find_stream_cameras
 
 MIRRORED_EXIF_QUARTER_TURNS = {2: 0, 4: 2, 5: 1, 7: 3}
 """Counter-clockwise quarter turns that make a mirrored photograph upright after left and right were
@@ -132,16 +132,14 @@ def assume_camera(video: Path, named: str | None, source: FrameSource) -> Camera
 
     Args:
         video: The video, beside which cameras may lie.
-        named: Value of --cameras: a file, "static" or "solve", of which nothing is known yet, or
-            None.
+        named: Value of --cameras; see `find_stream_cameras`.
         source: The video's frames.
 
     Raises:
         InputError: If a file of cameras cannot be read.
     """
-    unknown = named in ("static", "solve") or source.live
-    path = None if unknown else named or find_own_cameras(video)
+    path = find_stream_cameras(video, named)
     if path is None:
         phone = RelativeFocalLength(ratio=DEFAULT_FOCAL_RATIO).intrinsic_matrix(source.size_px)
         return Camera.from_intrinsic(phone, source.size_px)
-    return replace(read_upright_cameras(Path(path), source)[0], camera_from_world=np.eye(4))
+    return replace(read_upright_cameras(path, source)[0], camera_from_world=np.eye(4))

@@ -5,16 +5,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from capture.input_error import InputError
 from capture.source import Frame
 from preprocess.body.body_surface import splat_silhouette
 from preprocess.body.parametric_body import load_body_model
+from preprocess.cameras.camera_file import CameraTrack, write_cameras
 from preprocess.cameras.camera_orientation import assume_camera
+from preprocess.capture_session import CaptureInputs
 from preprocess.fitting.tracked_frames import LAG_FRAMES
 from preprocess.live import tracked_stream
 from preprocess.live.tracked_stream import NOT_FOUND, LiveTracking, TrackedStream
 from preprocess.observation import DroppedFrame, Observation
+from preprocess.open_stream import open_tracked_stream
 from preprocess.tracking.keypoints import CroppedMask, PersonKeypoints
 
 COUNT = 24
@@ -180,3 +184,33 @@ def test_a_stated_focal_length_changes_less_than_an_assumed_one(standing):
         start = tracking.start(shaped, guess, stated_focal=stated)
         changes.append(abs(np.log(start.cameras[0].focal_px[0] / guess.focal_px[0])))
     assert changes[1] < 0.5 * changes[0]
+
+
+@pytest.mark.parametrize("beside", [False, True])
+def test_a_live_folder_takes_the_focal_length_of_a_camera_file(standing, tmp_path, beside):
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for number in range(tracked_stream.START_FRAMES):
+        Image.new("RGB", SIZE, (80, 80, 80)).save(folder / f"{number:04d}.png")
+    (folder / "DONE").touch()
+    assumed = assume_camera(folder, "static", Pictures())
+    stated = assumed.scale_focal(1.3)
+    file = (folder if beside else tmp_path) / "cameras.npz"
+    write_cameras(file, CameraTrack(cameras=(stated,), source="file"))
+
+    def focal_px(cameras: str | None) -> float:
+        named = CaptureInputs(video=folder, live=True, cameras=cameras)
+        opened = open_tracked_stream(named, Tracker(standing), lambda size: plain, tmp_path / "p")
+        return opened.cameras[0].focal_px[0]
+
+    told = focal_px(None if beside else str(file))
+    unknown = focal_px("static")
+    away = [abs(np.log(each / stated.focal_px[0])) for each in (told, unknown)]
+    assert away[0] < 0.5 * away[1]
+
+
+def test_a_camera_has_no_files_beside_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    np.savez("cameras.npz", intrinsic=np.eye(3))
+    camera = assume_camera(Path("camera:0"), None, Pictures())
+    assert camera.focal_px == assume_camera(Path("film.mp4"), "static", Pictures()).focal_px
