@@ -12,7 +12,7 @@ from apps.cli.command_line import parse_arguments
 from apps.cli.console import Console
 from apps.cli.exit_codes import DONE, run_command
 from capture.input_error import InputError
-from export.web import onnxruntime_web
+from export import player_page
 
 PROGRAM = "python -m apps.fetch_runtime"
 """Name of the command in its --help."""
@@ -42,11 +42,11 @@ def fetch_runtime(console: Console) -> int:
         InputError: If npm is missing or fails, or the checksum differs.
     """
     try:
-        onnxruntime_web.runtime_files()
+        player_page.runtime_files()
     except InputError:
-        with console.status(f"fetching onnxruntime-web {onnxruntime_web.ORT_WEB_VERSION}"):
-            onnxruntime_web.install_runtime(_fetch_tarball())
-    console.print_artifact("onnxruntime-web", onnxruntime_web.FOLDER)
+        with console.status(f"fetching onnxruntime-web {player_page.ORT_WEB_VERSION}"):
+            player_page.install_runtime(_fetch_tarball())
+    console.print_artifact("onnxruntime-web", player_page.RUNTIME_FOLDER)
     return DONE
 
 
@@ -55,7 +55,7 @@ def _fetch_tarball() -> bytes:
     if npm is None:
         raise InputError("npm was not found. Install Node.js, which includes it, and try again.")
     with tempfile.TemporaryDirectory() as folder:
-        package = f"onnxruntime-web@{onnxruntime_web.ORT_WEB_VERSION}"
+        package = f"onnxruntime-web@{player_page.ORT_WEB_VERSION}"
         command = [npm, "pack", package, "--ignore-scripts", "--pack-destination", folder]
         done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)
         found = list(Path(folder).glob("*.tgz"))

@@ -158,8 +158,7 @@ def _run_web(arguments: PlayArguments, port: int, console: Console) -> int:
     from apps.animation.web_server import serve_site, web_clip, write_site
     from apps.cli.output_paths import check_output_folder
     from export.player import Player
-    from export.web.onnxruntime_web import runtime_files
-    from export.web.player_page import build_page
+    from export.player_page import build_page, runtime_files
 
     if not 0 < port < 1 << 16:
         raise InputError(f"--web is {port}, but must be a port from 1 to 65535.")

@@ -28,9 +28,9 @@ from apps.cli.exit_codes import run_command
 from benchmarks.hardware import Hardware
 from benchmarks.measurements import Measurement, markdown_rows
 from benchmarks.stopwatch import limit_threads
-from export.package.render_settings import QUALITY_TIERS
+from export.package.player_tables import QUALITY_TIERS
 from export.player import Player
-from export.web.player_page import build_page
+from export.player_page import build_page
 from preprocess.body.body_pose import Motion
 from tests.apps.browser import Browser, until
 

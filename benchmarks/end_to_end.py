@@ -20,8 +20,7 @@ import tyro
 from apps.report.learning_curve import CurvePoint, largest_drop
 from avatar.evaluation.image_metrics import composite_on_white, ground_truth_on_white, psnr, ssim
 from benchmarks.hardware import ROOT, Hardware
-from export.picture_difference import premultiply
-from export.player import Player
+from export.player import Player, premultiply
 from preprocess.capture_session import CaptureInputs
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture

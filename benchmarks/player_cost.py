@@ -20,7 +20,7 @@ from benchmarks.hardware import ROOT
 from benchmarks.measurements import Measurement
 from benchmarks.player_fidelity import ComparedView
 from export.bake.bake_tables import ExportRefused
-from export.package.render_settings import QUALITY_TIERS
+from export.package.player_tables import QUALITY_TIERS
 from export.player import Player
 
 MB = 1e6

@@ -17,9 +17,8 @@ from benchmarks.end_to_end import novel_observations
 from benchmarks.measurements import Measurement
 from benchmarks.sample_training import open_sample
 from capture.camera import Camera
-from export.package.render_settings import QUALITY_TIERS
-from export.picture_difference import premultiply
-from export.player import Player
+from export.package.player_tables import QUALITY_TIERS
+from export.player import Player, premultiply
 from preprocess.body.body_pose import BodyPose
 from preprocess.capture_session import Capture
 from preprocess.observation import Observation

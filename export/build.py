@@ -1,6 +1,8 @@
 """Exporting an avatar: sample the field, bake, fine-tune, build the graphs, check, write.
 
 report = export_avatar(avatar, Path("avatar.iavatar"), views=[(pose, camera)], metrics={})
+
+The checks compare a package's player with its reference and with the volume renderer.
 """
 
 import io
@@ -17,37 +19,45 @@ import torch
 from jaxtyping import Float32, UInt8
 from PIL import Image
 
+from avatar.evaluation.image_metrics import psnr
 from avatar.field.avatar_model import Avatar
 from avatar.render import render
 from avatar.rig import Rig
 from capture.camera import Camera
 from capture.input_error import InputError
-from export.bake.bake_tables import BakeConfig, bake_tables, sample_field
-from export.bake.field_grid import FieldFunction
+from export.bake.bake_tables import BakeConfig, ExportRefused, bake_tables, sample_field
 from export.bake.fine_tuning import (
     THICK_FIELD_PICTURES,
     ExportProgress,
     FineTuningInputs,
     FineTuningResult,
+    PictureCache,
+    PosedView,
+    RenderFunction,
+    RgbaPicture,
     fine_tune,
     is_below_target,
 )
-from export.bake.render_targets import PictureCache, PosedView, RenderFunction, RgbaPicture
+from export.bake.proxy_surface import FieldFunction
+from export.bake.reference_player import PlayerInputs, draw_reference
 from export.graph.player_graph import build_graph
 from export.package.manifest import MAX_GOLDEN_PX, GoldenFrame, Manifest, TierInfo
 from export.package.package_file import AvatarPackage, PackageWriter
-from export.package.player_tables import PlayerTables
-from export.package.render_settings import QUALITY_TIERS, THICK_FIELD_TIERS, RenderSettings
-from export.package.table_codec import TableLayout, estimate_brick_bytes
-from export.package_checks import (
-    CHECK_PX,
-    check_graph,
-    mean_psnr_to_renderer,
-    quality_warnings,
+from export.package.player_tables import (
+    QUALITY_TIERS,
+    THICK_FIELD_TIERS,
+    PlayerTables,
+    RenderSettings,
 )
-from export.picture_difference import picture_on_white
-from export.player import Player
-from export.player_limits import fit_camera
+from export.package.table_codec import TableLayout, estimate_brick_bytes
+from export.player import (
+    MIN_CLOSE_FRACTION,
+    PictureDifference,
+    Player,
+    picture_on_white,
+    premultiply,
+)
+from export.player_inputs import fit_camera
 from preprocess.body.body_pose import BodyPose
 
 GRAPH_CHECK_PICTURES = {"hq": 2, "lite": 1}
@@ -314,3 +324,72 @@ def _encode_png(rgba: UInt8[np.ndarray, "height width 4"]) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(rgba).save(buffer, format="PNG")
     return buffer.getvalue()
+
+
+POOR_PSNR = 30.0
+"""Player against volume renderer, dB: below this a package shows its avatar poorly."""
+GOOD_PSNR = 38.0
+"""Player against volume renderer, dB: from this on, both look the same."""
+SIMPLIFIED_WARNING = (
+    "The package simplifies fine detail or soft edges: what it draws is {score:.1f} dB from the "
+    "avatar as trained ({good:.0f} dB and more look the same)."
+)
+"""Shown between `POOR_PSNR` and `GOOD_PSNR`."""
+POOR_WARNING = (
+    "The package shows the avatar poorly: what it draws is only {score:.1f} dB from the avatar as "
+    "trained ({good:.0f} dB and more look the same). The avatar is still fog rather than a "
+    "surface; train longer (ia-ingest with --resume and more --seconds)."
+)
+"""Shown below `POOR_PSNR`."""
+CHECK_PX = 256
+"""Longer side of the pictures that are compared with the volume renderer, pixels."""
+
+
+def check_graph(
+    player: Player, package: AvatarPackage, tier: str, frames: Sequence[GoldenFrame]
+) -> float:
+    """Compare a tier's graph with its reference.
+
+    Returns:
+        The largest difference over all frames, in 1/255.
+
+    Raises:
+        ExportRefused: If a picture does not match.
+    """
+    tables, settings = package.tables[tier], package.manifest.tiers[tier].settings
+    worst = 0.0
+    for number, frame in enumerate(frames):
+        camera = frame.camera
+        inputs = PlayerInputs.of(player.bones(frame.pose, camera), camera, settings.samples)
+        drawn = premultiply(player.render(frame.pose, camera))
+        difference = PictureDifference.of(drawn, draw_reference(tables, settings, inputs))
+        worst = max(worst, difference.largest_difference)
+        if not difference.matches:
+            raise ExportRefused(
+                f"In view {number} the player's graph ({tier}) is within 2/255 of its reference "
+                f"on only {difference.close_fraction:.2%} of the pixels; {MIN_CLOSE_FRACTION:.1%} "
+                "are required. Nothing was written; the checkpoint is kept. This is a fault of the "
+                "program: please report it with the version of onnxruntime."
+            )
+    return worst
+
+
+def mean_psnr_to_renderer(
+    player: Player,
+    views: Sequence[PosedView],
+    exact: Sequence[Float32[np.ndarray, "_ _ 3"]],
+) -> float:
+    """Return the mean PSNR of the player to the renderer's pictures on white, dB."""
+    scores = []
+    for (pose, camera), truth in zip(views, exact, strict=True):
+        drawn = picture_on_white(premultiply(player.render(pose, fit_camera(camera, CHECK_PX))))
+        scores.append(min(psnr(drawn, truth), 99.0))
+    return float(np.mean(scores))
+
+
+def quality_warnings(score: float) -> list[str]:
+    """Return the warnings for a player with this mean PSNR to the renderer, dB."""
+    if score >= GOOD_PSNR:
+        return []
+    text = POOR_WARNING if score < POOR_PSNR else SIMPLIFIED_WARNING
+    return [text.format(score=score, good=GOOD_PSNR)]

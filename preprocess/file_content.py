@@ -1,14 +1,16 @@
 """What a file holds, as dictionaries, lists, numbers, texts and numpy arrays; nothing is run.
 
-Two readers: `read_npz` for archives of arrays, whose keys are known, and `read_untrusted_file` for
-files of any container. A container is recognised by its first bytes: people rename files.
+Three readers: `read_npz` and `read_pickled_arrays` for files whose keys are known, and
+`read_untrusted_file` for files of any container, which is recognised by its first bytes: people
+rename files.
 """
 
 import io
 import json
+import sys
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +19,27 @@ from jaxtyping import Shaped
 
 from capture.image_folder import natural_sort_key
 from capture.input_error import InputError
-from preprocess.pickle_records import element_count
-from preprocess.safe_pickle import MAX_BYTES, explain_failures, load_pickle, read_limited
+from preprocess.safe_pickle import (
+    OLD_TORCH_MAGIC,
+    ArrayRecord,
+    PickleRecord,
+    SparseRecord,
+    UnsafePickleError,
+    array_of,
+    dtype_of,
+    element_count,
+    load_records,
+    load_torch,
+)
+
+MAX_BYTES = 1 << 30
+"""Largest file, and most bytes of arrays made from one (SMPL with 300 betas: a quarter of it)."""
+
+MAX_ITEMS = 1 << 21
+"""Most dictionaries, lists and numbers in one file."""
+
+MAX_DEPTH = 16
+"""Deepest nesting of dictionaries and lists."""
 
 MAX_UNPACKED_BYTES = 4 << 30
 """Archives that would unpack to more are refused."""
@@ -54,6 +75,68 @@ def read_npz(
             "Is the file complete, and written without pickled objects?"
         ) from cause
     return {key: array for key, array in found.items() if isinstance(array, np.ndarray)}
+
+
+def read_pickled_arrays(path: Path, keys: Collection[str]) -> dict[str, Shaped[np.ndarray, "..."]]:
+    """Those of the entries `keys` of a pickled dictionary that it has, as arrays.
+
+    Raises:
+        InputError: If the file is too large, is not a pickle of a dictionary, holds anything that
+            would have to be executed, or if a wanted entry is not an array.
+    """
+    content = explain_failures(path, lambda: load_records(read_limited(path)))
+    if not isinstance(content, dict):
+        raise InputError(f"{path} holds a {type(content).__name__}; a dictionary was expected.")
+    arrays = {}
+    for key in keys:
+        if key in content:
+            try:
+                arrays[key] = array_of(content[key])
+            except Exception as cause:  # the records hold whatever the file says
+                raise InputError(f"`{key}` in {path} is no readable array ({cause}).") from cause
+    return arrays
+
+
+def explain_failures(path: Path, read: Callable[[], Any], kind: str = "pickle") -> Any:
+    """What `read` gives, or what is wrong with the file, in words.
+
+    Raises:
+        InputError: If the file asks to run something, or `read` fails in any other way.
+    """
+    try:
+        return read()
+    except (InputError, PermissionError):  # a command names who may not read what
+        raise
+    except UnsafePickleError as found:
+        raise InputError(
+            f"{path} is a pickle that asks to run {found}; it was refused and nothing was run. "
+            "A body or pose file holds arrays only: get it from its authors again, or convert it "
+            "to .npz."
+        ) from None
+    except Exception as cause:  # a broken pickle may fail in any way: see the pickle documentation
+        if isinstance(cause, ModuleNotFoundError) and cause.name == "torch":
+            raise InputError(
+                f"{path} holds tensors of PyTorch, which is not installed: pip install "
+                "'instant-avatar-stream[learn]'. Or convert it to .npz where PyTorch is: "
+                "torch.load, then numpy.savez."
+            ) from None
+        # a KeyError's text is the byte or name that was not expected, and explains nothing
+        why = "it holds something else" if isinstance(cause, KeyError) else cause
+        raise InputError(f"{path} is no readable {kind} ({why}). Is the file complete?") from cause
+
+
+def read_limited(path: Path) -> bytes:
+    """The bytes of a file, unless there are more than `MAX_BYTES`.
+
+    Raises:
+        InputError: If it is too large.
+    """
+    size = path.stat().st_size
+    if size > MAX_BYTES:
+        raise InputError(
+            f"{path} has {size >> 20} MiB; pickles of more than {MAX_BYTES >> 20} MiB are not read."
+        )
+    return path.read_bytes()
 
 
 POSE_FILE_SUFFIXES = frozenset(
@@ -201,3 +284,82 @@ def _inflated(data: bytes, bits: int) -> Iterator[bytes]:
         while packed and not inflater.eof:
             yield inflater.decompress(packed, CHUNK_BYTES)
             packed = inflater.unconsumed_tail
+
+
+def load_pickle(data: bytes) -> Any:
+    """What a pickle or PyTorch file holds: dictionaries, lists, numbers, texts and numpy arrays.
+
+    Raises:
+        UnsafePickleError: If it names anything that is not in `ALLOWED`.
+        Exception: Of any kind, if it is damaged or too large.
+    """
+    if data.startswith(b"PK") or OLD_TORCH_MAGIC in data[:32]:
+        return _Plain().of(load_torch(data))
+    return _Plain().of(load_records(data))
+
+
+class _Plain:
+    """Turns records and tensors into plain values, each once, with limits on all of them."""
+
+    def __init__(self) -> None:
+        self._items, self._grown_bytes = 0, 0
+        self._known: dict[int, Any] = {}
+        self._kept: list[Any] = []
+        """Things made on the way: their ids must not be used again."""
+
+    def of(self, thing: Any, depth: int = 0) -> Any:
+        """The plain value; a thing that was met before has the same value again."""
+        if thing is None or isinstance(thing, bool | int | float | str | np.ndarray | np.generic):
+            return thing
+        if depth > MAX_DEPTH:
+            raise ValueError("nested too deeply")
+        if id(thing) not in self._known:
+            self._count(1)
+            self._kept.append(thing)
+            self._known[id(thing)] = self._made(thing, depth + 1)
+        return self._known[id(thing)]
+
+    def _made(self, thing: Any, depth: int) -> Any:
+        match thing:
+            case bytes() | bytearray():
+                return bytes(thing).decode("latin1")
+            case dict():
+                self._count(len(thing))
+                return {
+                    self._key(key, depth): self.of(value, depth) for key, value in thing.items()
+                }
+            case list() | tuple() | set() | frozenset():
+                self._count(len(thing))
+                return [self.of(part, depth) for part in thing]
+            case ArrayRecord(state=(_, shape, kind, _, raw)) if dtype_of(kind).hasobject:
+                parts = [self.of(part, depth) for part in raw]
+                self._count(len(parts))
+                return parts[0] if shape == () and len(parts) == 1 else parts
+            case SparseRecord():
+                array = array_of(thing)
+                self._count_grown(array.nbytes)
+                return array
+            case PickleRecord():
+                return array_of(thing)
+        torch: Any = sys.modules.get("torch")
+        if torch is not None and type(thing) in (torch.Tensor, torch.nn.Parameter):
+            self._count_grown(element_count(thing.shape) * thing.element_size())  # expand()ed, too
+            return thing.detach().numpy()
+        raise ValueError(f"a {type(thing).__name__}")
+
+    def _key(self, key: Any, depth: int) -> Any:
+        plain = self.of(key, depth)
+        if isinstance(plain, np.ndarray | np.generic):
+            plain = plain.item()
+        return tuple(plain) if isinstance(plain, list) else plain
+
+    def _count(self, more: int) -> None:
+        self._items += more
+        if self._items > MAX_ITEMS:
+            raise ValueError(f"more than {MAX_ITEMS} things")
+
+    def _count_grown(self, more: int) -> None:
+        """Counts the bytes of arrays that a small file can make large."""
+        self._grown_bytes += more
+        if self._grown_bytes > MAX_BYTES:
+            raise ValueError(f"arrays that grow beyond {MAX_BYTES >> 20} MiB")

@@ -1,6 +1,6 @@
 """Observations: frames joined with the person's mask, pose and camera, all of one size."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import cv2
@@ -53,23 +53,6 @@ class DroppedFrame:
 
     index: int
     reason: str
-
-
-def observe(
-    source: FrameSource,
-    motion: Motion,
-    masks: Masks | None,
-    cameras: CameraTrack,
-    *,
-    size_px: int | None = None,
-    segment: Segmenter | None = None,
-    refine: GivenMaskRefiner | None = None,
-) -> Iterator[Observation | DroppedFrame]:
-    """Observations of the wanted frames in order, lazily; `observation_builder` says the rest."""
-    observed = observation_builder(
-        source, motion, masks, cameras, size_px=size_px, segment=segment, refine=refine
-    )
-    return map(observed, source.frames())
 
 
 def observation_builder(

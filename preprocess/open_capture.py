@@ -39,13 +39,13 @@ from preprocess.masks.mask_origin import (
     make_segmenter,
     segmenter_name,
 )
+from preprocess.poses.motion_builder import place_in_camera_world
 from preprocess.poses.plausibility import (
     lost_pose_warnings,
     plausibility_warnings,
     require_plausible,
 )
 from preprocess.poses.pose_format_registry import read_poses
-from preprocess.poses.root_placement import place_in_camera_world
 
 
 def describe_capture(

@@ -10,37 +10,17 @@ import io
 import pickle
 import re
 import struct
-import sys
-from collections.abc import Callable, Collection
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any, ClassVar, final
 
 import numpy as np
 from jaxtyping import Shaped
 
-from capture.input_error import InputError
-from preprocess.pickle_records import (
-    ArrayRecord,
-    ChumpyRecord,
-    DTypeRecord,
-    JoblibArrayRecord,
-    NameRecord,
-    PickleRecord,
-    SparseRecord,
-    array_of,
-    dtype_of,
-    element_count,
-    shaped_array,
-)
+MAX_EXPRESSION_DEPTH = 8
+"""Deepest nesting of chumpy's expressions."""
 
-MAX_BYTES = 1 << 30
-"""Largest file, and most bytes of arrays made from one (SMPL with 300 betas: a quarter of it)."""
-
-MAX_ITEMS = 1 << 21
-"""Most dictionaries, lists and numbers in one file."""
-
-MAX_DEPTH = 16
-"""Deepest nesting of dictionaries and lists."""
+MAX_SPARSE_CELLS = 1 << 25
+"""Most numbers in a sparse matrix that is made dense."""
 
 MAX_NESTED_PICKLES = 2
 """Deepest nesting of pickles in joblib's arrays of objects."""
@@ -51,6 +31,128 @@ OLD_TORCH_MAGIC = b"\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19."
 
 class UnsafePickleError(Exception):
     """The pickle names something that is not in `ALLOWED`."""
+
+
+class PickleRecord:
+    """Stands for an object of the pickle: keeps its arguments and its state, runs nothing."""
+
+    arguments: tuple[Any, ...]
+    state: Any
+
+    def __new__(cls, *arguments: Any) -> "PickleRecord":
+        """A record without a state."""
+        record = object.__new__(cls)
+        record.arguments, record.state = arguments, None
+        return record
+
+    def __init__(self, *arguments: Any) -> None:
+        """Does nothing: `pickle` may call `__new__` alone, which keeps the arguments."""
+
+
+class NameRecord(PickleRecord):
+    """A class that is only ever an argument."""
+
+
+class DTypeRecord(PickleRecord):
+    """numpy.dtype(code, …), with the byte order in its state."""
+
+
+class ArrayRecord(PickleRecord):
+    """An array of numpy: contents in its state (`_reconstruct`) or its arguments."""
+
+
+class JoblibArrayRecord(PickleRecord):
+    """joblib's NumpyArrayWrapper: type and shape in its state, contents behind it in the file."""
+
+
+class ChumpyRecord(PickleRecord):
+    """chumpy's variable (`x`), selection (`a`, `idxs`) or transposition (`a`, `axes`)."""
+
+
+class SparseRecord(PickleRecord):
+    """scipy's csc_matrix."""
+
+
+def array_of(thing: Any, depth: int = 0) -> Shaped[np.ndarray, "..."]:
+    """The array that a record, a number or a list of numbers stands for.
+
+    Raises:
+        Exception: Of any kind, for the records hold whatever the file says.
+    """
+    if depth > MAX_EXPRESSION_DEPTH:
+        raise ValueError("nested too deeply")
+    match thing:
+        case np.ndarray():
+            return thing
+        case ArrayRecord(state=(_, shape, kind, by_columns, raw)):  # _reconstruct
+            return shaped_array(raw, dtype_of(kind), shape, "F" if by_columns else "C")
+        case ArrayRecord(arguments=(kind, raw)):  # scalar
+            return shaped_array(raw, dtype_of(kind), (), "C")
+        case ArrayRecord(arguments=(raw, kind, shape, order)):  # _frombuffer
+            return shaped_array(raw, dtype_of(kind), shape, order)
+        case ChumpyRecord(state={"x": leaf}):
+            return array_of(leaf, depth + 1)
+        case ChumpyRecord(state={"a": a, "idxs": rows, **others}):
+            chosen = array_of(a, depth + 1).ravel()[array_of(rows, depth + 1).ravel()]
+            shape = others.get("preferred_shape")
+            return chosen if shape is None else chosen.reshape(shape)
+        case ChumpyRecord(state={"a": a, **others}):
+            return np.transpose(array_of(a, depth + 1), others.get("axes"))
+        case SparseRecord():
+            return _dense(thing.state, depth)
+        case bool() | int() | float() | list() | tuple():
+            plain = np.asarray(thing)
+            if plain.dtype.kind in "biuf":
+                return plain
+    raise ValueError(f"a {type(thing).__name__}")
+
+
+def dtype_of(kind: Any) -> np.dtype:
+    """The type that a record stands for; numbers and "object" only."""
+    if not isinstance(kind, DTypeRecord):
+        raise ValueError("an array without a type")
+    code = str(kind.arguments[0])
+    if not re.fullmatch(r"[fiu][1248]|b1|O8?", code):
+        raise ValueError(f"an array of {code!r}")
+    order = kind.state[1] if kind.state else "="
+    return np.dtype(code[:2]).newbyteorder(order if order in "<>" else "=")
+
+
+def shaped_array(raw: Any, kind: np.dtype, shape: Any, order: Any) -> Shaped[np.ndarray, "..."]:
+    """Bytes as an array of numbers; a view, which cannot grow."""
+    if kind.hasobject:
+        raise ValueError("an array of objects")
+    content = np.frombuffer(raw.encode("latin1") if isinstance(raw, str) else raw, kind)
+    return content.reshape(shape, order="F" if order == "F" else "C")
+
+
+def _dense(state: Any, depth: int) -> Shaped[np.ndarray, "rows columns"]:
+    """scipy's compressed columns as a full matrix."""
+    rows, columns = (int(array_of(n)) for n in state.get("_shape", state.get("shape")))
+    if rows * columns > MAX_SPARSE_CELLS:
+        raise ValueError(f"a sparse matrix of {rows}x{columns}")
+    data, indices, starts = (
+        array_of(state[key], depth + 1) for key in ("data", "indices", "indptr")
+    )
+    dense = np.zeros((rows, columns), data.dtype)
+    np.add.at(dense, (indices, np.repeat(np.arange(columns), np.diff(starts))), data)
+    return dense
+
+
+def element_count(shape: tuple[int, ...]) -> int:
+    """How many numbers an array of this shape holds.
+
+    Raises:
+        ValueError: If a side is negative, or that is more than any file can hold.
+    """
+    if min(shape, default=0) < 0 or len(shape) > 32:
+        raise ValueError(f"an array of {shape}")
+    count = 1
+    for side in shape:
+        count *= int(side)
+        if count > 1 << 50:
+            raise ValueError("an array larger than any file")
+    return count
 
 
 def _latin1(text: str, *_: Any) -> bytes:
@@ -77,7 +179,7 @@ def _new(kind: Any, *_: Any) -> PickleRecord:
 
 def _torch_storage(raw: bytes | str) -> Any:
     """The numbers of a tensor in a pickle, which are a file of PyTorch themselves."""
-    return _load_torch(raw.encode("latin1") if isinstance(raw, str) else raw)
+    return load_torch(raw.encode("latin1") if isinstance(raw, str) else raw)
 
 
 def _tensor(
@@ -193,19 +295,7 @@ class _SafeUnpickler(_PythonUnpickler):
             raise pickle.UnpicklingError(f"an array of {length} bytes that are not there")
 
 
-def load_pickle(data: bytes) -> Any:
-    """What a pickle or PyTorch file holds: dictionaries, lists, numbers, texts and numpy arrays.
-
-    Raises:
-        UnsafePickleError: If it names anything that is not in `ALLOWED`.
-        Exception: Of any kind, if it is damaged or too large.
-    """
-    if data.startswith(b"PK") or OLD_TORCH_MAGIC in data[:32]:
-        return _Plain().of(_load_torch(data))
-    return _Plain().of(_load_records(data))
-
-
-def _load_torch(data: bytes) -> Any:
+def load_torch(data: bytes) -> Any:
     """What `torch.load` makes of a file that may name nothing but tensors.
 
     Raises:
@@ -228,135 +318,6 @@ def _load_torch(data: bytes) -> Any:
         raise UnsafePickleError(named[1]) from cause
 
 
-def read_pickled_arrays(path: Path, keys: Collection[str]) -> dict[str, Shaped[np.ndarray, "..."]]:
-    """Those of the entries `keys` of a pickled dictionary that it has, as arrays.
-
-    Raises:
-        InputError: If the file is too large, is not a pickle of a dictionary, holds anything that
-            would have to be executed, or if a wanted entry is not an array.
-    """
-    content = explain_failures(path, lambda: _load_records(read_limited(path)))
-    if not isinstance(content, dict):
-        raise InputError(f"{path} holds a {type(content).__name__}; a dictionary was expected.")
-    arrays = {}
-    for key in keys:
-        if key in content:
-            try:
-                arrays[key] = array_of(content[key])
-            except Exception as cause:  # the records hold whatever the file says
-                raise InputError(f"`{key}` in {path} is no readable array ({cause}).") from cause
-    return arrays
-
-
-def explain_failures(path: Path, read: Callable[[], Any], kind: str = "pickle") -> Any:
-    """What `read` gives, or what is wrong with the file, in words.
-
-    Raises:
-        InputError: If the file asks to run something, or `read` fails in any other way.
-    """
-    try:
-        return read()
-    except (InputError, PermissionError):  # a command names who may not read what
-        raise
-    except UnsafePickleError as found:
-        raise InputError(
-            f"{path} is a pickle that asks to run {found}; it was refused and nothing was run. "
-            "A body or pose file holds arrays only: get it from its authors again, or convert it "
-            "to .npz."
-        ) from None
-    except Exception as cause:  # a broken pickle may fail in any way: see the pickle documentation
-        if isinstance(cause, ModuleNotFoundError) and cause.name == "torch":
-            raise InputError(
-                f"{path} holds tensors of PyTorch, which is not installed: pip install "
-                "'instant-avatar-stream[learn]'. Or convert it to .npz where PyTorch is: "
-                "torch.load, then numpy.savez."
-            ) from None
-        # a KeyError's text is the byte or name that was not expected, and explains nothing
-        why = "it holds something else" if isinstance(cause, KeyError) else cause
-        raise InputError(f"{path} is no readable {kind} ({why}). Is the file complete?") from cause
-
-
-def read_limited(path: Path) -> bytes:
-    """The bytes of a file, unless there are more than `MAX_BYTES`.
-
-    Raises:
-        InputError: If it is too large.
-    """
-    size = path.stat().st_size
-    if size > MAX_BYTES:
-        raise InputError(
-            f"{path} has {size >> 20} MiB; pickles of more than {MAX_BYTES >> 20} MiB are not read."
-        )
-    return path.read_bytes()
-
-
-def _load_records(data: bytes) -> Any:
+def load_records(data: bytes) -> Any:
     """What a pickle holds in dictionaries, lists and records."""
     return _SafeUnpickler(io.BytesIO(data)).load()
-
-
-class _Plain:
-    """Turns records and tensors into plain values, each once, with limits on all of them."""
-
-    def __init__(self) -> None:
-        self._items, self._grown_bytes = 0, 0
-        self._known: dict[int, Any] = {}
-        self._kept: list[Any] = []
-        """Things made on the way: their ids must not be used again."""
-
-    def of(self, thing: Any, depth: int = 0) -> Any:
-        """The plain value; a thing that was met before has the same value again."""
-        if thing is None or isinstance(thing, bool | int | float | str | np.ndarray | np.generic):
-            return thing
-        if depth > MAX_DEPTH:
-            raise ValueError("nested too deeply")
-        if id(thing) not in self._known:
-            self._count(1)
-            self._kept.append(thing)
-            self._known[id(thing)] = self._made(thing, depth + 1)
-        return self._known[id(thing)]
-
-    def _made(self, thing: Any, depth: int) -> Any:
-        match thing:
-            case bytes() | bytearray():
-                return bytes(thing).decode("latin1")
-            case dict():
-                self._count(len(thing))
-                return {
-                    self._key(key, depth): self.of(value, depth) for key, value in thing.items()
-                }
-            case list() | tuple() | set() | frozenset():
-                self._count(len(thing))
-                return [self.of(part, depth) for part in thing]
-            case ArrayRecord(state=(_, shape, kind, _, raw)) if dtype_of(kind).hasobject:
-                parts = [self.of(part, depth) for part in raw]
-                self._count(len(parts))
-                return parts[0] if shape == () and len(parts) == 1 else parts
-            case SparseRecord():
-                array = array_of(thing)
-                self._count_grown(array.nbytes)
-                return array
-            case PickleRecord():
-                return array_of(thing)
-        torch: Any = sys.modules.get("torch")
-        if torch is not None and type(thing) in (torch.Tensor, torch.nn.Parameter):
-            self._count_grown(element_count(thing.shape) * thing.element_size())  # expand()ed, too
-            return thing.detach().numpy()
-        raise ValueError(f"a {type(thing).__name__}")
-
-    def _key(self, key: Any, depth: int) -> Any:
-        plain = self.of(key, depth)
-        if isinstance(plain, np.ndarray | np.generic):
-            plain = plain.item()
-        return tuple(plain) if isinstance(plain, list) else plain
-
-    def _count(self, more: int) -> None:
-        self._items += more
-        if self._items > MAX_ITEMS:
-            raise ValueError(f"more than {MAX_ITEMS} things")
-
-    def _count_grown(self, more: int) -> None:
-        """Counts the bytes of arrays that a small file can make large."""
-        self._grown_bytes += more
-        if self._grown_bytes > MAX_BYTES:
-            raise ValueError(f"arrays that grow beyond {MAX_BYTES >> 20} MiB")

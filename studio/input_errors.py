@@ -19,7 +19,7 @@ from preprocess.body.body_pose import Motion
 from preprocess.body.body_surface import signed_distance_px
 from preprocess.body.kinematics import PARENTS, axis_angles_from_matrices, rotation_matrices
 from preprocess.body.parametric_body import ShapedBody
-from preprocess.poses.root_placement import place_by_pixels, transform_motion
+from preprocess.poses.motion_builder import place_by_pixels, transform_motion
 
 BORDER_NOISE_SCALE_PX = 6.0
 """How smooth the wandering is along the border."""

@@ -10,9 +10,9 @@ from apps.cli.console import Console
 from capture.input_error import InputError
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.kinematics import slerp
+from preprocess.poses.motion_builder import anchor_at_pelvis
 from preprocess.poses.plausibility import plausibility_warnings, require_plausible
 from preprocess.poses.pose_format_registry import read_poses
-from preprocess.poses.root_placement import anchor_at_pelvis
 
 
 def pose_rate(motion: Motion) -> float:

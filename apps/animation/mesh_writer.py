@@ -9,10 +9,10 @@ import numpy as np
 from apps.animation.driving_motion import demo_motion, load_driving_motion, pose_rate
 from apps.cli.console import Console
 from capture.atomic_files import atomic_file
-from export.mesh.gltf import SkeletonAnimation, encode_glb
-from export.mesh.skinned_mesh import SkinnedMesh, extract_mesh
+from export.gltf import SkeletonAnimation, encode_glb
 from export.package.manifest import Manifest
 from export.package.package_file import read_package
+from export.skinned_mesh import SkinnedMesh, extract_mesh
 from preprocess.body.body_pose import Motion
 
 

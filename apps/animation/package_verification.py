@@ -8,12 +8,13 @@ import onnxruntime
 
 from export.package.manifest import Manifest
 from export.package.package_file import read_package
-from export.picture_difference import (
+from export.player import (
     MAX_CLOSE_DIFFERENCE,
     MIN_CLOSE_FRACTION,
     PictureDifference,
+    compare_golden_frames,
+    find_provider,
 )
-from export.player import compare_golden_frames, find_provider
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -158,10 +158,10 @@ def load_cameras(
 
 def _camera_image_size(path: Path) -> tuple[int, int]:
     """Return the image size of a camera file; twice its principal point if it names none."""
-    from preprocess.cameras.camera_registry import read_named_cameras
-    from preprocess.cameras.multi_view_cameras import (
+    from preprocess.cameras.camera_registry import (
         find_multi_view_cameras,
         read_multi_view_camera,
+        read_named_cameras,
     )
     from preprocess.file_content import read_npz
 

@@ -15,7 +15,7 @@ from apps.cli.interrupt import interrupt_event
 from capture.atomic_files import atomic_folder
 from capture.input_error import InputError
 from export.player import Player
-from export.web.player_page import PageMotion, StartView, flatten_pose
+from export.player_page import PageMotion, StartView, flatten_pose
 from preprocess.body.body_pose import Motion
 
 HOST = "127.0.0.1"

@@ -17,8 +17,7 @@ from avatar.evaluation.held_out import HeldOutFrame
 from avatar.render import render
 from avatar.training.held_out_pose_fitting import fit_test_poses
 from avatar.training.trainer import Trainer
-from export.picture_difference import premultiply
-from export.player import Player
+from export.player import Player, premultiply
 from preprocess.observation import Observation
 
 BEST_TIER = "hq"

@@ -11,7 +11,7 @@ from apps.report.learning_curve import CurvePoint
 from avatar.evaluation.held_out import HeldOutFrame, subsample_evenly
 from avatar.training.trainer import Trainer
 from export.bake.bake_tables import ExportRefused
-from export.bake.render_targets import PosedView
+from export.bake.fine_tuning import PosedView
 from export.build import ExportReport, export_avatar
 from export.package.package_file import update_metrics
 from preprocess.capture_session import Capture

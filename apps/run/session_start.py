@@ -25,7 +25,7 @@ from avatar.rig import Rig
 from avatar.training import checkpoint, warmup
 from avatar.training.trainer import Trainer
 from capture.input_error import InputError
-from export.bake import bake_kernels
+from export.bake import proxy_surface
 from preprocess.capture_session import Capture
 
 if TYPE_CHECKING:  # viser is an optional extra
@@ -77,7 +77,7 @@ def prepare_trainer(
         prepared = _new_run(arguments, capture)
     with console.status("warming up"):
         warmup.warm_up(prepared.trainer)
-        bake_kernels.warm_up()
+        proxy_surface.warm_up()
     _announce_duration(arguments, capture, prepared.trainer, console)
     return prepared
 

@@ -37,7 +37,7 @@ from avatar.training.trainer import Trainer
 from avatar.training.training_frame import TrainingFrame
 from capture.inbox import Inbox
 from capture.source import RealtimePlayback
-from export.bake.render_targets import PosedView
+from export.bake.fine_tuning import PosedView
 from preprocess.body.body_pose import BodyPose
 from preprocess.capture_session import Capture
 

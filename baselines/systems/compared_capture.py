@@ -19,7 +19,7 @@ from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.fitting.capture_fitting import apply_fit, fit_capture
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
-from preprocess.poses.root_placement import place_by_pixels
+from preprocess.poses.motion_builder import place_by_pixels
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

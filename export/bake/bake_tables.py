@@ -6,15 +6,22 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32, Int64, Shaped, UInt8, UInt16
 
 from avatar.rig import Rig
-from export.bake.bake_kernels import mark_visible_nodes
-from export.bake.field_grid import MIN_DENSITY, FieldFunction, FieldGrid, sample_field_grid
-from export.bake.grid_filters import dilate
-from export.bake.proxy_surface import ProxySurface, extract_proxy_surface
+from export.bake.proxy_surface import (
+    MIN_DENSITY,
+    FieldFunction,
+    FieldGrid,
+    ProxySurface,
+    extract_proxy_surface,
+    mark_visible_nodes,
+    sample_field_grid,
+)
+from export.bake.voxel_grid import dilate
 from export.package.player_tables import (
     BRICK_NODES,
     BRICK_SIZE,
     COLOR_CODE_STEP,
     DENSITY_CODE_STEP,
+    QUALITY_TIERS,
     SURFEL_BITS,
     THICKNESS_STEP_M,
     WEIGHT_SCALE,
@@ -25,7 +32,6 @@ from export.package.player_tables import (
     encode_density,
     round_codes,
 )
-from export.package.render_settings import QUALITY_TIERS
 from preprocess.body.kinematics import body_from_rest
 
 
@@ -166,28 +172,6 @@ class BakeConfig:
             tiers=("hq",),
             fine_tuning_pictures=0,
         )
-
-
-def bake_field(
-    field_at: FieldFunction,
-    rig: Rig,
-    *,
-    occupied: UInt8[np.ndarray, "cx cy cz"],
-    config: BakeConfig | None = None,
-) -> PlayerTables:
-    """Bake the tables of a trained field: `sample_field`, then `bake_tables`.
-
-    Args:
-        field_at: The field; evaluated only inside `occupied`.
-        rig: What moves it.
-        occupied: Cells of the rig's box that are not empty, as in `rig.skin_distance`.
-        config: Resolution.
-
-    Raises:
-        ExportRefused: If the field is empty.
-    """
-    config = config or BakeConfig()
-    return bake_tables(sample_field(field_at, rig, occupied=occupied, config=config), rig, config)
 
 
 def sample_field(

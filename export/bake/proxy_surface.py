@@ -1,14 +1,210 @@
-"""The proxy surface: a level set just outside the visible density, with normals and thickness."""
+"""The trained field on a voxel grid, and its proxy surface: points just outside what is visible.
 
+The field is sampled once; everything else is baked from that grid. The proxy surface is a level set
+with normals and the thickness under it that is visible.
+"""
+
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Int
+import torch
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 from scipy import ndimage
 
-from export.bake.bake_kernels import visible_depth_steps
-from export.bake.field_grid import FieldGrid
-from export.bake.grid_filters import remove_floaters_and_cavities, resample_grid
+from avatar.kernels.kernel_compiler import compile_kernel
+from avatar.rig import Rig
+from export.bake.voxel_grid import dilate, remove_floaters_and_cavities, resample_grid
+from export.package.player_tables import BRICK_SIZE, LOG_DENSITY_RANGE
+
+F32, I32 = np.float32, np.int32
+
+
+@compile_kernel(nogil=True, error_model="numpy")
+def visible_depth_steps(
+    density, low, voxel_m, positions, normals, step, max_steps, opaque, fraction
+):
+    """Count the steps along each inward normal until everything visible has been passed.
+
+    Args:
+        density: On nodes, 1/m.
+        low, voxel_m: Position of the first node and distance between nodes, metres.
+        positions, normals: Where to start, and the outward direction.
+        step: Distance between steps, metres.
+        max_steps: Steps to take.
+        opaque: Optical depth behind which nothing is visible.
+        fraction: Fraction of the optical depth of all steps that is enough, too.
+    """
+    ends = np.empty(len(positions), dtype=np.int32)
+    along = np.empty(max_steps, dtype=np.float32)
+    last_i, last_j, last_k = density.shape[0] - 1, density.shape[1] - 1, density.shape[2] - 1
+    for p in range(len(positions)):
+        # the whole walk comes first: thin parts are enough at a fraction of their own total
+        total = F32(0)
+        for n in range(max_steps):
+            depth = (F32(n) + F32(0.5)) * step
+            i = I32(np.rint((positions[p, 0] - normals[p, 0] * depth - low[0]) / voxel_m))
+            j = I32(np.rint((positions[p, 1] - normals[p, 1] * depth - low[1]) / voxel_m))
+            k = I32(np.rint((positions[p, 2] - normals[p, 2] * depth - low[2]) / voxel_m))
+            i, j, k = min(max(i, 0), last_i), min(max(j, 0), last_j), min(max(k, 0), last_k)
+            total += density[i, j, k] * step
+            along[n] = total
+        enough = min(F32(opaque), F32(fraction) * total)
+        seen = 0
+        while seen < max_steps and along[seen] < enough:
+            seen += 1
+        ends[p] = seen
+    return ends
+
+
+@compile_kernel(nogil=True, error_model="numpy")
+def mark_visible_nodes(visible, low, voxel_m, positions, normals, thickness, margin_m):
+    """Mark the nodes along each normal, from a margin outside to the thickness inside."""
+    last_i, last_j, last_k = visible.shape[0] - 1, visible.shape[1] - 1, visible.shape[2] - 1
+    for p in range(len(positions)):
+        depth = -margin_m
+        while depth <= thickness[p]:
+            i = I32(np.rint((positions[p, 0] - normals[p, 0] * depth - low[0]) / voxel_m))
+            j = I32(np.rint((positions[p, 1] - normals[p, 1] * depth - low[1]) / voxel_m))
+            k = I32(np.rint((positions[p, 2] - normals[p, 2] * depth - low[2]) / voxel_m))
+            i, j, k = min(max(i, 0), last_i), min(max(j, 0), last_j), min(max(k, 0), last_k)
+            visible[i, j, k] = True
+            depth += voxel_m
+
+
+@compile_kernel(nogil=True, error_model="numpy")
+def _mean_colors(visible, rgb, nodes):
+    """Write the mean color of the visible ones among 26 neighbors to some nodes."""
+    _, ny, nz = visible.shape
+    for node in nodes:
+        i, j, k = node // (ny * nz), node // nz % ny, node % nz
+        red, green, blue, count = 0, 0, 0, 0
+        for a in range(i - 1, i + 2):
+            for b in range(j - 1, j + 2):
+                for c in range(k - 1, k + 2):
+                    if visible[a, b, c]:
+                        red += rgb[a, b, c, 0]
+                        green += rgb[a, b, c, 1]
+                        blue += rgb[a, b, c, 2]
+                        count += 1
+        rgb[i, j, k, 0] = np.uint8(np.rint(red / count))
+        rgb[i, j, k, 1] = np.uint8(np.rint(green / count))
+        rgb[i, j, k, 2] = np.uint8(np.rint(blue / count))
+
+
+def dilate_colors(visible: Bool[np.ndarray, "x y z"], rgb: UInt8[np.ndarray, "x y z 3"]) -> None:
+    """Give each empty node next to visible ones their mean color, in place.
+
+    Color is interpolated between a visible and an empty node as well: black would darken the rim.
+    The grid's border is left unchanged and counts as empty.
+    """
+    inner = np.zeros_like(visible)
+    inner[1:-1, 1:-1, 1:-1] = visible[1:-1, 1:-1, 1:-1]
+    beside = dilate(inner) & ~inner
+    beside[[0, -1]] = beside[:, [0, -1]] = beside[:, :, [0, -1]] = False
+    _mean_colors(inner, rgb, np.flatnonzero(beside))
+
+
+def warm_up() -> None:
+    """Compile these loops, or load them from disk, before a package is waited for."""
+    nodes, point = np.zeros((3, 3, 3), dtype=np.float32), np.ones((1, 3), dtype=np.float32)
+    low, size = point[0], np.float32(1.0)
+    visible_depth_steps(nodes, low, size, point, point, size, 1, 7.0, 0.999)
+    mark_visible_nodes(nodes > 0, low, size, point, point, low[:1], size)
+    solid = np.zeros((3, 3, 3), dtype=bool)
+    solid[1, 1, 1] = True
+    dilate_colors(solid, np.zeros((3, 3, 3, 3), dtype=np.uint8))
+
+
+FieldFunction = Callable[
+    [Float32[torch.Tensor, "points 3"]],
+    tuple[Float32[torch.Tensor, "points 3"], Float32[torch.Tensor, "points"]],
+]
+"""Evaluates color in [0, 1] and density in 1/m at canonical points."""
+CHUNK_POINTS = 1 << 18
+"""Points per evaluation of the field."""
+MIN_DENSITY = float(np.exp(LOG_DENSITY_RANGE[0]))
+"""Density below which a node is empty, 1/m."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FieldGrid:
+    """Density and color on nodes `low + voxel_m · (i, j, k)`; each count is a multiple of 8, + 1.
+
+    Attributes:
+        low: Corner, canonical metres.
+        voxel_m: Distance between nodes.
+        density: 1/m.
+        rgb: 8 bits; empty nodes next to visible ones hold the mean of these.
+    """
+
+    low: Float32[np.ndarray, "3"]
+    voxel_m: float
+    density: Float32[np.ndarray, "x y z"]
+    rgb: UInt8[np.ndarray, "x y z 3"]
+
+
+def sample_field_grid(
+    field_at: FieldFunction, rig: Rig, occupied: UInt8[np.ndarray, "cx cy cz"], voxel_m: float
+) -> FieldGrid:
+    """Sample the field at every node inside an occupied cell; the others are empty.
+
+    Args:
+        field_at: The field.
+        rig: Its box is what the cells divide.
+        occupied: Cells of the box that are not empty, as in `rig.skin_distance`.
+        voxel_m: Distance between nodes, metres.
+    """
+    first, last = _occupied_bounds(occupied)
+    cell = (rig.box_high - rig.box_low) / occupied.shape
+    low = (rig.box_low + (first - 1) * cell).astype(np.float32)
+    extent = (last - first + 3) * cell
+    counts = np.ceil(extent / (voxel_m * BRICK_SIZE)).astype(int) * BRICK_SIZE + 1
+    density = np.zeros(counts, dtype=np.float32)
+    rgb = np.zeros((*counts, 3), dtype=np.uint8)
+    for nodes in _occupied_nodes(occupied, (low - rig.box_low) / cell, voxel_m / cell, counts):
+        points = torch.from_numpy((low + nodes * voxel_m).astype(np.float32))
+        with torch.no_grad():
+            colors, densities = field_at(points)
+        i, j, k = nodes.T
+        place = (i * counts[1] + j) * counts[2] + k
+        density.ravel()[place] = densities.numpy()
+        rgb.reshape(-1, 3)[place] = np.round(np.clip(colors.numpy(), 0, 1) * 255.0).astype(np.uint8)
+    dilate_colors(density > MIN_DENSITY, rgb)
+    return FieldGrid(low=low, voxel_m=voxel_m, density=density, rgb=rgb)
+
+
+def _occupied_bounds(
+    occupied: UInt8[np.ndarray, "cx cy cz"],
+) -> tuple[Int[np.ndarray, "3"], Int[np.ndarray, "3"]]:
+    """Return the first and the last occupied cell along each axis."""
+    axes = [np.flatnonzero(occupied.any(axis=tuple({0, 1, 2} - {axis}))) for axis in range(3)]
+    return np.array([a[0] for a in axes]), np.array([a[-1] for a in axes])
+
+
+def _occupied_nodes(
+    occupied: UInt8[np.ndarray, "cx cy cz"],
+    offset: Float[np.ndarray, "3"],
+    step: Float[np.ndarray, "3"],
+    counts: Int[np.ndarray, "3"],
+) -> Iterator[Int[np.ndarray, "nodes 3"]]:
+    """Yield the nodes inside occupied cells, some 10⁵ at a time."""
+    padded = np.pad(occupied, 1)
+    cells = [
+        np.clip(np.floor(offset[k] + np.arange(counts[k]) * step[k]).astype(int) + 1, 0, size - 1)
+        for k, size in enumerate(padded.shape)
+    ]
+    waiting: list[Int[np.ndarray, "nodes 3"]] = []
+    for i, cell in enumerate(cells[0]):
+        j, k = np.nonzero(padded[cell][np.ix_(cells[1], cells[2])])
+        waiting.append(np.stack([np.full_like(j, i), j, k], axis=1))
+        if sum(len(nodes) for nodes in waiting) > CHUNK_POINTS or i == counts[0] - 1:
+            nodes = np.concatenate(waiting)
+            yield from (
+                nodes[start : start + CHUNK_POINTS] for start in range(0, len(nodes), CHUNK_POINTS)
+            )
+            waiting = []
+
 
 DENSITY_CONTRAST = 16.0
 """Factor about the level to which densities are clipped, as emptiness has no logarithm."""

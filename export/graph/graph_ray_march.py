@@ -4,9 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from export.graph.graph_context import GraphContext, VectorValue, dot, gather_vector
 from export.graph.graph_skinning import (
+    GraphContext,
     PosedNodeValues,
+    VectorValue,
+    dot,
+    gather_vector,
     invert_jacobian,
     locate_skinning_cell,
     skin_points,

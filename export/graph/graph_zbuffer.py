@@ -4,8 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from export.graph.graph_context import GraphContext, VectorValue, dot
-from export.graph.graph_skinning import PosedNodeValues, PosedSurfels, faces_camera
+from export.graph.graph_skinning import (
+    GraphContext,
+    PosedNodeValues,
+    PosedSurfels,
+    VectorValue,
+    dot,
+    faces_camera,
+)
 from export.graph.onnx_builder import GraphValue
 from export.package.player_tables import DEPTH_CODES, SURFEL_BITS, SURFEL_MASK
 

@@ -5,15 +5,20 @@ from dataclasses import replace
 import numpy as np
 import onnx
 
-from export.graph.graph_context import CameraValues, GraphContext, gather_vector
 from export.graph.graph_ray_setup import (
     DepthLayer,
     PosedProxySurface,
+    filter_specks,
     pixel_rays,
     trace_depth_layer,
 )
-from export.graph.graph_skinning import pose_nodes, pose_surfels
-from export.graph.graph_speck_filter import filter_specks
+from export.graph.graph_skinning import (
+    CameraValues,
+    GraphContext,
+    gather_vector,
+    pose_nodes,
+    pose_surfels,
+)
 from export.graph.graph_zbuffer import (
     EMPTY_KEY,
     SplatWindow,
@@ -25,9 +30,8 @@ from export.graph.graph_zbuffer import (
     project_surfels,
 )
 from export.graph.onnx_builder import GraphBuilder, GraphValue
-from export.package.graph_tables import graph_initializers
-from export.package.player_tables import PlayerTables
-from export.package.render_settings import MIN_FOOTPRINT_PX, RenderSettings
+from export.package.player_tables import MIN_FOOTPRINT_PX, PlayerTables, RenderSettings
+from export.player_inputs import graph_initializers
 
 
 def build_graph(tables: PlayerTables, settings: RenderSettings) -> onnx.ModelProto:

@@ -10,21 +10,15 @@ from jaxtyping import Float, Int
 
 from capture.camera import Camera
 from capture.input_error import InputError
-from export.package.render_settings import RenderSettings
+from export.package.player_tables import RenderSettings
 from export.package.table_codec import TableLayout
 from preprocess.body.body_pose import BodyPose
+from preprocess.body.kinematics import JOINT_NAMES
 
 FORMAT_VERSION = 5
 """Version of the package format; readers refuse all others."""
 MAX_GOLDEN_PX = 128
 """Longest side of a golden frame, pixels."""
-JOINT_NAMES = (
-    *("pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee"),
-    *("spine2", "left_ankle", "right_ankle", "spine3", "left_foot", "right_foot"),
-    *("neck", "left_collar", "right_collar", "head", "left_shoulder", "right_shoulder"),
-    *("left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hand", "right_hand"),
-)
-"""SMPL's joints in their order."""
 CONVENTIONS = {
     "units": "metres, radians, density in 1/m",
     "body_axes": "x to the body's left, y up, z out of the chest (SMPL)",

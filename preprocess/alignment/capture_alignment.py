@@ -32,7 +32,7 @@ from preprocess.body.body_surface import SkinPoints
 from preprocess.body.parametric_body import BodyModel, ShapedBody
 from preprocess.body.proportion_space import shape_for_motion
 from preprocess.cameras.camera_file import CameraTrack
-from preprocess.poses.root_placement import place_in_camera_world
+from preprocess.poses.motion_builder import place_in_camera_world
 
 FOCAL_SAMPLES = 6
 """Frames to whose masks a focal length is fitted."""

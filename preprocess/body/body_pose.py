@@ -81,7 +81,7 @@ class Motion:
         assumed_focal: Focal length that the tracker assumed, where the file holds no K.
         anchor: Point of the resting body that `root_translations` refer to. "pelvis": SMPL's
             convention, the root rotates about it. "origin" (EasyMocap) and "hips" (BEV; the middle
-            between both): that point moves to `root_translations`; `root_placement` converts them
+            between both): that point moves to `root_translations`; `motion_builder` converts them
             to SMPL's convention once the body is known.
         space: "world", or "camera": each row in the camera of its frame.
         camera_from_world: The camera of each row, if the file holds them.

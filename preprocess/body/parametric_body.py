@@ -15,8 +15,7 @@ from jaxtyping import Float, Float64, Int, Shaped
 from capture.input_error import InputError
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.kinematics import PARENTS, body_from_rest, rotation_matrices, world_from_body
-from preprocess.file_content import read_npz
-from preprocess.safe_pickle import read_pickled_arrays
+from preprocess.file_content import read_npz, read_pickled_arrays
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

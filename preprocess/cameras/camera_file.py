@@ -11,8 +11,11 @@ from capture.image_folder import refuse_pipe
 from capture.input_error import InputError
 from capture.source import FrameSource
 from preprocess.body.body_pose import Motion, RelativeFocalLength
-from preprocess.cameras.camera_registry import read_named_cameras
-from preprocess.cameras.multi_view_cameras import find_multi_view_cameras, read_multi_view_camera
+from preprocess.cameras.camera_registry import (
+    find_multi_view_cameras,
+    read_multi_view_camera,
+    read_named_cameras,
+)
 from preprocess.file_content import read_npz
 from preprocess.frame_association import cameras_by_frame, interpolate_missing_cameras
 

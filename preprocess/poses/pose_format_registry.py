@@ -110,7 +110,7 @@ def read_poses(
 
     Of several people the one with most poses is chosen, and the note names the others. Short gaps
     of the tracker are interpolated and marked. The poses keep the file's anchor and space;
-    `preprocess.poses.root_placement` converts them for a body and its cameras.
+    `preprocess.poses.motion_builder` converts them for a body and its cameras.
 
     Args:
         path: The file or folder; of a capture folder the poses in it.

@@ -17,7 +17,7 @@ from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import rigid_transform, rotation_matrices
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.cameras.camera_file import CameraTrack
-from preprocess.poses.root_placement import place_in_camera_world, transform_motion
+from preprocess.poses.motion_builder import place_in_camera_world, transform_motion
 from preprocess.sfm.camera_solution import KEY, MISSING, PLACED, CameraSolution
 from preprocess.sfm.metric_scale import (
     SOLE_THICKNESS_M,

@@ -14,8 +14,7 @@ from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
 from preprocess.body.parametric_body import ShapedBody
-from preprocess.poses.motion_builder import fill_gaps
-from preprocess.poses.root_placement import place_by_pixels
+from preprocess.poses.motion_builder import fill_gaps, place_by_pixels
 from preprocess.tracking.keypoint_track import KeypointTrack
 from preprocess.tracking.swap_repair import repair_swaps
 

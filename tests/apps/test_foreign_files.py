@@ -124,7 +124,7 @@ def test_a_place_with_other_peoples_files_is_refused(
     line, hoard, film, run, package, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("export.web.onnxruntime_web.runtime_files", dict)
+    monkeypatch.setattr("export.player_page.runtime_files", dict)
     (tmp_path / "bad.mp4").write_text("no video")
     before = contents(tmp_path)
     assert called(line, film=film, hoard=hoard, run=run, package=package) == 2

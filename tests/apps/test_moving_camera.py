@@ -13,8 +13,8 @@ from apps.checks.capture_validation import passes_quick_check
 from preprocess.capture_session import CaptureInputs
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
+from preprocess.poses.motion_builder import transform_motion
 from preprocess.poses.pose_file import read_motion, write_motion
-from preprocess.poses.root_placement import transform_motion
 
 
 @pytest.fixture

@@ -14,8 +14,8 @@ from capture.input_error import InputError
 from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.open_capture import open_capture
+from preprocess.poses.motion_builder import SMPLX_PELVIS, place_in_camera_world
 from preprocess.poses.pose_format_registry import read_poses
-from preprocess.poses.root_placement import SMPLX_PELVIS, place_in_camera_world
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from avatar.rig import Rig
 from capture.camera import Camera
-from export.bake.bake_tables import BakeConfig, bake_field
+from export.bake.bake_tables import BakeConfig, bake_tables, sample_field
 from export.build import ExportReport, export_field
 from export.package.player_tables import PlayerTables
 from preprocess.body.body_pose import BodyPose
@@ -167,7 +167,8 @@ def coarse() -> BakeConfig:
 
 @pytest.fixture(scope="session")
 def tables(stand_in: StandIn, coarse: BakeConfig) -> PlayerTables:
-    return bake_field(stand_in.field_at, stand_in.rig, occupied=stand_in.occupied, config=coarse)
+    grid = sample_field(stand_in.field_at, stand_in.rig, occupied=stand_in.occupied, config=coarse)
+    return bake_tables(grid, stand_in.rig, coarse)
 
 
 @pytest.fixture(scope="session")

@@ -11,18 +11,16 @@ from scipy import ndimage
 
 from avatar.evaluation.image_metrics import psnr
 from capture.input_error import InputError
+from export.bake import reference_player
+from export.bake.compositor import VoxelCodes, composite_segments
+from export.bake.reference_geometry import PosedNodes, RaySegments, skin_tetrahedral, skin_trilinear
+from export.bake.reference_player import PlayerInputs, draw_reference
 from export.graph.player_graph import build_graph
-from export.mesh.skinned_mesh import extract_mesh, skinning_weights
-from export.package.graph_tables import subdivided_skinning_nodes
 from export.package.package_file import read_package
-from export.package.render_settings import RenderSettings
-from export.picture_difference import PictureDifference, premultiply
-from export.player import Player, compare_golden_frames
-from export.reference import reference_player
-from export.reference.compositor import VoxelCodes, composite_segments
-from export.reference.ray_segments import RaySegments
-from export.reference.reference_player import PlayerInputs, draw_reference
-from export.reference.reference_skinning import PosedNodes, skin_tetrahedral, skin_trilinear
+from export.package.player_tables import RenderSettings
+from export.player import PictureDifference, Player, compare_golden_frames, premultiply
+from export.player_inputs import subdivided_skinning_nodes
+from export.skinned_mesh import extract_mesh, skinning_weights
 from preprocess.body.body_pose import BodyPose
 
 

@@ -3,9 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from export.picture_difference import PictureDifference, premultiply
-from export.player import Player
-from export.player_limits import ResolutionLimit, downscale_camera, upscale_picture
+from export.player import PictureDifference, Player, premultiply
+from export.player_inputs import ResolutionLimit, downscale_camera, upscale_picture
 
 
 @pytest.fixture(scope="module")

@@ -19,9 +19,9 @@ from hypothesis import strategies as st
 from scipy import sparse
 
 from capture.input_error import InputError
-from preprocess import safe_pickle
+from preprocess import file_content
 from preprocess.body.parametric_body import load_body_model
-from preprocess.safe_pickle import read_pickled_arrays
+from preprocess.file_content import read_pickled_arrays
 
 
 class Python2Pickler(pickle._Pickler):
@@ -191,7 +191,7 @@ def test_records_inside_cannot_be_turned_against_the_reader(tmp_path, chumpy):
 def test_a_file_beyond_the_limit_is_not_even_read(tmp_path, monkeypatch):
     path = tmp_path / "a.pkl"
     path.write_bytes(pickle.dumps({"a": np.zeros(1000)}))
-    monkeypatch.setattr(safe_pickle, "MAX_BYTES", 1000)
+    monkeypatch.setattr(file_content, "MAX_BYTES", 1000)
     with pytest.raises(InputError, match="are not read"):
         read_pickled_arrays(path, ("a",))
 

@@ -33,7 +33,7 @@ export class Player {
     return this.engine.open(tier);
   }
 
-  /** The camera, coarser where surfels would leave gaps in a close-up (export/player_limits.py). */
+  /** The camera, coarser where surfels would leave gaps in a close-up (export/player_inputs.py). */
   drawable({ tier }, pose, camera) {
     const { settings, layout } = this.avatar.tiers[tier];
     const seen = this.skeleton.posed(pose).joints.map((joint) => moved(camera.cameraFromWorld, joint));

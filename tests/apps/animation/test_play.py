@@ -20,9 +20,9 @@ from apps.animation.following_camera import FollowingCamera
 from apps.animation.package_verification import package_warnings
 from capture import video_encoder
 from capture.atomic_files import LIST_NAME as LIST
+from export import player_page
 from export.package.package_file import read_package, write_package
 from export.player import Player
-from export.web import onnxruntime_web, player_page
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import rotation_matrices
 from preprocess.poses.pose_file import read_motion
@@ -306,7 +306,7 @@ def test_poses_in_other_units_are_refused(
     call_play, package, novel, tmp_path, monkeypatch, changed, words
 ):
     monkeypatch.chdir(tmp_path)
-    for module in (onnxruntime_web, player_page):  # `site` holds a name of its own
+    for module in (player_page, player_page):  # `site` holds a name of its own
         monkeypatch.setattr(module, "runtime_files", dict)
     with np.load(novel) as given:
         turned, places = given["body_pose"], given["transl"] + np.array([0.0, 0.0, 3.0])

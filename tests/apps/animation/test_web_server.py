@@ -12,9 +12,8 @@ import pytest
 
 from apps.animation.following_camera import FollowingCamera
 from capture.input_error import InputError
-from export.picture_difference import PictureDifference, premultiply
-from export.player import Player
-from export.web import onnxruntime_web
+from export import player_page
+from export.player import PictureDifference, Player, premultiply
 from preprocess.poses.pose_file import read_motion
 from tests.apps.browser import Browser, chromium, until
 
@@ -25,7 +24,7 @@ STAGE = (slice(60, 600), slice(4, -4))
 
 def is_here():
     try:
-        onnxruntime_web.runtime_files()
+        player_page.runtime_files()
     except InputError:
         return False
     return True
@@ -317,7 +316,7 @@ def test_a_page_replaces_a_page_but_nothing_else(call_play, package, tmp_path):
 
 
 def test_without_the_runtime_it_says_how_to_get_it(call_play, package, tmp_path, monkeypatch):
-    monkeypatch.setattr(onnxruntime_web, "FOLDER", tmp_path / "nothing")
+    monkeypatch.setattr(player_page, "RUNTIME_FOLDER", tmp_path / "nothing")
     outcome = call_play(package, "--web", "--out", tmp_path / "page")
     assert outcome.code == 2
     assert "make web" in outcome.complaint("ia-play")

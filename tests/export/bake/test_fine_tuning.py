@@ -11,15 +11,15 @@ from export.bake.bake_tables import (
     THICK_FAINT_FRACTION,
     VOXEL_FACTORS,
     BakeConfig,
-    bake_field,
+    bake_tables,
+    sample_field,
 )
-from export.bake.fine_tuning import FineTuningInputs, fine_tune
-from export.bake.render_targets import PictureCache
+from export.bake.compositor import VoxelCodes, back_project, composite_segments
+from export.bake.fine_tuning import FineTuningInputs, PictureCache, fine_tune
+from export.bake.reference_player import PlayerInputs, draw_reference, trace_picture
 from export.build import export_field
 from export.package.package_file import read_package
-from export.package.render_settings import QUALITY_TIERS, THICK_FIELD_TIERS
-from export.reference.compositor import VoxelCodes, back_project, composite_segments
-from export.reference.reference_player import PlayerInputs, draw_reference, trace_picture
+from export.package.player_tables import QUALITY_TIERS, THICK_FIELD_TIERS
 from preprocess.body.body_pose import BodyPose
 
 SETTINGS = QUALITY_TIERS["hq"]
@@ -238,9 +238,13 @@ def test_haze_about_a_faint_core_is_inside_the_surface_of_a_thick_field(stand_in
         return rgb, 120.0 * (density > 0) * (1.0 - 0.93 * (density < 0.5 * density.max()))
 
     usual = BakeConfig(voxel_m=0.008, surfel_spacing_m=0.012)
+
+    def surfels(config):
+        grid = sample_field(hazy, stand_in.rig, occupied=stand_in.occupied, config=config)
+        return bake_tables(grid, stand_in.rig, config).surfels
+
     surfaces = [
-        bake_field(hazy, stand_in.rig, occupied=stand_in.occupied, config=config).surfels
-        for config in (usual, replace(usual, faint_fraction=THICK_FAINT_FRACTION))
+        surfels(config) for config in (usual, replace(usual, faint_fraction=THICK_FAINT_FRACTION))
     ]
     assert len(surfaces[1]) > 1.01 * len(surfaces[0])
 

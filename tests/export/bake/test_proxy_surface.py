@@ -1,14 +1,14 @@
 import numpy as np
 import pytest
 
-from export.bake.bake_kernels import dilate_colors
-from export.bake.field_grid import FieldGrid
-from export.bake.grid_filters import resample_grid
 from export.bake.proxy_surface import (
     OPAQUE_OPTICAL_DEPTH,
     THICKNESS_MARGIN_M,
+    FieldGrid,
+    dilate_colors,
     extract_proxy_surface,
 )
+from export.bake.voxel_grid import resample_grid
 
 VOXEL_M = 0.004
 RADIUS_M = 0.08

@@ -14,10 +14,9 @@ from avatar.training.trainer import Trainer
 from capture.input_error import InputError
 from export import build
 from export.bake.bake_tables import MAX_VOXEL_M, MIN_VOXEL_M, BakeConfig, ExportRefused
-from export.build import export_avatar, export_field
+from export.build import GOOD_PSNR, POOR_PSNR, export_avatar, export_field, quality_warnings
 from export.package.manifest import FORMAT_VERSION
 from export.package.package_file import read_package, write_package
-from export.package_checks import GOOD_PSNR, POOR_PSNR, quality_warnings
 from export.player import Player
 
 

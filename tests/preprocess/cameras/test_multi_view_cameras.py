@@ -14,7 +14,7 @@ from capture.camera import Camera
 from capture.input_error import InputError
 from capture.source_opening import open_source
 from preprocess.cameras.camera_file import read_cameras
-from preprocess.cameras.multi_view_cameras import find_multi_view_cameras, read_multi_view_camera
+from preprocess.cameras.camera_registry import find_multi_view_cameras, read_multi_view_camera
 
 NAMES, SIZE = ("01", "02", "B3"), (64, 48)
 BENDS = np.array([[0.1, -0.02, 0.001, 0.002, 0.003]])

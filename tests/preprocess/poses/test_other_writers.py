@@ -10,8 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from capture.input_error import InputError
+from preprocess.poses.motion_builder import SMPLX_PELVIS, place_in_camera_world
 from preprocess.poses.pose_format_registry import read_poses
-from preprocess.poses.root_placement import SMPLX_PELVIS, place_in_camera_world
 from tests.preprocess.poses.test_trackers import World, npz, own_camera
 
 

@@ -17,9 +17,8 @@ from capture.input_error import InputError
 from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import rotation_matrices
 from preprocess.cameras.camera_file import CameraTrack, tracker_intrinsic_matrix
-from preprocess.poses.motion_builder import fill_gaps
+from preprocess.poses.motion_builder import SMPLX_PELVIS, fill_gaps, place_in_camera_world
 from preprocess.poses.pose_format_registry import read_poses
-from preprocess.poses.root_placement import SMPLX_PELVIS, place_in_camera_world
 
 SIZE = (640, 360)
 

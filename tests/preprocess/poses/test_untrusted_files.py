@@ -25,7 +25,7 @@ import torch
 
 from benchmarks.fuzz_mutations import mutate_bytes, random_opcodes
 from capture.input_error import InputError
-from preprocess import safe_pickle
+from preprocess import file_content
 from preprocess.body.parametric_body import load_body_model
 from preprocess.file_content import read_untrusted_file
 from preprocess.poses.pose_format_registry import read_poses
@@ -256,8 +256,7 @@ def sparse_bombs() -> bytes:
 def test_bombs_are_refused_before_they_grow(tmp_path, monkeypatch, make):
     path = tmp_path / "bomb"
     path.write_bytes(make())
-    monkeypatch.setattr(safe_pickle, "MAX_BYTES", 16 << 20)
-    monkeypatch.setattr("preprocess.file_content.MAX_BYTES", 16 << 20)
+    monkeypatch.setattr(file_content, "MAX_BYTES", 16 << 20)
     tracemalloc.start()
     try:
         with pytest.raises(InputError):
@@ -270,7 +269,7 @@ def test_bombs_are_refused_before_they_grow(tmp_path, monkeypatch, make):
 def test_many_sparse_matrices_may_not_grow_beyond_the_limit_together(tmp_path, monkeypatch):
     path = tmp_path / "bomb"
     path.write_bytes(sparse_bombs())
-    monkeypatch.setattr(safe_pickle, "MAX_BYTES", 300 << 20)
+    monkeypatch.setattr(file_content, "MAX_BYTES", 300 << 20)
     with pytest.raises(InputError, match="grow beyond 300 MiB"):
         read_poses(path)
 

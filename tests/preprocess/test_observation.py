@@ -16,7 +16,7 @@ from preprocess.observation import (
     DroppedFrame,
     Observation,
     associate_poses,
-    observe,
+    observation_builder,
     shrink_to_longer_side,
 )
 
@@ -60,6 +60,11 @@ def parts(images):
         return source, masks, assume_static_camera(moving(1), source.size_px)
 
     return parts
+
+
+def observe(source, motion, masks, cameras, **options):
+    """Observations of the wanted frames in order, lazily."""
+    return map(observation_builder(source, motion, masks, cameras, **options), source.frames())
 
 
 def rows_of(observations) -> list[int]:

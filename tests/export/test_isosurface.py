@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from export.mesh.isosurface import extract_isosurface
+from export.bake.voxel_grid import extract_isosurface
 
 
 def grid(of, size=33):

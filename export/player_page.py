@@ -1,7 +1,15 @@
-"""The files of a page that plays an avatar: the package's graph, expanded tables, no CDN."""
+"""The files of a page that plays an avatar in a browser: graph, expanded tables, runtime, no CDN.
 
+onnxruntime-web runs the graph: one pinned release, stored with the page.
+"""
+
+import base64
 import hashlib
+import io
 import json
+import shlex
+import sys
+import tarfile
 import zlib
 from dataclasses import asdict, dataclass
 from importlib import resources
@@ -11,11 +19,88 @@ from typing import Any, final
 import numpy as np
 from jaxtyping import Float, Float32, Shaped
 
-from export.package.graph_tables import graph_initializers
+from capture.atomic_files import atomic_file
+from capture.input_error import InputError
 from export.package.manifest import GoldenFrame
 from export.package.package_file import AvatarPackage, read_package
-from export.web.onnxruntime_web import SCRIPT_FILE, WASM_FILE, runtime_files
+from export.player_inputs import graph_initializers
 from preprocess.body.body_pose import BodyPose
+
+ORT_WEB_VERSION = "1.30.0"
+"""Release of the npm package `onnxruntime-web` (MIT)."""
+INTEGRITY = (
+    "sha512-q0y+JrrtukXSzsBWEMccVfqX25LRmosXHF+CaRJmg8pZ"
+    "ClzcV7svNc4rKY3jL02Vb7QmRMDs1SigqR4CXAfKYQ=="
+)
+"""npm's checksum of that release's tarball."""
+WEB = Path(__file__).with_name("web")
+"""Folder of the page's own files and of the runtime."""
+RUNTIME_FOLDER = WEB / "onnxruntime"
+"""Folder of the files: ignored by git, but part of wheels built after `make web`."""
+SCRIPT_FILE = "ort.mjs"
+"""The script, as stored."""
+WASM_FILE = "ort.wasm"
+"""The WebAssembly module, as stored."""
+TARBALL_MEMBERS = {
+    SCRIPT_FILE: "package/dist/ort.wasm.bundle.min.mjs",
+    WASM_FILE: "package/dist/ort-wasm-simd-threaded.wasm",
+}
+"""Stored files by name, and the tarball's members they come from."""
+LICENCE_FILES = ("LICENSE", "ThirdPartyNotices.txt")
+"""Notices, from the Python package of the same project, as the npm package has none."""
+MISSING_MESSAGE = (
+    "The browser page needs onnxruntime-web, which is not here: {why}. In a checkout, `make web` "
+    "fetches it (npm package onnxruntime-web {version}, 33 MB once), anywhere else "
+    "{python} -m apps.fetch_runtime"
+)
+"""Message of `runtime_files` for a missing file."""
+
+
+def install_runtime(tarball: bytes, folder: Path | None = None) -> None:
+    """Store what the page needs of npm's tarball.
+
+    Args:
+        tarball: Content of the pinned release's tarball.
+        folder: Where to store it; `RUNTIME_FOLDER` if None.
+
+    Raises:
+        InputError: If its checksum is another.
+        OSError: If the disk is full.
+    """
+    folder = folder or RUNTIME_FOLDER
+    found = "sha512-" + base64.b64encode(hashlib.sha512(tarball).digest()).decode()
+    if found != INTEGRITY:
+        raise InputError(
+            f"The tarball is not onnxruntime-web {ORT_WEB_VERSION}: its checksum is {found}, "
+            f"expected {INTEGRITY}. Nothing was kept."
+        )
+    folder.mkdir(exist_ok=True)
+    with tarfile.open(fileobj=io.BytesIO(tarball)) as archive:
+        for name, member in TARBALL_MEMBERS.items():
+            file = archive.extractfile(member)
+            assert file is not None
+            with atomic_file(folder / name) as part:
+                part.write_bytes(file.read())
+    for name in LICENCE_FILES:
+        notice = resources.files("onnxruntime").joinpath(name)
+        with atomic_file(folder / name) as part:
+            part.write_bytes(notice.read_bytes())
+
+
+def runtime_files(folder: Path | None = None) -> dict[str, bytes]:
+    """Read the stored files by name.
+
+    Raises:
+        InputError: If one is missing; the message has the command that fetches it.
+    """
+    folder = folder or RUNTIME_FOLDER
+    wanted = (*TARBALL_MEMBERS, *LICENCE_FILES)
+    missing = [name for name in wanted if not (folder / name).is_file()]
+    if missing:
+        why, python = f"no {folder / missing[0]}", shlex.quote(sys.executable)
+        raise InputError(MISSING_MESSAGE.format(why=why, version=ORT_WEB_VERSION, python=python))
+    return {name: (folder / name).read_bytes() for name in wanted}
+
 
 PAGE_SUFFIXES = (".html", ".css", ".js", ".svg")
 """Suffixes of the page's own files."""
@@ -113,9 +198,8 @@ def build_page(
 
 def static_page_files() -> dict[str, bytes]:
     """Read the page's own files, the same for every avatar."""
-    folder = resources.files("export.web").joinpath("page")
-    files = [file for file in folder.iterdir() if file.name.endswith(PAGE_SUFFIXES)]
-    return {file.name: file.read_bytes() for file in sorted(files, key=lambda file: file.name)}
+    files = sorted(file for file in (WEB / "page").iterdir() if file.suffix in PAGE_SUFFIXES)
+    return {file.name: file.read_bytes() for file in files}
 
 
 @final

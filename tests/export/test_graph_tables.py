@@ -2,10 +2,9 @@ import numpy as np
 import pytest
 
 from capture.input_error import InputError
-from export.package.graph_tables import skinning_nodes, subdivided_skinning_nodes
-from export.package.player_tables import round_codes
-from export.package.render_settings import RenderSettings
-from export.reference.reference_skinning import PosedNodes, skin_trilinear
+from export.bake.reference_geometry import PosedNodes, skin_trilinear
+from export.package.player_tables import RenderSettings, round_codes
+from export.player_inputs import skinning_nodes, subdivided_skinning_nodes
 
 
 @pytest.fixture(scope="module")

@@ -13,32 +13,33 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
-from export.package.graph_tables import skinning_nodes
-from export.package.player_tables import DEPTH_CODES, SURFEL_BITS, PlayerTables
-from export.package.render_settings import (
+from capture.camera import Camera
+from export.bake.compositor import VoxelCodes, composite_segments
+from export.bake.reference_geometry import (
+    EMPTY_PIXEL_KEY,
+    CanonicalRays,
+    PosedNodes,
+    RaySegments,
+    SurfelFootprints,
+    compression_factor,
+    fill_holes,
+    invert_jacobians,
+    skin_tetrahedral,
+    skin_trilinear,
+    surfel_of_key,
+    z_buffer,
+)
+from export.package.player_tables import (
+    DEPTH_CODES,
     MAX_MEDIAN_DIFFERENCE,
     MAX_TRUSTED_COMPRESSION,
     MIN_FOOTPRINT_PX,
     MIN_MEDIAN_ALPHA,
+    SURFEL_BITS,
+    PlayerTables,
     RenderSettings,
 )
-from export.reference.compositor import VoxelCodes, composite_segments
-from export.reference.ray_segments import RaySegments
-from export.reference.reference_skinning import (
-    CanonicalRays,
-    PosedNodes,
-    compression_factor,
-    invert_jacobians,
-    skin_tetrahedral,
-    skin_trilinear,
-)
-from export.reference.reference_zbuffer import (
-    EMPTY_PIXEL_KEY,
-    SurfelFootprints,
-    fill_holes,
-    surfel_of_key,
-    z_buffer,
-)
+from export.player_inputs import skinning_nodes
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -57,6 +58,19 @@ class PlayerInputs:
     center: Float32[np.ndarray, "2"]
     size_px: tuple[int, int]
     samples: int
+
+    @classmethod
+    def of(
+        cls, bones: Float32[np.ndarray, "24 3 4"], camera: Camera, samples: int
+    ) -> "PlayerInputs":
+        """The inputs for a camera's lens and size."""
+        return cls(
+            bones=bones,
+            focal=np.array(camera.focal_px, dtype=np.float32),
+            center=np.array(camera.center_px, dtype=np.float32),
+            size_px=camera.size_px,
+            samples=samples,
+        )
 
 
 class TracedPicture(NamedTuple):

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float, Float32, Shaped, UInt16
 from scipy.spatial.transform import Rotation
 
-from export.mesh.skinned_mesh import SkinnedMesh
-from export.package.manifest import JOINT_NAMES, Manifest
+from export.package.manifest import Manifest
+from export.skinned_mesh import SkinnedMesh
 from preprocess.body.body_pose import Motion
-from preprocess.body.kinematics import body_from_rest
+from preprocess.body.kinematics import JOINT_NAMES, body_from_rest
 
 COMPONENT_TYPES = {"float32": 5126, "uint32": 5125, "uint16": 5123, "uint8": 5121}
 """glTF's codes of the element types."""

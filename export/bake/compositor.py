@@ -6,9 +6,8 @@ import numpy as np
 from jaxtyping import Float32
 
 from avatar.kernels.kernel_compiler import compile_kernel
-from export.package.player_tables import BRICK_SIZE, LOG_DENSITY_RANGE, BrickTable
-from export.package.render_settings import RenderSettings
-from export.reference.ray_segments import RaySegments
+from export.bake.reference_geometry import RaySegments
+from export.package.player_tables import BRICK_SIZE, LOG_DENSITY_RANGE, BrickTable, RenderSettings
 
 F32 = np.float32
 VOXELS_PER_BRICK = BRICK_SIZE**3

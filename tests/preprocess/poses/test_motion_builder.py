@@ -9,7 +9,7 @@ from capture.camera import Camera
 from preprocess.body.body_pose import RelativeFocalLength
 from preprocess.body.kinematics import rotation_matrices
 from preprocess.cameras.camera_file import CameraTrack, assume_static_camera
-from preprocess.poses.root_placement import (
+from preprocess.poses.motion_builder import (
     anchor_at_pelvis,
     place_in_camera_world,
     transform_motion,

@@ -8,17 +8,17 @@ import numpy as np
 import pytest
 
 from capture.input_error import InputError
-from export.package.graph_tables import graph_initializers
+from export import player_page
 from export.package.package_file import read_package
-from export.web import onnxruntime_web, player_page
-from export.web.player_page import PageMotion, StartView, flatten_pose
+from export.player_inputs import graph_initializers
+from export.player_page import PageMotion, StartView, flatten_pose
 
 
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory):
     """A folder with all of onnxruntime-web's files; what is in them is of no matter here."""
     folder = tmp_path_factory.mktemp("runtime")
-    for name in (*onnxruntime_web.TARBALL_MEMBERS, *onnxruntime_web.LICENCE_FILES):
+    for name in (*player_page.TARBALL_MEMBERS, *player_page.LICENCE_FILES):
         (folder / name).write_bytes(name.encode())
     return folder
 
@@ -34,7 +34,7 @@ def clip(bent):
 
 @pytest.fixture
 def files(exported, clip, kept, monkeypatch):
-    monkeypatch.setattr(player_page, "runtime_files", lambda: onnxruntime_web.runtime_files(kept))
+    monkeypatch.setattr(player_page, "RUNTIME_FOLDER", kept)
     return player_page.build_page(exported.path, clip, name="an avatar")
 
 
@@ -89,13 +89,13 @@ def test_every_file_that_the_page_names_is_there(files):
 
 def test_a_missing_runtime_is_refused_with_the_command_to_run(tmp_path):
     with pytest.raises(InputError, match="make web"):
-        onnxruntime_web.runtime_files(tmp_path)
+        player_page.runtime_files(tmp_path)
 
 
 def test_an_altered_tarball_is_refused_and_leaves_nothing(tmp_path):
     folder = tmp_path / "runtime"
     with pytest.raises(InputError, match="Nothing was kept"):
-        onnxruntime_web.install_runtime(b"something else", folder)
+        player_page.install_runtime(b"something else", folder)
     assert not folder.exists()
 
 

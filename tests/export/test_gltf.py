@@ -12,12 +12,12 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from export.mesh.gltf import SkeletonAnimation, encode_glb
-from export.mesh.skinned_mesh import extract_mesh
+from export.gltf import SkeletonAnimation, encode_glb
 from export.package.package_file import read_package
+from export.skinned_mesh import extract_mesh
 from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import body_from_rest, rotation_matrices, world_from_body
-from tests.export.mesh.test_isosurface import is_closed, volume
+from tests.export.test_isosurface import is_closed, volume
 
 TYPES = {5126: "<f4", 5125: "<u4", 5123: "<u2", 5121: "u1"}
 SIZES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}

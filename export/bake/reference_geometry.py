@@ -1,0 +1,367 @@
+"""Geometry of the reference player in numpy: posed skinning nodes, z-buffer, ray segments."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int32, Int64
+
+from export.package.player_tables import (
+    DEPTH_CODES,
+    SURFEL_BITS,
+    SURFEL_MASK,
+    BrickTable,
+    PlayerTables,
+    RenderSettings,
+)
+from export.player_inputs import SkinningNodes
+
+
+class PosedNodes(NamedTuple):
+    """Nodes of the skinning grid and their posed positions in the camera's frame, metres."""
+
+    nodes: SkinningNodes
+    camera: Float32[np.ndarray, "rows 3"]
+
+
+class CanonicalRays(NamedTuple):
+    """Straight segments of camera rays, carried into canonical space.
+
+    Attributes:
+        direction_camera: Unit directions from the camera's center.
+        begin, end: Distances from the camera's center, metres.
+        start_canonical: Canonical positions at `begin`.
+        direction_canonical: Canonical metres per metre along the ray.
+    """
+
+    direction_camera: Float32[np.ndarray, "rays 3"]
+    begin: Float32[np.ndarray, "rays"]
+    end: Float32[np.ndarray, "rays"]
+    start_canonical: Float32[np.ndarray, "rays 3"]
+    direction_canonical: Float32[np.ndarray, "rays 3"]
+
+
+def skin_trilinear(
+    posed: PosedNodes, points: Float32[np.ndarray, "points 3"]
+) -> tuple[Float32[np.ndarray, "points 3"], Float32[np.ndarray, "points 3 3"]]:
+    """Skin canonical points, trilinear between posed nodes.
+
+    Returns:
+        Positions in the camera's frame, and the Jacobian; it is 0, so that it is never inverted,
+        where one of the eight nodes is not stored.
+    """
+    nodes = posed.nodes
+    last = np.array(nodes.index.shape) - 1
+    place = np.clip((points - nodes.low) / nodes.step_m, 0.0, last - 1e-3)
+    base = np.floor(place).astype(np.int64)
+    part = (place - base).astype(np.float32)
+    moved = np.zeros((len(points), 3), dtype=np.float32)
+    jacobian = np.zeros((len(points), 3, 3), dtype=np.float32)
+    stored = np.ones(len(points), dtype=bool)
+    for corner in np.ndindex(2, 2, 2):
+        below = nodes.index[tuple((base + np.array([*corner[:2], 0])).T)]
+        stored &= below > 0
+        there = posed.camera[below + corner[2]]
+        x, y, z = np.where(corner, part, 1 - part).T
+        moved += there * (x * y * z)[:, None]
+        for axis, others in enumerate((y * z, x * z, x * y)):
+            sign = (2 * corner[axis] - 1) / nodes.step_m[axis]
+            jacobian[:, :, axis] += there * (others * sign)[:, None]
+    jacobian[~stored] = 0.0
+    return moved, jacobian
+
+
+def skin_tetrahedral(
+    posed: PosedNodes, points: Float32[np.ndarray, "points 3"]
+) -> tuple[Float32[np.ndarray, "points 3"], Float32[np.ndarray, "points 3 3"]]:
+    """Skin canonical points, linear in the six tetrahedra of each cell; as `skin_trilinear`."""
+    nodes = posed.nodes
+    last = np.array(nodes.index.shape) - 1
+    place = np.clip((points - nodes.low) / nodes.step_m, 0.0, last - 1e-3).astype(np.float32)
+    base = np.floor(place).astype(np.int64)
+    moved = np.zeros((len(points), 3), dtype=np.float32)
+    jacobian = np.zeros((len(points), 3, 3), dtype=np.float32)
+    before = None
+    for corner, share in _tetrahedron_walk(place - base):
+        above = corner[:, 2]
+        row = nodes.index[tuple((base + corner * np.array([1, 1, 0])).T)] + above
+        there = posed.camera[row]
+        moved += there * share[:, None]
+        if before is not None:
+            axis = (corner - before[1]).argmax(axis=1)
+            step = (there - before[0]) / nodes.step_m[axis, None]
+            jacobian[np.arange(len(points)), :, axis] = step
+        before = there, corner
+    return moved, jacobian
+
+
+def _tetrahedron_walk(
+    part: Float[np.ndarray, "points 3"],
+) -> Iterator[tuple[Int64[np.ndarray, "points 3"], Float[np.ndarray, "points"]]]:
+    """Yield the corners of each point's tetrahedron, relative to its cell, and their weights.
+
+    Six tetrahedra share a cell's diagonal. Walking from the lower to the upper corner along the
+    axes in descending order of the point's fractions visits the four corners of its tetrahedron.
+    """
+    order = np.argsort(-part, axis=1, kind="stable")
+    shares = np.take_along_axis(part, order, axis=1)
+    bounds = np.concatenate([np.ones((len(part), 1)), shares, np.zeros((len(part), 1))], axis=1)
+    corner = np.zeros((len(part), 3), dtype=np.int64)
+    for turn in range(4):
+        yield corner.copy(), bounds[:, turn] - bounds[:, turn + 1]
+        if turn < 3:
+            corner[np.arange(len(part)), order[:, turn]] += 1
+
+
+def compression_factor(
+    settings: RenderSettings, direction: Float32[np.ndarray, "rays 3"]
+) -> Float32[np.ndarray, "rays"]:
+    """Factor, at most 1, by which lengths along rays shrink where the pose compresses space."""
+    canonical_per_m = np.linalg.norm(direction, axis=1)
+    return np.minimum(np.float32(settings.max_compression) / canonical_per_m, np.float32(1.0))
+
+
+def invert_jacobians(
+    settings: RenderSettings,
+    jacobian: Float32[np.ndarray, "rays 3 3"],
+) -> tuple[Float32[np.ndarray, "rays 3 3"], Bool[np.ndarray, "rays"]]:
+    """Return inverse Jacobians, and which of them are sound; the others are arbitrary."""
+    volume = np.linalg.det(jacobian)
+    sound = (volume > 1 / settings.max_volume_ratio) & (volume < settings.max_volume_ratio)
+    inverse = np.linalg.inv(np.where(sound[:, None, None], jacobian, np.eye(3)))
+    return inverse.astype(np.float32), sound
+
+
+def newton_correction(
+    settings: RenderSettings, posed: PosedNodes, rays: CanonicalRays
+) -> CanonicalRays:
+    """Move canonical starts one Newton step onto their camera rays; update the directions."""
+    camera, jacobian = skin_trilinear(posed, rays.start_canonical)
+    inverse, sound = invert_jacobians(settings, jacobian)
+    turned = np.einsum("nij,nj->ni", inverse, rays.direction_camera)
+    inverse = inverse[sound]
+    off = rays.begin[sound, None] * rays.direction_camera[sound] - camera[sound]
+    shift = np.einsum("nij,nj->ni", inverse, off)
+    length = np.linalg.norm(shift, axis=1, keepdims=True)
+    start, direction = rays.start_canonical.copy(), rays.direction_canonical.copy()
+    start[sound] += shift * np.minimum(settings.max_correction_m / np.maximum(length, 1e-10), 1.0)
+    direction[sound] = turned[sound]
+    return rays._replace(start_canonical=start, direction_canonical=direction)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RaySegments:
+    """Blocks of equidistant samples along rays, each ray's in the order in which light passes them.
+
+    Attributes:
+        ray_offsets: First segment of each ray, and the number of segments.
+        start: Begin of each segment, in voxels of the brick grid.
+        slope: Voxels from one sample to the next.
+        step_m: Metres from one sample to the next along the ray.
+        count: Samples.
+        layer: Depth layer, from 0.
+    """
+
+    ray_offsets: Int64[np.ndarray, "rays_and_one"]
+    start: Float32[np.ndarray, "segments 3"]
+    slope: Float32[np.ndarray, "segments 3"]
+    step_m: Float32[np.ndarray, "segments"]
+    count: Int32[np.ndarray, "segments"]
+    layer: Int32[np.ndarray, "segments"]
+
+    @property
+    def num_rays(self) -> int:
+        """Number of rays, with segments or without."""
+        return len(self.ray_offsets) - 1
+
+    @classmethod
+    def of_first_layer(
+        cls,
+        rays: CanonicalRays,
+        posed: PosedNodes,
+        bricks: BrickTable,
+        settings: RenderSettings,
+        samples: int,
+    ) -> "RaySegments":
+        """March the first layer's rays to their ends, as if none ever became opaque.
+
+        Args:
+            rays: One for each covered pixel.
+            posed: Skinning nodes in this pose.
+            bricks: Whose voxels the samples address.
+            settings: Spacing and number of blocks.
+            samples: Density samples along `RenderSettings.sample_span_m`.
+        """
+        blocks = list(_march_blocks(rays, posed, settings, samples))
+        number = np.concatenate([ray for ray, _, _ in blocks])
+        rest = CanonicalRays(*map(np.concatenate, zip(*(b[1] for b in blocks), strict=True)))
+        step_m = np.concatenate([step for _, _, step in blocks])
+        order = np.argsort(number, kind="stable")
+        return cls._along(
+            CanonicalRays(*(part[order] for part in rest)),
+            step_m[order],
+            np.searchsorted(number[order], np.arange(len(rays.begin) + 1)).astype(np.int64),
+            bricks,
+            (settings.block_samples, 0),
+        )
+
+    @classmethod
+    def of_further_layer(
+        cls,
+        rays: CanonicalRays,
+        ray_index: Int64[np.ndarray, "rays"],
+        num_rays: int,
+        bricks: BrickTable,
+        count_and_layer: tuple[int, int],
+    ) -> "RaySegments":
+        """Make one segment for each ray of a further layer.
+
+        Args:
+            rays: The layer's rays.
+            ray_index: Ray of the first layer that each belongs to, ascending.
+            num_rays: Rays of the first layer.
+            bricks: Whose voxels the samples address.
+            count_and_layer: Samples of a segment, and the layer's number, from 1.
+        """
+        step_m = (rays.end - rays.begin) / np.float32(count_and_layer[0])
+        offsets = np.searchsorted(ray_index, np.arange(num_rays + 1)).astype(np.int64)
+        return cls._along(rays, step_m, offsets, bricks, count_and_layer)
+
+    @classmethod
+    def _along(
+        cls,
+        rays: CanonicalRays,
+        step_m: Float32[np.ndarray, "segments"],
+        ray_offsets: Int64[np.ndarray, "rays_and_one"],
+        bricks: BrickTable,
+        count_and_layer: tuple[int, int],
+    ) -> "RaySegments":
+        """Express segments, which are grouped by ray already, in voxels of the brick grid."""
+        (count, layer), voxel_m = count_and_layer, np.float32(bricks.voxel_m)
+        return cls(
+            ray_offsets=ray_offsets,
+            start=(rays.start_canonical - bricks.low) / voxel_m,
+            slope=rays.direction_canonical * (step_m / voxel_m)[:, None],
+            step_m=step_m,
+            count=np.full(len(step_m), count, dtype=np.int32),
+            layer=np.full(len(step_m), layer, dtype=np.int32),
+        )
+
+    def append_layer(self, behind: "RaySegments") -> "RaySegments":
+        """Append the segments of a layer behind to those of each ray."""
+        rays = np.arange(self.num_rays)
+        owners = [np.repeat(rays, np.diff(segments.ray_offsets)) for segments in (self, behind)]
+        order = np.argsort(np.concatenate(owners), kind="stable")
+        columns = {
+            name: np.concatenate([getattr(self, name), getattr(behind, name)])[order]
+            for name in _SEGMENT_FIELDS
+        }
+        return RaySegments(ray_offsets=self.ray_offsets + behind.ray_offsets, **columns)
+
+    @classmethod
+    def concatenate(cls, many: "Sequence[RaySegments]") -> "RaySegments":
+        """Concatenate the rays of several pictures."""
+        offsets = np.cumsum([0, *(len(segments.step_m) for segments in many)])
+        starts = [s.ray_offsets[:-1] + o for s, o in zip(many, offsets[:-1], strict=True)]
+        columns = {
+            name: np.concatenate([getattr(segments, name) for segments in many])
+            for name in _SEGMENT_FIELDS
+        }
+        return cls(ray_offsets=np.concatenate([*starts, offsets[-1:]]), **columns)
+
+
+_SEGMENT_FIELDS = [field.name for field in fields(RaySegments) if field.name != "ray_offsets"]
+"""Fields with one row per segment."""
+
+
+def _march_blocks(
+    rays: CanonicalRays, posed: PosedNodes, settings: RenderSettings, samples: int
+) -> Iterator[tuple[Int64[np.ndarray, "segments"], CanonicalRays, Float32[np.ndarray, "segments"]]]:
+    """Yield for each block the numbers of unfinished rays, their remainders and their steps."""
+    number, rest = np.arange(len(rays.begin)), rays
+    for turn in range(settings.max_blocks * _block_multiple(settings, samples)):
+        if turn > 0:
+            rest = newton_correction(settings, posed, rest)
+        step_m = np.minimum(
+            (rest.end - rest.begin) / np.float32(settings.block_samples),
+            _max_sample_spacing(settings, samples, turn, rest),
+        )
+        yield number, rest, step_m
+        length = step_m * np.float32(settings.block_samples)
+        rest = rest._replace(
+            begin=rest.begin + length,
+            start_canonical=rest.start_canonical + rest.direction_canonical * length[:, None],
+        )
+        going = rest.begin < rest.end - 1e-5
+        number, rest = number[going], CanonicalRays(*(part[going] for part in rest))
+
+
+def _block_multiple(settings: RenderSettings, samples: int) -> int:
+    """Factor on both counts of blocks where more samples than usual are asked for."""
+    return -(-samples // settings.samples)
+
+
+def _max_sample_spacing(
+    settings: RenderSettings, samples: int, turn: int, rays: CanonicalRays
+) -> Float32[np.ndarray, "rays"]:
+    """Upper bound on the distance between samples in the rays' `turn`-th block, metres."""
+    multiple = _block_multiple(settings, samples)
+    if turn > 0 and turn == settings.max_blocks * multiple - 1:
+        return np.full(len(rays.begin), settings.max_segment_m, dtype=np.float32)
+    doublings = max(0, turn + 1 - settings.uniform_blocks * multiple)
+    nominal = settings.sample_span_m / samples * 2.0**doublings
+    return np.float32(nominal) * compression_factor(settings, rays.direction_canonical)
+
+
+EMPTY_PIXEL_KEY = 2**31 - 1
+"""Z-buffer key of a pixel that no surfel covers."""
+
+
+class SurfelFootprints(NamedTuple):
+    """Surfels' footprints, one row for each cell that one covers.
+
+    Attributes:
+        side: Edge of a footprint, pixels.
+        cell: Cells, numbered in a picture with a margin of `side` pixels.
+        key: Z-buffer keys.
+        depth: Depths of surfels that may form a further layer, metres; 0 for the others.
+    """
+
+    side: int
+    cell: Int64[np.ndarray, "splats"]
+    key: Int64[np.ndarray, "splats"]
+    depth: Float32[np.ndarray, "splats"]
+
+
+def surfel_of_key(key: Int64[np.ndarray, "*pixels"]) -> Int64[np.ndarray, "*pixels"]:
+    """Return the number of a key's surfel."""
+    return key & SURFEL_MASK
+
+
+def z_buffer(
+    size_px: tuple[int, int],
+    splats: SurfelFootprints,
+    chosen: Bool[np.ndarray, "splats"] | None = None,
+) -> Int64[np.ndarray, "rows columns"]:
+    """Return the least key of every cell, of some splats or of all."""
+    (width, height), margin = size_px, 2 * splats.side
+    buffer = np.full((height + margin, width + margin), EMPTY_PIXEL_KEY, dtype=np.int64)
+    where = slice(None) if chosen is None else chosen
+    np.minimum.at(buffer.reshape(-1), splats.cell[where], splats.key[where])
+    return buffer
+
+
+def fill_holes(
+    keys: Int64[np.ndarray, "rows columns"],
+    tables: PlayerTables,
+    settings: RenderSettings,
+    side: int,
+) -> Int64[np.ndarray, "height width"]:
+    """Fill pixels that two opposite ones, a footprint away, overtop by far; cut off the margin."""
+    here = slice(side, -side)
+    across = np.maximum(keys[here, : -2 * side], keys[here, 2 * side :])
+    along = np.maximum(keys[: -2 * side, here], keys[2 * side :, here])
+    neighbors, keys = np.minimum(across, along), keys[here, here]
+    steps = int(settings.hole_depth_m / (2.0 * tables.reach_m) * DEPTH_CODES)
+    return np.where(keys - (steps << SURFEL_BITS) > neighbors, neighbors, keys)

@@ -1,1 +1,0 @@
-"""Meshes for other programs: isosurface, skinning weights and glTF."""

@@ -1,1 +1,0 @@
-"""The player in numpy: the reference of the ONNX graph."""

@@ -1,1 +1,0 @@
-"""The web page that plays a package in a browser."""
