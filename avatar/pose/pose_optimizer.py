@@ -31,8 +31,8 @@ from preprocess.body.kinematics import (
 
 MAX_RAYS_PER_FRAME = 512
 """Rays per frame that are accumulated until its pose is corrected."""
-MIN_RAYS_PER_CORRECTION = 256
-"""Rays of a frame between two corrections of its pose."""
+MIN_RAYS_SHARE = 0.5
+"""Share of these rays from which its pose may be corrected."""
 MIN_POSE_GRADIENT_CELL_M = 0.025
 """Smallest cells of the hash levels whose gradient reaches the poses, metres. Finer levels point to
 the right place from a few millimetres away only."""
@@ -99,7 +99,14 @@ class PoseOptimizer:
     """
 
     def __init__(
-        self, rig: Rig, capacity: int, device: torch.device, *, poses_may_be_exact: bool = True
+        self,
+        rig: Rig,
+        capacity: int,
+        device: torch.device,
+        *,
+        poses_may_be_exact: bool = True,
+        rays_per_frame: int = MAX_RAYS_PER_FRAME,
+        prior_precision: float = 1.0,
     ) -> None:
         """Starts without poses.
 
@@ -110,8 +117,11 @@ class PoseOptimizer:
             poses_may_be_exact: Whether a pose moves only where its rays agree that it is wrong, and
                 then by half steps. Otherwise, with estimated poses or a fixed avatar, every pose
                 makes whole steps.
+            rays_per_frame: Most rays of a frame that one correction of its pose follows.
+            prior_precision: Precision of the given poses, relative to that of a tracker's.
         """
         self.rig = rig
+        self._rays_per_frame, self._prior_precision = rays_per_frame, prior_precision
         self.poses_may_be_exact = poses_may_be_exact
         self.min_gradient_cell_m = MIN_POSE_GRADIENT_CELL_M
         self.corrections: Float[np.ndarray, "slots 25 3"] = np.zeros((capacity, 25, 3))
@@ -121,8 +131,8 @@ class PoseOptimizer:
             torch.from_numpy(rig.box_low).to(device),
             torch.from_numpy(rig.nodes_per_m).to(device),
         )
-        self._wrenches = torch.zeros(capacity, MAX_RAYS_PER_FRAME, 24, 6, device=device)
-        self._losses = torch.zeros(capacity, MAX_RAYS_PER_FRAME, device=device)
+        self._wrenches = torch.zeros(capacity, rays_per_frame, 24, 6, device=device)
+        self._losses = torch.zeros(capacity, rays_per_frame, device=device)
         self._ray_counts = torch.zeros(capacity, dtype=torch.int64, device=device)
         self._tracker_poses: list[BodyPose | None] = [None] * capacity
         self._joint_transforms = np.zeros((capacity, 24, 4, 4))
@@ -238,11 +248,11 @@ class PoseOptimizer:
         counts = torch.bincount(slots, minlength=len(self._ray_counts))
         rank = torch.arange(len(slots), device=slots.device) - (counts.cumsum(0) - counts)[slots]
         place = self._ray_counts[slots] + rank
-        kept = (place < MAX_RAYS_PER_FRAME) & self._is_correctable[slots]
+        kept = (place < self._rays_per_frame) & self._is_correctable[slots]
         self._wrenches[slots[kept], place[kept]] = wrenches[kept]
         self._losses[slots[kept], place[kept]] = loss[kept]
         self._ray_counts = (self._ray_counts + counts * self._is_correctable).clamp(
-            max=MAX_RAYS_PER_FRAME
+            max=self._rays_per_frame
         )
 
     def correct_next(self, *, rate: float) -> int | None:
@@ -256,13 +266,14 @@ class PoseOptimizer:
         """
         slot = int(self._ray_counts.argmax())
         rows = int(self._ray_counts[slot])
-        if rows < MIN_RAYS_PER_CORRECTION:
+        if rows < MIN_RAYS_SHARE * self._rays_per_frame:
             return None
         loss = self._losses[slot, :rows].cpu().numpy()
         evidence = self._evidence if self.poses_may_be_exact else math.inf
+        prior = self._temporal_prior.prior_for(slot, self.corrections)
         step = gauss_newton_step(
             self.pose_gradients(slot), loss, self.corrections[slot], evidence,
-            prior=self._temporal_prior.prior_for(slot, self.corrections),
+            prior=prior._replace(precision=self._prior_precision * prior.precision),
         )  # fmt: skip
         self._ray_counts[slot] = 0
         self._temporal_prior.record_estimate(slot, step.unregularized)

@@ -21,10 +21,12 @@ from avatar.training.training_step import OccupancySampler, compute_gradients
 
 MIN_SCORED_GAIN = 0.01
 """Difference of a gain from 1 up to which the given pose is not scored again with it."""
-CORRECTIONS_PER_FRAME = 32
+CORRECTIONS_PER_FRAME = 12
 """Corrections of each frame's pose."""
-RAYS_PER_CORRECTION = 512
-"""Rays per correction of a pose."""
+RAYS_PER_CORRECTION = 4096
+"""Rays per correction of a pose: few corrections by many rays end nearer than many by few."""
+PRIOR_PRECISION = 0.25
+"""Precision of the given poses relative to that in training: the avatar no longer gives way."""
 COARSE_SHARE = 0.5
 """Share of the corrections that follow the coarse levels of the hash grid alone; then poses are so
 near that the finer ones, which do not change any more, point to the right place, too."""
@@ -41,8 +43,8 @@ def fit_test_poses(
     """Held-out frames in poses and exposures fitted to them.
 
     The avatar is frozen; only poses and exposures are optimized, starting from those of neighboring
-    frames. Each correction uses a few hundred rays, so an exact pose ends about a millimetre off;
-    the given pose, or exposure, is kept where it scores higher on a sample of the pixels.
+    frames. Each correction follows some of the frame's rays, so that even an exact pose moves a
+    little; the given pose, or exposure, is kept where it scores higher on a sample of the pixels.
 
     Args:
         trainer: Trainer of the avatar; the gradients of its field are overwritten.
@@ -79,16 +81,17 @@ def _fit_frames(
 ) -> None:
     """Fits poses and exposures to the frames of `replay`."""
     avatar, field = trainer.avatar, trainer.avatar.field
+    at_once = min(2, len(replay))
     config = dataclasses.replace(
         trainer.config,
         empty_space_weight=0.0,
         interior_weight=0.0,
         inner_leg_weight=0.0,
-        rays=2 * RAYS_PER_CORRECTION,
+        rays=at_once * RAYS_PER_CORRECTION,
     )
     sampler = OccupancySampler(field.backend, avatar.occupancy, config)
     generator = torch.Generator(device=replay.device).manual_seed(config.seed)
-    steps = math.ceil(CORRECTIONS_PER_FRAME * len(replay) / 2)
+    steps = math.ceil(CORRECTIONS_PER_FRAME * len(replay) / at_once)
     for step in range(steps):
         if step >= COARSE_SHARE * steps:
             poses.min_gradient_cell_m = 0.0
@@ -100,7 +103,7 @@ def _fit_frames(
         field.table_grad.zero_()
         if config.estimate_exposures:
             exposures.observe(batch, result.rendered)
-        for _ in range(2):
+        for _ in range(at_once):
             rate = cosine_decay(step / steps)
             correct_one_pose(avatar.rig, trainer.backend, replay, poses, rate=rate)
         progress(FITTING_SHARE * (step + 1) / steps)
@@ -112,7 +115,14 @@ def _with_neighboring_corrections(
     """The frames and their poses, slot by slot, corrected like the frames about them."""
     rig, device = trainer.avatar.rig, trainer.avatar.field.table.device
     replay = ReplayBuffer(len(frames), device)
-    poses = PoseOptimizer(rig, len(frames), device, poses_may_be_exact=False)
+    poses = PoseOptimizer(
+        rig,
+        len(frames),
+        device,
+        poses_may_be_exact=False,
+        rays_per_frame=RAYS_PER_CORRECTION,
+        prior_precision=PRIOR_PRECISION,
+    )
     for frame in frames:
         prepared = prepare_frame(frame.observation, rig)
         slot = replay.add(prepared)

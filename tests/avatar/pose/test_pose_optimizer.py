@@ -249,7 +249,7 @@ def test_fine_levels_pull_held_out_poses_in_the_second_half_alone(learnt, clip, 
         HashLevels, "coarser_than", lambda levels, cell_m: (asked.append(cell_m), levels)[1]
     )
     list(fit_test_poses(learnt.trainer, [HeldOutFrame(observation=clip.observations[11])]))
-    assert asked == 8 * [MIN_POSE_GRADIENT_CELL_M] + 8 * [0.0]
+    assert asked == 6 * [MIN_POSE_GRADIENT_CELL_M] + 6 * [0.0]
 
 
 def test_no_frame_scores_worse_in_a_fitted_pose(learnt, clip):
@@ -334,6 +334,23 @@ def test_estimated_poses_follow_their_rays_even_where_these_hardly_agree(rig, be
     assert tables[1].freeze_converged(FREEZE_AFTER_STEPS)
     assert tables[1].correction_interval(1.0) == 1
     assert tables[1].correction_interval(0.1) == MAX_ESTIMATED_INTERVAL
+
+
+def test_a_held_out_pose_follows_more_rays_and_its_given_pose_less(rig, bent_pose, generator):
+    wrenches, loss = torch.randn(1000, 24, 6, generator=generator), torch.full((1000,), 0.1)
+
+    def correct(rays, precision):
+        table = PoseOptimizer(
+            rig, 1, CPU, poses_may_be_exact=False, rays_per_frame=1000, prior_precision=precision
+        )
+        table.set_pose(0, pose_of(bent_pose))
+        table.accumulate(torch.zeros(rays, dtype=torch.int64), wrenches[:rays], loss[:rays])
+        table.correct_next(rate=1.0)
+        return np.linalg.norm(table.corrections[0])
+
+    assert correct(400, 1.0) == 0.0  # it waits for more of them
+    assert correct(600, 1.0) != correct(1000, 1.0)
+    assert correct(1000, 0.01) > correct(1000, 1.0) > 0.0
 
 
 def test_a_correction_outlives_a_checkpoint(rig, clip, tmp_path):
