@@ -27,6 +27,7 @@ from preprocess.fitting.capture_fit import CaptureFit
 from preprocess.fitting.clip_fitting import (
     SIGMA_LOG_ASSUMED_FOCAL,
     SIGMA_LOG_FOCAL,
+    TRACKED_WEIGHTS,
     USUAL_WEIGHTS,
     ClipFitter,
     ClipFrame,
@@ -46,14 +47,16 @@ ESTIMATED_KEY_FRAMES = 60
 """Frames whose masks are fitted where masks must be estimated."""
 TRACKED_KEY_FRAMES = 300
 """Frames, evenly spread, whose masks are fitted together with key points."""
-TRACKED_WEIGHTS = EvidenceWeights(outline_rows=120.0, keypoints=0.3)
-"""Outlines tell where limbs are better than key points, which are off by 2 cm for many frames."""
 TRACKED_FRAMES_PER_PRIOR = 30.0
 """Frames that count as one for the proportions where key points see the joints, too."""
 KEYPOINT_ITERATIONS = 5
 """Iterations with key points alone, after which the body is near its outline."""
-TRACKED_ITERATIONS = (4, 5)
-"""Fewest and most iterations with outlines after that."""
+TRACKED_ITERATIONS = 3
+"""Iterations with outlines after that."""
+POSE_ITERATIONS = 2
+"""Iterations over poses alone after those, with `TRACKED_POSE_WEIGHTS`."""
+TRACKED_POSE_WEIGHTS = EvidenceWeights(outline_rows=480.0, keypoints=0.6)
+"""Evidence of poses alone counts more against their priors; proportions would follow clothes."""
 PROPORTION_ITERATIONS = 4
 """Iterations that show how well proportions and focal length alone explain the masks."""
 MIN_ERROR_DECREASE = 0.01
@@ -119,17 +122,13 @@ def fit_capture(capture: Capture, *, fit_body: bool = True) -> CaptureFit | None
     if fitter is None:
         return None
     everything = FitParameters(proportions=fit_body, focal=not capture.cameras.is_moving)
-    errors: list[float] = []
     if tracked:
-        for _ in range(KEYPOINT_ITERATIONS):
-            fitter.iterate(everything._replace(outlines=False))
+        errors = settling = _fit_tracked(fitter, everything)
     else:
         alone = everything._replace(poses=False)
         errors = [fitter.iterate(alone) for _ in range(PROPORTION_ITERATIONS)]
-    settling = _iterate_until_settled(
-        fitter, everything, TRACKED_ITERATIONS if tracked else (MIN_ITERATIONS, MAX_ITERATIONS)
-    )
-    before, explained, after = (errors or settling)[0], settling[0], settling[-1]
+        settling = _iterate_until_settled(fitter, everything)
+    before, explained, after = errors[0], settling[0], settling[-1]
     corrections = fitter.corrections
     turned = np.degrees(np.linalg.norm(corrections[:, :3], axis=1).mean())
     pixel_cm = 100.0 * capture.pixel_footprint_m() * _reduction(capture, fitter)
@@ -144,19 +143,31 @@ def fit_capture(capture: Capture, *, fit_body: bool = True) -> CaptureFit | None
     )
 
 
-def _iterate_until_settled(
-    fitter: ClipFitter, fitted: FitParameters, bounds: tuple[int, int]
-) -> list[float]:
-    """Iterates until the error hardly decreases, between a fewest and a most times.
+def _fit_tracked(fitter: ClipFitter, everything: FitParameters) -> list[float]:
+    """Fits to key points, then with outlines, then poses alone to outlines that count more.
+
+    Returns:
+        The error before each iteration with outlines.
+    """
+    for _ in range(KEYPOINT_ITERATIONS):
+        fitter.iterate(everything._replace(outlines=False))
+    errors = [fitter.iterate(everything) for _ in range(TRACKED_ITERATIONS)]
+    fitter.weights = TRACKED_POSE_WEIGHTS
+    poses = everything._replace(proportions=False, focal=False)
+    return errors + [fitter.iterate(poses) for _ in range(POSE_ITERATIONS)]
+
+
+def _iterate_until_settled(fitter: ClipFitter, fitted: FitParameters) -> list[float]:
+    """Iterates until the error hardly decreases.
 
     Returns:
         The error before each iteration.
     """
     errors: list[float] = []
-    while len(errors) < bounds[1]:
+    while len(errors) < MAX_ITERATIONS:
         errors.append(fitter.iterate(fitted))
         settled = errors[-1] > (1.0 - MIN_ERROR_DECREASE) * errors[max(len(errors) - 2, 0)]
-        if len(errors) >= bounds[0] and settled:
+        if len(errors) >= MIN_ITERATIONS and settled:
             break
     return errors
 

@@ -83,7 +83,9 @@ class FitParameters(NamedTuple):
 
 
 USUAL_WEIGHTS = EvidenceWeights()
-"""Where few frames have an outline, or poses are given."""
+"""Where proportions are fitted to few frames, or poses are given."""
+TRACKED_WEIGHTS = EvidenceWeights(outline_rows=120.0, keypoints=0.3)
+"""Outlines tell where limbs are better than key points, which are off by 2 cm for many frames."""
 ALL_PARAMETERS = FitParameters()
 """Poses, proportions and focal length together."""
 
@@ -98,6 +100,7 @@ class ClipFitter:
         coefficients: Proportions, in prior standard deviations.
         log_focal: Logarithm of the focal length's factor.
         poses: Present poses of the frames.
+        weights: What outlines and key points count; may be changed between iterations.
     """
 
     def __init__(
@@ -130,7 +133,7 @@ class ClipFitter:
         self.frames = tuple(frames)
         self.model = model or OutlineModel(space)
         self._keypoint_model = KeypointModel(space)
-        self._frames_per_prior, self._weights = frames_per_prior, weights
+        self._frames_per_prior, self.weights = frames_per_prior, weights
         self.coefficients = np.zeros(space.count)
         self.log_focal, self._sigma_log_focal = 0.0, sigma_log_focal
         self._given = ClipPoses.of(motion, [frame.row for frame in self.frames])
@@ -205,7 +208,7 @@ class ClipFitter:
             seen = self.model.compare(carried[index], mask)
             if seen is None:
                 continue
-            precision = self._weights.outline_rows / SIGMA_OUTLINE_PX**2
+            precision = self.weights.outline_rows / SIGMA_OUTLINE_PX**2
             weight = seen.weights * (precision / len(seen.weights))
             squares += float(weight @ seen.residuals**2)
             total += float(weight.sum())
@@ -226,7 +229,7 @@ class ClipFitter:
             self.model.joints,
             ClipCameras.of(cameras),
             self._keypoints,
-            self._weights.keypoints,
+            self.weights.keypoints,
         )
         focal = self._sigma_log_focal * seen.focal_jacobian[..., None]
         equations.add_all(

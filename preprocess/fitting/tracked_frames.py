@@ -20,8 +20,11 @@ from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.fitting.clip_fitting import (
     SIGMA_LOG_ASSUMED_FOCAL,
+    TRACKED_WEIGHTS,
+    USUAL_WEIGHTS,
     ClipFitter,
     ClipFrame,
+    EvidenceWeights,
     FitParameters,
 )
 from preprocess.fitting.outlines import OUTLINE_PERSON_PX, OutlineDistances, OutlineModel
@@ -91,7 +94,10 @@ def fit_first_frames(
         Poses of the frames, the person, and the camera.
     """
     space = ProportionSpace.around(shaped)
-    fitter = _fitter(seen, None, OutlineModel(space), camera, range(len(seen)), sigma_log_focal)
+    fitter = _fitter(
+        seen, None, OutlineModel(space), camera, range(len(seen)),
+        sigma_log_focal=sigma_log_focal, weights=USUAL_WEIGHTS,
+    )  # fmt: skip
     everything = FitParameters(proportions=not fixed)
     for _ in range(FIRST_ITERATIONS[0]):
         fitter.iterate(everything._replace(outlines=False))
@@ -232,7 +238,9 @@ def _fitter(
     model: OutlineModel,
     camera: Camera,
     outlined: Collection[int],
+    *,
     sigma_log_focal: float = SIGMA_LOG_ASSUMED_FOCAL,
+    weights: EvidenceWeights = TRACKED_WEIGHTS,
 ) -> ClipFitter:
     """The fit of some frames, of which those at some places are compared with their masks."""
     shaped = model.space.shaped
@@ -253,7 +261,7 @@ def _fitter(
     return ClipFitter(
         motion, model.space, frames, model=model, track=_track(seen, camera),
         settled=poses is not None,
-        sigma_log_focal=sigma_log_focal,
+        sigma_log_focal=sigma_log_focal, weights=weights,
     )  # fmt: skip
 
 

@@ -9,9 +9,10 @@ being tracked are left out, so that tracking does not fall behind.
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import final
 
+import cv2
 import numpy as np
 from jaxtyping import Float32
 
@@ -263,21 +264,28 @@ class LiveTracking:
             if frame.index not in self._seen:
                 return NOT_FOUND
             assert self._fitter is not None
-            assert self._earlier is not None
             found.append(self._seen.pop(frame.index))
-            pose = self._fitter.pose(frame.index)
-            self._earlier.add(found[-1], pose)
-            return pose
+            return self._fitter.pose(frame.index)
 
         def alpha_of(frame: Frame, size_px: tuple[int, int]) -> Float32[np.ndarray, "rows columns"]:
             if self.given_masks is not None:
                 return self.given_masks(frame, size_px)
             return self._refine(frame.rgb, found[-1].keypoints.mask, size_px)
 
-        return compose_observation_builder(
+        observe = compose_observation_builder(
             pose_of, alpha_of, lambda index: cameras[0], target_px, segment=segment,
             refine=None if self.given_masks is None else refine,
         )  # fmt: skip
+
+        def observed(frame: Frame) -> Observation | DroppedFrame:
+            item = observe(frame)
+            if isinstance(item, Observation):
+                assert self._earlier is not None
+                mask = cv2.resize(item.alpha, self._mask_px, interpolation=cv2.INTER_AREA)
+                self._earlier.add(replace(found[-1], mask=mask), item.pose)
+            return item
+
+        return observed
 
     def take_revised_poses(self) -> dict[int, BodyPose]:
         """Poses of earlier frames that were fitted again since the last call, by their numbers."""

@@ -14,7 +14,7 @@ from preprocess.body.parametric_body import load_body_model
 from preprocess.cameras.camera_file import CameraTrack, write_cameras
 from preprocess.cameras.camera_orientation import assume_camera
 from preprocess.capture_session import CaptureInputs
-from preprocess.fitting.tracked_frames import LAG_FRAMES
+from preprocess.fitting.tracked_frames import LAG_FRAMES, EarlierPoses
 from preprocess.live import tracked_stream
 from preprocess.live.tracked_stream import NOT_FOUND, LiveTracking, TrackedStream
 from preprocess.observation import DroppedFrame, Observation
@@ -124,6 +124,16 @@ def test_every_frame_has_a_pose_and_a_mask(standing):
     assert np.abs(np.diff(places, axis=0)).max() < 0.02
     assert all(item.alpha.max() > 0.9 for item in seen)
     assert list(tracking.final_notes()) == []
+
+
+def test_earlier_poses_are_fitted_to_the_masks_that_are_learnt_from(standing, monkeypatch):
+    fitted = []
+    monkeypatch.setattr(EarlierPoses, "add", lambda earlier, seen, pose: fitted.append(seen))
+    stream, tracking, start = started(Tracker(standing))
+    tracking.given_masks = lambda frame, size_px: np.full(size_px[::-1], 0.9, dtype=np.float32)
+    seen = observe_all(stream, tracking, start)
+    assert [each.number for each in fitted] == [item.frame.index for item in seen]
+    assert all(np.allclose(each.mask, 0.9) for each in fitted)
 
 
 def test_a_frame_waits_for_later_ones(standing):
