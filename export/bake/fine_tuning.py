@@ -8,6 +8,7 @@ same rays of the renderer, and each shares its error among the voxels that it ha
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import final
 
 import numpy as np
@@ -90,49 +91,6 @@ class RenderTargets:
         return float(np.mean(-10.0 * np.log10(squares / (3.0 * self.pixels) + 1e-10)))
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class TargetBuilder:
-    """Draws views with the renderer while the player's rays are traced beside it.
-
-    Attributes:
-        tables: As baked.
-        codes: Voxel codes of the tables' bricks.
-        rig: What moves them.
-        renderer: Called on the caller's thread alone.
-        executor: Traces the player's rays meanwhile.
-        on_picture: Called after each picture.
-    """
-
-    tables: PlayerTables
-    codes: VoxelCodes
-    rig: Rig
-    renderer: RenderFunction
-    executor: Executor
-    on_picture: Callable[[], None]
-
-    def build(self, views: Sequence[PosedView], settings: RenderSettings) -> RenderTargets:
-        """Draw the views, or the first of them that reach `MAX_SEGMENTS`."""
-        parts = list[tuple[TracedPicture, RgbaPicture]]()
-        for pose, camera in views:
-            traced = self.executor.submit(self._trace, settings, pose, camera)
-            picture = self.renderer(pose, camera)
-            parts.append((traced.result(), picture))
-            self.on_picture()
-            if sum(len(traced.segments.step_m) for traced, _ in parts) > MAX_SEGMENTS:
-                break
-        return _join_targets(parts)
-
-    def psnr(self, targets: RenderTargets, settings: RenderSettings) -> float:
-        """Return the PSNR as baked, dB, with the settings that the targets were built for."""
-        return targets.psnr(self.tables, settings, self.codes)
-
-    def _trace(self, settings: RenderSettings, pose: BodyPose, camera: Camera) -> TracedPicture:
-        camera_from_body = camera.camera_from_world @ self.rig.world_from_body(pose)
-        bones = camera_from_body @ self.rig.body_from_canonical(pose.joint_rotations)
-        inputs = PlayerInputs.of(bones[:, :3].astype(np.float32), camera, settings.samples)
-        return trace_picture(self.tables, self.codes, settings, inputs)
-
-
 def _join_targets(parts: Sequence[tuple[TracedPicture, RgbaPicture]]) -> RenderTargets:
     target_colors, uncovered_error = [], []
     for traced, picture in parts:
@@ -209,16 +167,39 @@ class FineTuningInputs:
     views: Sequence[PosedView]
     executor: Executor
 
-    def target_builder(self, on_picture: Callable[[], None] = lambda: None) -> TargetBuilder:
-        """Build targets for these tables; `on_picture` is called after each picture."""
-        return TargetBuilder(
-            tables=self.tables,
-            codes=VoxelCodes.of(self.tables.bricks),
-            rig=self.rig,
-            renderer=self.renderer,
-            executor=self.executor,
-            on_picture=on_picture,
-        )
+    @cached_property
+    def codes(self) -> VoxelCodes:
+        """Voxel codes of the tables' bricks."""
+        return VoxelCodes.of(self.tables.bricks)
+
+    def draw_targets(
+        self,
+        views: Sequence[PosedView],
+        settings: RenderSettings,
+        on_picture: Callable[[], None] = lambda: None,
+    ) -> RenderTargets:
+        """Draw views with the renderer while the player's rays are traced beside it.
+
+        Args:
+            views: Those, or the first of them that reach `MAX_SEGMENTS`.
+            settings: How the player draws them.
+            on_picture: Called after each picture.
+        """
+        parts = list[tuple[TracedPicture, RgbaPicture]]()
+        for pose, camera in views:
+            traced = self.executor.submit(self._trace, settings, pose, camera)
+            picture = self.renderer(pose, camera)
+            parts.append((traced.result(), picture))
+            on_picture()
+            if sum(len(traced.segments.step_m) for traced, _ in parts) > MAX_SEGMENTS:
+                break
+        return _join_targets(parts)
+
+    def _trace(self, settings: RenderSettings, pose: BodyPose, camera: Camera) -> TracedPicture:
+        camera_from_body = camera.camera_from_world @ self.rig.world_from_body(pose)
+        bones = camera_from_body @ self.rig.body_from_canonical(pose.joint_rotations)
+        inputs = PlayerInputs.of(bones[:, :3].astype(np.float32), camera, settings.samples)
+        return trace_picture(self.tables, self.codes, settings, inputs)
 
     def perturbed_views(
         self, count: int, pose_noise_rad: float, generator: np.random.Generator, longest_px: int
@@ -268,12 +249,12 @@ class FineTuningResult:
 
 def is_below_target(inputs: FineTuningInputs) -> bool:
     """Tell whether the player is farther from the renderer than `TARGET_DB`, as baked."""
-    builder = inputs.target_builder()
     near = inputs.perturbed_views(
         PROBE_PICTURES, POSE_NOISE_RAD, np.random.default_rng(1), VALIDATION_PX
     )
     settings = inputs.settings["hq"]
-    return builder.psnr(builder.build(near, settings), settings) < TARGET_DB
+    targets = inputs.draw_targets(near, settings)
+    return targets.psnr(inputs.tables, settings, inputs.codes) < TARGET_DB
 
 
 def fine_tune(
@@ -302,17 +283,20 @@ def fine_tune(
     tiers = [inputs.settings[tier] for tier in inputs.tuned_tiers]
     total = len(training) + len(tiers) * (len(asked) + len(novel)) + ROUNDS
     steps = iter(range(1, total + 1))
-    builder = inputs.target_builder(lambda: progress(next(steps) / total))
-    judges = [(builder.build(asked + novel, each), each) for each in tiers]
+
+    def drawn(views: list[PosedView], settings: RenderSettings) -> RenderTargets:
+        return inputs.draw_targets(views, settings, lambda: progress(next(steps) / total))
+
+    judges = [(drawn(asked + novel, each), each) for each in tiers]
     learnt = [
-        (builder.build(part, each), each)
+        (drawn(part, each), each)
         for part, each in zip(_in_turn(training, len(tiers), len(inputs.views)), tiers, strict=True)
     ]
 
     def judge(codes: VoxelCodes) -> float:
         return float(np.mean([targets.psnr(tables, each, codes) for targets, each in judges]))
 
-    baked = best = builder.codes
+    baked = best = inputs.codes
     first = score = judge(baked)
     for latent in _sirt_rounds(learnt, tables, baked):
         quantized = _quantize_codes(latent, baked)

@@ -6,7 +6,6 @@ import numpy as np
 
 from export.graph.graph_skinning import (
     GraphContext,
-    PosedNodeValues,
     VectorValue,
     dot,
     gather_vector,
@@ -175,7 +174,7 @@ class BlockValues:
 
 def march_segments(
     context: GraphContext,
-    posed: PosedNodeValues,
+    posed: VectorValue,
     segment: SegmentValues,
     close_up: GraphValue,
 ) -> tuple[VectorValue, GraphValue]:
@@ -322,7 +321,7 @@ def composite_samples(
 
 
 def _newton_step(
-    context: GraphContext, posed: PosedNodeValues, segment: SegmentValues
+    context: GraphContext, posed: VectorValue, segment: SegmentValues
 ) -> SegmentValues:
     """Move canonical positions onto their camera rays where skinning is invertible."""
     graph, settings = context.graph, context.settings

@@ -16,7 +16,6 @@ from export.graph.graph_ray_march import (
 from export.graph.graph_skinning import (
     CameraValues,
     GraphContext,
-    PosedNodeValues,
     PosedSurfels,
     SkinningCell,
     VectorValue,
@@ -69,7 +68,7 @@ class PosedProxySurface:
     """Surfels and skinning nodes in the camera's frame; whether it is near (`MIN_FOOTPRINT_PX`)."""
 
     surfels: PosedSurfels
-    posed: PosedNodeValues
+    posed: VectorValue
     close_up: GraphValue
 
 

@@ -87,13 +87,6 @@ def gather_vector(vector: Sequence[GraphValue], places: GraphValue) -> VectorVal
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PosedNodeValues:
-    """Skinning nodes in the camera's frame: values of the graph, one entry a node."""
-
-    camera_positions: VectorValue
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
 class SkinningCell:
     """Cells of the skinning grid about points: values of the graph, one entry a point.
 
@@ -107,15 +100,15 @@ class SkinningCell:
     fraction: VectorValue
 
 
-def pose_nodes(context: GraphContext) -> PosedNodeValues:
-    """Skin every node into the camera's frame."""
+def pose_nodes(context: GraphContext) -> VectorValue:
+    """Return the positions of skinning nodes in the camera's frame, one entry a node."""
     graph, columns = context.graph, context.table_values
     blended = context.camera.bones.transpose(1, 0).matmul(columns["node_weights"])
     positions = [columns[f"node_{letter}"] for letter in "xyz"]
     ones = positions[0] * 0.0 + 1.0
     homogeneous = graph.concatenate([p.reshape(1, -1) for p in [*positions, ones]])
     matrix = blended.reshape(3, 4, -1)
-    return PosedNodeValues(camera_positions=graph.split((matrix * homogeneous).reduce_sum(1), 3))
+    return graph.split((matrix * homogeneous).reduce_sum(1), 3)
 
 
 def skinning_nodes_per_m(context: GraphContext) -> list[float]:
@@ -146,7 +139,7 @@ def locate_skinning_cell(context: GraphContext, canonical: VectorValue) -> Skinn
 
 
 def skin_points(
-    context: GraphContext, posed: PosedNodeValues, place: SkinningCell
+    context: GraphContext, posed: VectorValue, place: SkinningCell
 ) -> tuple[VectorValue, MatrixValue]:
     """Skin points, trilinear between the eight nodes about each.
 
@@ -155,7 +148,7 @@ def skin_points(
     """
     rows = [row for lower in place.rows for row in (lower, lower + 1)]
     point, derivative = [], []
-    for table in posed.camera_positions:
+    for table in posed:
         value, slopes = _trilinear([table.gather(row) for row in rows], place.fraction)
         point.append(value)
         derivative.append(slopes)
@@ -241,7 +234,7 @@ class PosedSurfels:
     camera_positions: VectorValue
 
 
-def pose_surfels(context: GraphContext, posed: PosedNodeValues) -> PosedSurfels:
+def pose_surfels(context: GraphContext, posed: VectorValue) -> PosedSurfels:
     """Pose surfels as weighted sums of four nodes each, as most of them are never seen.
 
     All but the nodes' posed positions is constant: onnxruntime computes it once.
@@ -249,7 +242,7 @@ def pose_surfels(context: GraphContext, posed: PosedNodeValues) -> PosedSurfels:
     columns = context.table_values
     place = locate_skinning_cell(context, [columns[f"position_{letter}"] for letter in "xyz"])
     rows, shares, normal = _surfel_tetrahedra(context, place)
-    corners = [gather_vector(posed.camera_positions, row) for row in rows]
+    corners = [gather_vector(posed, row) for row in rows]
     camera = []
     for axis in range(3):
         parts = [corner[axis] * share for corner, share in zip(corners, shares, strict=True)]
@@ -263,14 +256,14 @@ def _tetrahedron_edges(corners: Sequence[VectorValue]) -> list[VectorValue]:
 
 
 def faces_camera(
-    context: GraphContext, posed: PosedNodeValues, surfels: PosedSurfels, number: GraphValue
+    context: GraphContext, posed: VectorValue, surfels: PosedSurfels, number: GraphValue
 ) -> GraphValue:
     """Tell which surfels face the camera: n · J⁻¹ c < 0, J the Jacobian in the tetrahedron.
 
     J's columns are the edges between the four nodes, so J⁻¹ consists of their cross products.
     """
     settings, rows = context.settings, gather_vector(surfels.rows, number)
-    edges = _tetrahedron_edges([gather_vector(posed.camera_positions, row) for row in rows])
+    edges = _tetrahedron_edges([gather_vector(posed, row) for row in rows])
     across = [cross(edges[(k + 1) % 3], edges[(k + 2) % 3]) for k in range(3)]
     volume = dot(edges[0], across[0])
     camera = gather_vector(surfels.camera_positions, number)

@@ -6,7 +6,6 @@ import numpy as np
 
 from export.graph.graph_skinning import (
     GraphContext,
-    PosedNodeValues,
     PosedSurfels,
     VectorValue,
     dot,
@@ -219,7 +218,7 @@ def depth_limits(
 
 def hidden_splats(
     context: GraphContext,
-    posed: PosedNodeValues,
+    posed: VectorValue,
     surfels: PosedSurfels,
     splats: SurfelSplats,
     limits: GraphValue,

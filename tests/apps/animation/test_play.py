@@ -306,8 +306,7 @@ def test_poses_in_other_units_are_refused(
     call_play, package, novel, tmp_path, monkeypatch, changed, words
 ):
     monkeypatch.chdir(tmp_path)
-    for module in (player_page, player_page):  # `site` holds a name of its own
-        monkeypatch.setattr(module, "runtime_files", dict)
+    monkeypatch.setattr(player_page, "runtime_files", dict)
     with np.load(novel) as given:
         turned, places = given["body_pose"], given["transl"] + np.array([0.0, 0.0, 3.0])
     for said, other in (
