@@ -24,7 +24,7 @@ demo: install
 	$(BIN)/python -m apps.play $(DEMO)/run/avatar.iavatar --poses $(DEMO)/capture/dance.npz --out $(DEMO)/dance.webm --overwrite
 
 web: install # what `ia-play --web` needs: onnxruntime-web, pinned, through npm
-	$(BIN)/python -m apps.fetch_runtime
+	$(BIN)/python -m apps.animation.web_server
 
 results: install # docs/results.md: about an hour on two cores (calculated from its parts); MOTION=track.npz films a track of poses, PLAN=whole runs all
 	$(BIN)/python -m benchmarks.results --write docs/results.md $(if $(PLAN),--plan $(PLAN)) $(if $(MOTION),--motion $(MOTION))
@@ -33,7 +33,7 @@ test: install # on one thread: these tests are small, a second thread costs more
 	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -q -m "not slow"
 
 test-all: install # the slow ones, too: long trainings, the browser, a fresh installation
-	-$(BIN)/python -m apps.fetch_runtime # without it the browser's tests are skipped
+	-$(BIN)/python -m apps.animation.web_server # without it the browser's tests are skipped
 	$(BIN)/python -m pytest -q
 
 check: install

@@ -15,29 +15,38 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from apps.batching.batch_folder import BatchFolder
-from apps.batching.batch_scheduler import FIRST_NEED_MB, BatchLimits, BatchScheduler, plan_captures
+from apps.batching.batch_scheduler import (
+    FIRST_NEED_MB,
+    BatchLimits,
+    BatchScheduler,
+    CaptureState,
+    LiveTable,
+    plan_captures,
+)
 from apps.batching.capture_discovery import BATCH_OPTIONS, find_captures, resolve_option
+from apps.batching.executors import RAY_LOCAL, AttemptExecutor, LocalExecutor, RayExecutor
 from apps.batching.ingest_attempt import IngestJob
-from apps.batching.live_table import CaptureState, LiveTable
-from apps.batching.local_executor import AttemptExecutor, LocalExecutor
-from apps.batching.node_resources import LOCK_NAME
-from apps.batching.ray_executor import RAY_LOCAL, RayExecutor
-from apps.batching.remote_files import RemoteFileError, is_url
+from apps.batching.remote_files import LOCK_NAME, RemoteFileError, is_url
 from apps.batching.summary_page import BatchSummary, CorePrice, write_summary
-from apps.cli.capture_options import Flag
-from apps.cli.command_line import parse_arguments
-from apps.cli.console import Console, StderrConsole
-from apps.cli.exit_codes import (
+from apps.cli.command_line import (
     DONE,
     INTERRUPTED,
     NO_AVATAR,
     RESOURCE_UNAVAILABLE,
     CommandExit,
+    handle_signals,
+    parse_arguments,
     run_command,
+    stop_on_interrupt,
 )
-from apps.cli.interrupt import handle_signals, stop_on_interrupt
-from apps.cli.output_paths import check_disjoint_from_inputs, check_output_file, check_writable
-from apps.report.hardware import usable_cores
+from apps.cli.console import Console, StderrConsole
+from apps.cli.hardware import usable_cores
+from apps.cli.shared_options import (
+    Flag,
+    check_disjoint_from_inputs,
+    check_output_file,
+    check_writable,
+)
 from apps.run.ingest_arguments import IngestArguments
 from capture.input_error import InputError
 

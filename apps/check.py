@@ -1,6 +1,7 @@
 """ia-check: diagnose a capture in seconds and suggest corrections."""
 
 import json
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,20 +11,23 @@ from typing import Annotated, Any
 
 from tyro.conf import arg
 
-from apps.checks.capture_validation import (
+from apps.capture_validation import (
     GOOD_EDGE_RATIO,
     CaptureValidation,
     check_capture,
-    json_number,
+    check_command,
 )
-from apps.checks.contact_sheet import write_contact_sheet
-from apps.checks.corrected_capture import check_new_or_empty, write_corrected_capture
-from apps.checks.preflight_check import check_command
-from apps.cli.capture_options import CaptureArguments, Flag, capture_name
-from apps.cli.command_line import parse_arguments
+from apps.cli.command_line import BAD_INPUT, DONE, parse_arguments, run_command
 from apps.cli.console import Console
-from apps.cli.exit_codes import BAD_INPUT, DONE, run_command
-from apps.cli.output_paths import check_disjoint_from_inputs, check_output_file
+from apps.cli.shared_options import (
+    CaptureArguments,
+    Flag,
+    capture_name,
+    check_disjoint_from_inputs,
+    check_output_file,
+)
+from apps.contact_sheet import write_contact_sheet
+from apps.corrected_capture import check_new_or_empty, write_corrected_capture
 from apps.tracking.person_tracking import (
     grade_capture,
     needs_tracking,
@@ -163,6 +167,11 @@ def _check_inputs(arguments: CheckArguments, inputs: CaptureInputs, console: Con
     return DONE if good and check_result.verdict != "unusable" else BAD_INPUT
 
 
+def _json_number(value: float | None) -> float | None:
+    """Round a number for JSON; NaN and infinity become null."""
+    return None if value is None or not math.isfinite(value) else round(float(value), 4)
+
+
 def check_to_json(check_result: CaptureValidation) -> dict[str, Any]:
     """Convert a diagnosis to JSON; IoUs are null without masks, `edges` is null with masks."""
     diagnosis = check_result.diagnosis
@@ -174,13 +183,13 @@ def check_to_json(check_result: CaptureValidation) -> dict[str, Any]:
         "verdict": check_result.verdict,
         "cause": check_result.causes[0] if check_result.causes else None,
         "iou": {
-            "now": json_number(check_result.stored_iou),
-            "after_fix": json_number(check_result.corrected_iou),
+            "now": _json_number(check_result.stored_iou),
+            "after_fix": _json_number(check_result.corrected_iou),
         },
         "tried": [
             {
                 "cause": guess.correction.cause,
-                "iou": json_number(guess.mean_score),
+                "iou": _json_number(guess.mean_score),
                 "words": guess.correction.description,
             }
             for guess in tried
@@ -188,12 +197,12 @@ def check_to_json(check_result: CaptureValidation) -> dict[str, Any]:
         "film": None
         if film is None
         else {
-            "now": json_number(film.score_before),
-            "after_fix": json_number(film.score_after),
+            "now": _json_number(film.score_before),
+            "after_fix": _json_number(film.score_after),
             "tried": [
                 {
                     "cause": guess.correction.cause,
-                    "score": json_number(guess.mean_score),
+                    "score": _json_number(guess.mean_score),
                     "words": guess.correction.description,
                 }
                 for guess in film.candidates
@@ -202,7 +211,7 @@ def check_to_json(check_result: CaptureValidation) -> dict[str, Any]:
         "corrections": [{"cause": cure.cause, "words": cure.description} for cure in cures],
         "anomalies": list(check_result.anomalies),
         "refused": check_result.refusal,
-        "edges": json_number(check_result.edge_ratio),
+        "edges": _json_number(check_result.edge_ratio),
     }
 
 

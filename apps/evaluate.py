@@ -6,16 +6,22 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from apps.cli.capture_options import parse_frame_range
-from apps.cli.command_line import parse_arguments
+from apps.cli.command_line import (
+    DONE,
+    INTERRUPTED,
+    NO_AVATAR,
+    CommandExit,
+    parse_arguments,
+    run_command,
+)
 from apps.cli.console import Console
-from apps.cli.exit_codes import DONE, INTERRUPTED, NO_AVATAR, CommandExit, run_command
+from apps.cli.shared_options import parse_frame_range
 from apps.evaluation.evaluate_arguments import EvaluateArguments
 from apps.run.run_folder import RunFolder
 from capture.input_error import InputError
 
 if TYPE_CHECKING:  # torch is loaded after --help has been answered
-    from apps.evaluation.dataset_subject import DatasetSubject, SplitFrames
+    from apps.evaluation.datasets import DatasetSubject, SplitFrames
     from apps.evaluation.evaluation_session import EvaluationSession
     from apps.evaluation.score_table import AvatarEvaluation
 
@@ -35,7 +41,7 @@ def evaluate(arguments: EvaluateArguments, console: Console) -> int:
     """
     arguments.validate()
     with console.status("loading torch"):
-        from apps.cli.interrupt import stop_on_interrupt
+        from apps.cli.command_line import stop_on_interrupt
         from apps.evaluation.evaluation_session import EvaluationSession
         from apps.evaluation.score_table import evaluations_to_json, markdown_table
         from capture.atomic_files import write_text_atomically
@@ -69,8 +75,7 @@ def evaluate(arguments: EvaluateArguments, console: Console) -> int:
 
 
 def _evaluate_all(session: "EvaluationSession") -> "Iterator[AvatarEvaluation]":
-    from apps.evaluation.neuman import find_neuman
-    from apps.evaluation.people_snapshot import find_people_snapshot
+    from apps.evaluation.datasets import find_neuman, find_people_snapshot
 
     arguments, stop = session.arguments, session.stop
     for path in arguments.targets:

@@ -6,21 +6,24 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from apps.animation.driving_motion import demo_motion
-from apps.cli.command_line import parse_arguments
+from apps.animation.driving_motion import demo_motion, load_driving_motion, pose_rate
+from apps.cli.command_line import DONE, NO_AVATAR, CommandExit, parse_arguments, run_command
 from apps.cli.console import Console
-from apps.cli.exit_codes import DONE, NO_AVATAR, CommandExit, run_command
-from apps.cli.output_paths import check_output_file
+from apps.cli.shared_options import check_output_file
 from apps.run.run_folder import RunFolder
 from capture.atomic_files import atomic_file
 from capture.camera import Camera
 from capture.input_error import InputError
-from preprocess.body.body_pose import BodyPose
+from export.gltf import SkeletonAnimation, encode_glb
+from export.package.manifest import Manifest
+from export.package.package_file import read_package
+from export.skinned_mesh import SkinnedMesh, extract_mesh
+from preprocess.body.body_pose import BodyPose, Motion
 
 if TYPE_CHECKING:  # torch is loaded after --help has been answered
     from avatar.rig import Rig
@@ -124,12 +127,51 @@ def export(arguments: ExportArguments, console: Console) -> int:
 
 
 def _export_mesh(arguments: ExportArguments, package: Path, console: Console) -> None:
-    from apps.animation.mesh_writer import write_mesh
+    """Write a mesh of a package in the format of --to, whole or not at all."""
+    held = read_package(package)
+    motion = demo_motion()
+    if arguments.poses is not None:
+        joints = held.manifest.rest_joints
+        motion = load_driving_motion(arguments.poses, joints, console, person=arguments.person)
+    to_glb, out = arguments.to == "glb", arguments.out
+    with console.status("extracting the surface"):
+        mesh = extract_mesh(
+            held.tables["hq"],
+            triangles=arguments.triangles,
+            textured=to_glb and arguments.triangles is not None,
+        )
+        if to_glb:
+            content = _encode_animated(mesh, held.manifest, motion, out.stem)
+        else:
+            content = _encode_static(mesh, arguments.to)
+    with atomic_file(out, replace=arguments.overwrite) as part:
+        part.write_bytes(content)
+    console.info(f"{len(mesh.positions):,} vertices, {len(mesh.faces):,} triangles.")
 
-    write_mesh(
-        package, arguments.out, console, poses=arguments.poses, name=arguments.out.stem,
-        person=arguments.person, triangles=arguments.triangles, replace=arguments.overwrite,
-    )  # fmt: skip
+
+def _encode_animated(mesh: SkinnedMesh, manifest: Manifest, motion: Motion, name: str) -> bytes:
+    rows = tuple(int(row) for row in np.flatnonzero(motion.valid))
+    animation = SkeletonAnimation.of(motion, rows, pose_rate(motion), manifest.rest_joints[0])
+    return encode_glb(mesh, manifest, animation, name=name)
+
+
+def _encode_static(mesh: SkinnedMesh, kind: str) -> bytes:
+    """Encode the canonical pose; colors are sRGB, as programs take a PLY's to be."""
+    import trimesh  # missing in an installation of the player alone
+
+    options: dict[str, Any] = {
+        "ply": {"vertex_normal": True},
+        "obj": {"include_normals": True},
+    }[kind]
+    solid = trimesh.Trimesh(
+        vertices=mesh.positions,
+        faces=mesh.faces,
+        vertex_normals=mesh.normals,
+        vertex_colors=mesh.colors,
+        process=False,
+    )
+    content = solid.export(file_type=kind, **options)
+    return content if isinstance(content, bytes) else str(content).encode()
 
 
 def _export_package(folder: Path, out: Path, console: Console, *, fine_tune: bool = True) -> None:
@@ -148,7 +190,7 @@ def _export_package(folder: Path, out: Path, console: Console, *, fine_tune: boo
     with console.status("loading the checkpoint"):
         import torch
 
-        from apps.run.package_snapshot import write_package_snapshot
+        from apps.run.snapshot_writer import write_package_snapshot
         from avatar.training import checkpoint
 
         trainer, _ = checkpoint.load(run.checkpoint, torch.device("cpu"))

@@ -6,11 +6,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 
-from apps.checks.preflight_check import correction_hint, preflight_check
-from apps.cli.command_line import fill_optional_port, parse_arguments
+from apps.capture_validation import correction_hint, preflight_check
+from apps.cli.command_line import (
+    BAD_INPUT,
+    DONE,
+    CommandExit,
+    exit_on_interrupt,
+    fill_optional_port,
+    parse_arguments,
+    run_command,
+)
 from apps.cli.console import Console
-from apps.cli.exit_codes import BAD_INPUT, DONE, CommandExit, run_command
-from apps.cli.interrupt import exit_on_interrupt
 from apps.run.camera_solving import start_camera_solving
 from apps.run.ingest_arguments import PROGRAM, VIEW_PORT, IngestArguments
 from apps.run.run_folder import RunFolder
@@ -52,7 +58,7 @@ def ingest(arguments: IngestArguments, console: Console) -> int:
         capture = _fit_to_masks(arguments, capture, run, console)
         with start_camera_solving(arguments.solve_job(capture), capture, run) as solving:
             threads = threads or _load_trainer_code(arguments, run, console)
-            from apps.run.report_writer import print_results, write_report
+            from apps.report.report_writer import print_results, write_report
             from apps.run.session_start import start_session
 
             capture = solving.wait_before_training(capture, console)
@@ -84,7 +90,8 @@ def _load_trainer_code(arguments: IngestArguments, run: RunFolder, console: Cons
     """Import torch and load the compiled kernels; return the number of threads."""
     with exit_on_interrupt(console, PROGRAM, run.release):
         with console.status("loading torch"):
-            from apps.run import report_writer, training_session  # noqa: F401
+            from apps.report import report_writer  # noqa: F401
+            from apps.run import training_session  # noqa: F401
             from apps.run.session_start import load_kernels
         return load_kernels(arguments, console)
 

@@ -8,13 +8,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from apps.animation.play_arguments import DEFAULT_TURN_S, WEB_PORT, PlayArguments
-from apps.cli.command_line import fill_optional_number, fill_optional_port, parse_arguments
+from apps.cli.command_line import (
+    BAD_INPUT,
+    DONE,
+    INTERRUPTED,
+    fill_optional_number,
+    fill_optional_port,
+    parse_arguments,
+    run_command,
+)
 from apps.cli.console import Console
-from apps.cli.exit_codes import BAD_INPUT, DONE, INTERRUPTED, run_command
 from capture.input_error import InputError
 
 if TYPE_CHECKING:  # onnxruntime is loaded after --help has been answered
-    from apps.animation.render_sequence import RenderSequence
+    from apps.animation.clip_rendering import RenderSequence
     from export.player import Player
 
 
@@ -44,16 +51,16 @@ def play(arguments: PlayArguments, console: Console) -> int:
 
 
 def _render_clip(arguments: PlayArguments, console: Console) -> int:
-    from apps.animation.clip_writer import (
+    from apps.animation.clip_rendering import (
         MAX_GIF_FPS,
         TRANSPARENT,
         background_compositor,
         check_clip_path,
         choose_encoder,
+        plan_render,
         write_clip,
     )
-    from apps.animation.render_sequence import plan_render
-    from apps.cli.interrupt import stop_on_interrupt
+    from apps.cli.command_line import stop_on_interrupt
     from export.player import Player
 
     out = arguments.output_path
@@ -113,15 +120,15 @@ def _describe_clip(shots: "RenderSequence", count: int) -> str:
 
 
 def _print_package_warnings(player: "Player", console: Console) -> None:
-    from apps.animation.package_verification import package_warnings
+    from apps.animation.player_checks import package_warnings
 
     for note in package_warnings(player.manifest):
         console.warning(note)
 
 
 def _run_benchmark(arguments: PlayArguments, console: Console) -> int:
-    from apps.animation.player_timing import benchmark_player
-    from apps.animation.render_sequence import plan_render
+    from apps.animation.clip_rendering import plan_render
+    from apps.animation.player_checks import benchmark_player
     from capture.atomic_files import write_text_atomically
     from export.player import Player
 
@@ -156,7 +163,7 @@ def _format_workers(workers: int) -> str:
 def _run_web(arguments: PlayArguments, port: int, console: Console) -> int:
     from apps.animation.driving_motion import demo_motion, load_driving_motion, pose_rate
     from apps.animation.web_server import serve_site, web_clip, write_site
-    from apps.cli.output_paths import check_output_folder
+    from apps.cli.shared_options import check_output_folder
     from export.player import Player
     from export.player_page import build_page, runtime_files
 
@@ -192,7 +199,7 @@ def _run_web(arguments: PlayArguments, port: int, console: Console) -> int:
 
 
 def _run_verification(arguments: PlayArguments, console: Console) -> int:
-    from apps.animation.package_verification import verify_package
+    from apps.animation.player_checks import verify_package
     from capture.atomic_files import write_text_atomically
 
     verdict = verify_package(arguments.avatar, provider=arguments.provider)

@@ -9,10 +9,9 @@ from typing import Annotated
 
 import tyro
 
-from apps.cli.command_line import parse_arguments
+from apps.cli.command_line import DONE, parse_arguments, run_command
 from apps.cli.console import Console
-from apps.cli.exit_codes import DONE, run_command
-from apps.cli.output_paths import check_output_folder
+from apps.cli.shared_options import check_output_folder
 from studio.shoot_config import ShootConfig
 
 

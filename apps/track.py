@@ -13,20 +13,19 @@ from typing import Annotated
 import numpy as np
 from tyro.conf import Positional, arg
 
-from apps.cli.capture_options import (
+from apps.cli.command_line import DONE, INTERRUPTED, parse_arguments, run_command, stop_on_interrupt
+from apps.cli.console import Console
+from apps.cli.shared_options import (
     Flag,
     capture_name,
+    check_output_file,
+    check_output_folder,
     format_frame_range,
     option_words,
     parse_frame_range,
+    unused_path,
 )
-from apps.cli.command_line import parse_arguments
-from apps.cli.console import Console
-from apps.cli.exit_codes import DONE, INTERRUPTED, run_command
-from apps.cli.interrupt import stop_on_interrupt
-from apps.cli.output_paths import check_output_file, check_output_folder, unused_path
-from apps.run.run_folder import RunFolder
-from apps.run.run_lock import claim_folder
+from apps.run.run_folder import RunFolder, claim_folder
 from apps.tracking.person_tracking import masks_to_use, print_grade, track_person
 from apps.tracking.skeleton_film import write_skeleton_film
 from capture.atomic_files import OutputFileList, write_text_atomically

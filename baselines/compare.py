@@ -11,10 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from apps.cli.command_line import parse_arguments
+from apps.cli.command_line import DONE, INTERRUPTED, parse_arguments, run_command, stop_on_interrupt
 from apps.cli.console import Console
-from apps.cli.exit_codes import DONE, INTERRUPTED, run_command
-from apps.cli.interrupt import stop_on_interrupt
 from baselines.comparison_table import comparison_table
 from capture.atomic_files import OutputFileList, atomic_file, atomic_folder, write_text_atomically
 from capture.input_error import InputError
@@ -165,7 +163,7 @@ def compare(arguments: CompareArguments, console: Console) -> int:
 
 def _is_done(arguments: CompareArguments, name: str) -> bool:
     """Whether a method was trained before, under the same conditions, and is to be kept."""
-    from apps.report.hardware import Hardware
+    from apps.cli.hardware import Hardware
 
     scores = arguments.out / name / "scores.json"
     kept = json.loads(scores.read_text()) if scores.is_file() else {}
@@ -193,7 +191,7 @@ def _train_method(
     stop: threading.Event,
 ) -> None:
     """Trains a method, and writes its folder whole; nothing if it is stopped."""
-    from apps.report.hardware import Hardware
+    from apps.cli.hardware import Hardware
     from baselines.comparison_scores import curve_point, score_all
     from baselines.systems.compared_systems import make_system, train_config
 

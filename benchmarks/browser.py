@@ -21,10 +21,9 @@ import tyro
 from jaxtyping import Float
 from tyro.conf import Positional
 
-from apps.animation.driving_motion import demo_motion
-from apps.animation.following_camera import FollowingCamera
+from apps.animation.driving_motion import FollowingCamera, demo_motion
 from apps.animation.web_server import make_server, web_clip
-from apps.cli.exit_codes import run_command
+from apps.cli.command_line import run_command
 from benchmarks.hardware import Hardware
 from benchmarks.measurements import Measurement, markdown_rows
 from benchmarks.stopwatch import limit_threads

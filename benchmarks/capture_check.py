@@ -13,7 +13,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from apps.checks.capture_validation import check_capture
+from apps.capture_validation import check_capture
 from benchmarks import capture_corruptions as corrupt
 from benchmarks.capture_corruptions import CorruptedCapture, Corruption
 from benchmarks.hardware import Hardware

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import tyro
 
-from apps.report.learning_curve import CurvePoint, largest_drop
+from apps.report.report_figures import CurvePoint, largest_drop
 from avatar.evaluation.image_metrics import composite_on_white, ground_truth_on_white, psnr, ssim
 from benchmarks.hardware import ROOT, Hardware
 from export.player import Player, premultiply

@@ -20,7 +20,7 @@ def main() -> None:
 
     import torch
 
-    from apps.cli.device import set_threads
+    from apps.run.session_start import set_threads
     from avatar.config import TrainConfig
     from avatar.evaluation.held_out import HeldOutFrame
     from avatar.events import Stepped

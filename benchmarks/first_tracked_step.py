@@ -17,7 +17,6 @@ from apps.cli.command_line import parse_arguments
 from apps.cli.console import Console
 from apps.run.ingest_arguments import IngestArguments
 from apps.run.session_start import load_kernels, prepare_trainer
-from apps.run.training_observer import ObservableSession
 from apps.run.training_session import TrainingSession
 from avatar.events import Stepped, TrainEvent
 from preprocess.observation import Observation
@@ -45,7 +44,7 @@ class FirstStep:
             self.at, self.cpu_s = time.perf_counter(), time.process_time()
             self._stop.set()
 
-    def between_steps(self, session: ObservableSession) -> None:
+    def between_steps(self, session: TrainingSession) -> None:
         """Not needed."""
 
 

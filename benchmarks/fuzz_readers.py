@@ -94,7 +94,7 @@ def write_mutated_file(
 
 def readers(seeds: Path) -> dict[str, Callable[[Path], object]]:
     """What each kind of file is read by, as the commands do."""
-    from apps.checks.capture_validation import check_capture
+    from apps.capture_validation import check_capture
     from capture.source_opening import open_source
     from export.player import Player
     from preprocess.body.parametric_body import load_body_model, read_shaped_body

@@ -1,4 +1,4 @@
 """What a measurement was made on, and the root of the checkout."""
 
-from apps.report.hardware import ROOT as ROOT
-from apps.report.hardware import Hardware as Hardware
+from apps.cli.hardware import ROOT as ROOT
+from apps.cli.hardware import Hardware as Hardware

@@ -22,7 +22,7 @@ from pathlib import Path
 import torch
 import tyro
 
-from apps.cli.exit_codes import run_command
+from apps.cli.command_line import run_command
 from avatar.training import checkpoint
 from avatar.training.trainer import Trainer
 from benchmarks.hardware import ROOT, Hardware

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from apps.animation.player_timing import PlayerTiming, benchmark_player
-from apps.run.package_snapshot import write_package_snapshot
+from apps.animation.player_checks import PlayerTiming, benchmark_player
+from apps.run.snapshot_writer import write_package_snapshot
 from avatar.training.trainer import Trainer
 from benchmarks.hardware import ROOT
 from benchmarks.measurements import Measurement

@@ -21,7 +21,7 @@ from typing import Any, Literal, final
 import cv2
 import tyro
 
-from apps.cli.exit_codes import INTERRUPTED, run_command
+from apps.cli.command_line import INTERRUPTED, run_command
 from benchmarks.hardware import ROOT
 from benchmarks.results_page import BEGIN, END, ComparedSample, results_lines
 from capture.atomic_files import write_text_atomically

@@ -18,8 +18,8 @@ from typing import Literal
 import torch
 import tyro
 
-from apps.cli.device import resolve_device
-from apps.cli.exit_codes import run_command
+from apps.cli.command_line import run_command
+from apps.run.session_start import resolve_device
 from avatar.rig import Rig
 from benchmarks.builds import build_marks
 from benchmarks.correspondence_lookup import warp_marks

@@ -187,12 +187,8 @@ def _open_device(address: str) -> cv2.VideoCapture:
         raise PermissionError(errno.EACCES, "Permission denied", str(device))
     if device.is_char_device():
         raise OSError(errno.EBUSY, "another program may be using it", str(device))
-    there = ", ".join(sorted(path.name.removeprefix("video") for path in _list_devices())) or "none"
+    there = ", ".join(sorted(path.name[5:] for path in Path("/dev").glob("video[0-9]*"))) or "none"
     raise InputError(
         f"There is no camera {address!r} that can be opened; cameras of this machine: {there}. "
         "Expected camera:0, camera:/dev/video2, or a stream's address, as in camera:rtsp://…"
     )
-
-
-def _list_devices() -> list[Path]:
-    return list(Path("/dev").glob("video[0-9]*"))

@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from capture.input_error import InputError
-from capture.source import Frame, FrameSelection
+from capture.source import Frame, FrameSelection, Recording
 
 LOG_LEVEL_SILENT = 0
 """OpenCV's log level that prints nothing: our messages explain what is wrong with a file."""
@@ -201,14 +201,8 @@ def _is_complete(data: bytes) -> bool:
     return True
 
 
-class ImageFolder:
+class ImageFolder(Recording):
     """A folder of pictures; picture i was taken at i / 30 s."""
-
-    live = False
-    paced = False
-    started_at = 0.0
-    waited_s = 0.0
-    dropped = 0
 
     def __init__(self, path: Path, selection: FrameSelection) -> None:
         """Lists the folder and reads the first picture that can be read.
@@ -216,9 +210,7 @@ class ImageFolder:
         Raises:
             InputError: If there is none, or none is wanted.
         """
-        self.path = path
-        self.selection = selection
-        self.warnings: list[str] = []
+        super().__init__(path, selection)
         self._images = list_images(path)
         self.frames_in_file = len(self._images)
         self.frame_count: int | None = selection.count(self.frames_in_file)
@@ -259,9 +251,6 @@ class ImageFolder:
         """How many pictures the folder holds."""
         return len(self._images)
 
-    def close(self) -> None:
-        """Nothing is held open."""
-
     def _look(self) -> tuple[tuple[int, int], int]:
         """Size of the first picture that can be read, and by how many quarters it is turned."""
         for path in self._images:
@@ -272,7 +261,3 @@ class ImageFolder:
             turns = EXIF_QUARTER_TURNS.get(exif_orientation(path.read_bytes()), 0)
             return (rgb.shape[1], rgb.shape[0]), turns
         raise InputError(f"None of the {len(self._images)} pictures in {self.path} can be decoded.")
-
-    def _warn(self, message: str) -> None:
-        if message not in self.warnings:
-            self.warnings.append(message)

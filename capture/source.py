@@ -154,11 +154,30 @@ class FrameSource(Protocol):
         ...
 
 
+class Recording:
+    """What a video file and a folder of pictures have in common: nothing waits or is lost."""
+
+    live = paced = False
+    started_at = waited_s = 0.0
+    dropped = 0
+
+    def __init__(self, path: Path, selection: FrameSelection) -> None:
+        """Nothing is read yet; see `FrameSource` for the arguments."""
+        self.path, self.selection = path, selection
+        self.warnings: list[str] = []
+
+    def close(self) -> None:
+        """Nothing is held open but by `frames()`, which lets it go itself."""
+
+    def _warn(self, message: str) -> None:
+        if message not in self.warnings:
+            self.warnings.append(message)
+
+
 class _WrappedSource:
     """A recording whose size or times are changed; all else is the recording's own."""
 
-    live = False
-    paced = False
+    live = paced = False
 
     def __init__(self, source: FrameSource) -> None:
         self._source = source

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from capture.input_error import InputError
-from capture.source import Frame, FrameSelection
+from capture.source import Frame, FrameSelection, Recording
 from capture.video_decoder import DecoderFrame, open_decoder, read_hdr_transfer
 
 VIDEO_SUFFIXES = frozenset(
@@ -23,7 +23,7 @@ MAX_PIXEL_STRETCH = 0.02
 """Relative difference of a pixel's width and height from which it is worth a word."""
 
 
-class VideoFile:
+class VideoFile(Recording):
     """A recorded video, whose rotation flag is applied.
 
     A file that ends early or has gaps is read as far as it goes, with a warning. Known limit:
@@ -35,11 +35,6 @@ class VideoFile:
     """
 
     has_alpha = False
-    live = False
-    paced = False
-    started_at = 0.0
-    waited_s = 0.0
-    dropped = 0
 
     def __init__(self, path: Path, selection: FrameSelection) -> None:
         """Opens the file and decodes one frame.
@@ -47,9 +42,7 @@ class VideoFile:
         Raises:
             InputError: If no frame can be decoded, or none is wanted.
         """
-        self.path = path
-        self.selection = selection
-        self.warnings: list[str] = []
+        super().__init__(path, selection)
         self._decoder = open_decoder(path)
         self.quarter_turns = self._decoder.quarter_turns
         self.has_unread_alpha = self._decoder.has_unread_alpha
@@ -88,9 +81,6 @@ class VideoFile:
     def count_frames(self) -> int:
         """How many frames can be decoded, found by doing so."""
         return sum(1 for _ in self._decoder.decode())
-
-    def close(self) -> None:
-        """Nothing is held open but by `frames()`, which lets it go itself."""
 
     def _numbered(self) -> Iterator[tuple[int, DecoderFrame]]:
         """Every picture with its number; where some are lost, an even rate tells how many."""
@@ -146,10 +136,6 @@ class VideoFile:
                 f"too {kind} in them, and so is the avatar. Convert the video first: ffmpeg -i "
                 f"{shlex.quote(self.path.name)} -vf scale=iw*sar:ih,setsar=1 square.mp4"
             )
-
-    def _warn(self, message: str) -> None:
-        if message not in self.warnings:
-            self.warnings.append(message)
 
 
 def _frame_flags(

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -74,26 +75,23 @@ def video_encoder(suffix: str, *, transparent: bool) -> ClipEncoder:
         layout = "yuva420p" if transparent else "yuv420p"
         return ClipEncoder(
             description=name,
-            write=lambda path, pictures, fps: _write_av(
-                path, pictures, fps, codec=codec, options=options, layout=layout
-            ),
+            write=partial(_write_av, codec=codec, options=options, layout=layout),
         )
     if transparent:
         raise InputError(
             "--background transparent: .webm with alpha needs PyAV. Install it "
             f"({VIDEO_EXTRA_INSTALL}), or write .webp, .gif or a folder of frames."
         )
-    if suffix == ".mp4":
-        if _opencv_has("avc1"):
-            return ClipEncoder(
-                description="H.264, which plays everywhere", write=_opencv_writer("avc1")
-            )
-        said = (
+    code, description = "VP80", "VP8, which browsers play"
+    if suffix == ".mp4" and _opencv_has("avc1"):
+        code, description = "avc1", "H.264, which plays everywhere"
+    elif suffix == ".mp4":
+        code = "mp4v"
+        description = (
             "MPEG-4 part 2, for there is no H.264 encoder here: browsers do not play it; .webm "
             f"they do, and {VIDEO_EXTRA_INSTALL} brings H.264"
         )
-        return ClipEncoder(description=said, write=_opencv_writer("mp4v"))
-    return ClipEncoder(description="VP8, which browsers play", write=_opencv_writer("VP80"))
+    return ClipEncoder(description=description, write=partial(_write_opencv, code=code))
 
 
 def _pyav_has(codec: str) -> bool:
@@ -142,10 +140,6 @@ def _write_av(
             count += 1
         file.mux(stream.encode(None))
     return count
-
-
-def _opencv_writer(code: str) -> Callable[[Path, Iterator[Pixels], float], int]:
-    return lambda path, pictures, fps: _write_opencv(path, pictures, fps, code)
 
 
 def _opencv_has(code: str) -> bool:

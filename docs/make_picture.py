@@ -8,8 +8,8 @@ import numpy as np
 import tyro
 from PIL import Image
 
-from apps.animation.clip_writer import background_compositor
-from apps.animation.following_camera import FollowingCamera
+from apps.animation.clip_rendering import background_compositor
+from apps.animation.driving_motion import FollowingCamera
 from capture.atomic_files import atomic_file
 from capture.source_opening import open_source
 from export.player import Player

@@ -381,11 +381,7 @@ class Actor:
         Args:
             lamp_strength: Of the lamp, as a factor of color; without it the sky's light remains.
         """
-        pose = BodyPose(
-            root_rotation=np.zeros(3),
-            root_translation=np.zeros(3),
-            joint_rotations=A_POSE.reshape(23, 3),
-        )
+        pose = replace(BodyPose.rest(), joint_rotations=A_POSE.reshape(23, 3))
         points = self.vertices(pose)
         light = bake_light(
             points,

@@ -1,19 +1,28 @@
-"""ia-play --web: the player page, served on the loopback address or written as a folder."""
+"""ia-play --web: the player page, served on the loopback address or written as a folder.
+
+Run as a module (`make web`), it fetches onnxruntime-web with npm, which the page needs.
+"""
 
 import errno
+import shutil
+import subprocess
+import sys
+import tempfile
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
 
-from apps.animation.following_camera import FollowingCamera
+from apps.animation.driving_motion import FollowingCamera
+from apps.cli.command_line import DONE, interrupt_event, parse_arguments, run_command
 from apps.cli.console import Console
-from apps.cli.interrupt import interrupt_event
 from capture.atomic_files import atomic_folder
 from capture.input_error import InputError
+from export import player_page
 from export.player import Player
 from export.player_page import PageMotion, StartView, flatten_pose
 from preprocess.body.body_pose import Motion
@@ -132,3 +141,58 @@ def _handler(files: Mapping[str, bytes]) -> type[BaseHTTPRequestHandler]:
             """Log nothing: the console is for the user."""
 
     return Handler
+
+
+PROGRAM = "python -m apps.animation.web_server"
+"""Name of the command in its --help."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FetchArguments:
+    """Fetch the pinned release of onnxruntime-web that `ia-play --web` needs (`make web`).
+
+    npm downloads it once (33 MB); its checksum is verified, and it is stored next to the page. An
+    existing copy is kept.
+
+    Exit codes: 0 done; 2 npm is missing or failed; 3 disk full; 130 Ctrl-C.
+    """
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    parse_arguments(FetchArguments, PROGRAM, argv)
+    return run_command("make web", lambda: fetch_runtime(Console()))
+
+
+def fetch_runtime(console: Console) -> int:
+    """Fetch, verify and store the pinned release, unless it exists.
+
+    Raises:
+        InputError: If npm is missing or fails, or the checksum differs.
+    """
+    try:
+        player_page.runtime_files()
+    except InputError:
+        with console.status(f"fetching onnxruntime-web {player_page.ORT_WEB_VERSION}"):
+            player_page.install_runtime(_fetch_tarball())
+    console.print_artifact("onnxruntime-web", player_page.RUNTIME_FOLDER)
+    return DONE
+
+
+def _fetch_tarball() -> bytes:
+    npm = shutil.which("npm")
+    if npm is None:
+        raise InputError("npm was not found. Install Node.js, which includes it, and try again.")
+    with tempfile.TemporaryDirectory() as folder:
+        package = f"onnxruntime-web@{player_page.ORT_WEB_VERSION}"
+        command = [npm, "pack", package, "--ignore-scripts", "--pack-destination", folder]
+        done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=folder)
+        found = list(Path(folder).glob("*.tgz"))
+        if done.returncode or len(found) != 1:
+            lines = done.stderr.strip().splitlines() or ["no reason given"]
+            raise InputError(f"npm could not fetch {package}: {lines[-1]}")
+        return found[0].read_bytes()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

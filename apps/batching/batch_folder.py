@@ -25,9 +25,9 @@ from apps.batching.remote_files import (
     read_text,
     send_files,
 )
+from apps.cli.command_line import RESOURCE_UNAVAILABLE, CommandExit
 from apps.cli.console import Console
-from apps.cli.exit_codes import RESOURCE_UNAVAILABLE, CommandExit
-from apps.run.run_lock import claim_folder
+from apps.run.run_folder import claim_folder
 from capture.atomic_files import (
     OutputFileList,
     atomic_folder,

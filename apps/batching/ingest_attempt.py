@@ -15,14 +15,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from apps.batching.node_resources import (
-    describe_machine,
-    total_memory_mb,
-    tree_memory_mb,
-    work_folder,
-)
-from apps.batching.remote_files import fetch_inputs, send_files
-from apps.cli.exit_codes import BAD_INPUT, DONE
+from apps.batching.remote_files import fetch_inputs, send_files, work_folder
+from apps.cli.command_line import BAD_INPUT, DONE
+from apps.cli.hardware import describe_machine, total_memory_mb, tree_memory_mb
 from capture.input_error import InputError
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -1,22 +1,38 @@
-"""Files behind URLs (s3://, gs://, http://, …), through fsspec; credentials are the environment's.
+"""Files behind URLs (s3://, gs://, http://, …), and the folders on a node's disk for fetched ones.
 
-Local folders are listed in the same form, so that captures are found in both alike.
+URLs are read through fsspec; credentials are the environment's. Local folders are listed in the
+same form, so that captures are found in both alike.
 """
 
 import os
 import re
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from apps.cli.exit_codes import CommandExit
+from apps.cli.command_line import CommandExit
 from capture.input_error import InputError
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
 
 URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
 """Start of a URL."""
 VERSION_KEYS = ("ETag", "etag", "md5Hash", "LastModified", "updated", "mtime", "created")
 """What tells that a remote file has changed, best first."""
+WORK_PREFIX = "ia-batch-"
+"""Start of the names of work folders on a node's disk."""
+WORK_PATTERN = re.compile(rf"{WORK_PREFIX}\d+-\d+")
+"""Names of work folders: process and time."""
+LOCK_NAME = "in-use"
+"""File in a work folder: locked as long as its process lives; holds the bytes it has reserved."""
+DISK_POLL_S = 0.5
+"""Interval at which a full disk budget is looked at again, seconds."""
 
 
 class RemoteFileError(OSError):
@@ -180,3 +196,81 @@ def explain_errors(url: str, verb: str) -> Iterator[None]:
     except Exception as error:  # each file system has errors of its own
         message = f"cannot {verb} {url}: {type(error).__name__}: {error}"
         raise RemoteFileError(message) from error
+
+
+@contextmanager
+def work_folder(
+    place: Path, wanted_bytes: int, budget_bytes: int | None, stopped: Callable[[], bool]
+) -> Iterator[Path]:
+    """Make a folder on this node's disk for one attempt, and remove it afterwards.
+
+    Folders of processes that were killed are removed as well: their locks are gone.
+
+    Args:
+        place: Folder for work folders, used by all attempts on this node.
+        wanted_bytes: What will be fetched into the folder.
+        budget_bytes: What all attempts on this node may have fetched at a time; None for any.
+            Waits until there is room.
+        stopped: Whether to give up waiting.
+
+    Raises:
+        InputError: If a capture alone exceeds the budget.
+    """
+    if budget_bytes is not None and wanted_bytes > budget_bytes:
+        raise InputError(
+            f"The capture has {wanted_bytes / 1e9:.2f} GB, but --disk allows "
+            f"{budget_bytes / 1e9:.2f} GB on a node. Increase --disk."
+        )
+    place.mkdir(parents=True, exist_ok=True)
+    folder, descriptor = _reserve(place, wanted_bytes, budget_bytes, stopped)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        os.close(descriptor)
+
+
+def _reserve(
+    place: Path, wanted: int, budget: int | None, stopped: Callable[[], bool]
+) -> tuple[Path, int]:
+    """Wait for room, then make a folder with a locked file; one process at a time decides."""
+    while True:
+        with _locked(place / LOCK_NAME):
+            held = sum(_reserved_or_remove(folder) for folder in place.glob(f"{WORK_PREFIX}*"))
+            if budget is None or held + wanted <= budget or stopped():
+                folder = place / f"{WORK_PREFIX}{os.getpid()}-{time.monotonic_ns()}"
+                folder.mkdir()
+                descriptor = os.open(folder / LOCK_NAME, os.O_RDWR | os.O_CREAT, 0o666)
+                if fcntl is not None:
+                    fcntl.flock(descriptor, fcntl.LOCK_EX)
+                os.write(descriptor, str(wanted).encode())
+                return folder, descriptor
+        time.sleep(DISK_POLL_S)
+
+
+def _reserved_or_remove(folder: Path) -> int:
+    """Return the bytes that a work folder has reserved; remove it if its process is gone."""
+    if WORK_PATTERN.fullmatch(folder.name) is None or folder.is_symlink():
+        return 0  # a user's, who likes the name
+    try:
+        with (folder / LOCK_NAME).open("rb+") as lock:
+            if fcntl is None:
+                return int(lock.read() or 0)
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                return int(lock.read() or 0)
+    except (OSError, ValueError):  # killed before it had a lock: it is empty, or a user's
+        with suppress(OSError):
+            folder.rmdir()
+        return 0
+    shutil.rmtree(folder, ignore_errors=True)
+    return 0
+
+
+@contextmanager
+def _locked(path: Path) -> Iterator[None]:
+    with path.open("a") as file:
+        if fcntl is not None:
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield

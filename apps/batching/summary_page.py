@@ -12,9 +12,9 @@ from urllib.parse import quote
 import numpy as np
 
 from apps.batching.batch_folder import AttemptRecord, BatchFolder
+from apps.batching.batch_scheduler import CaptureState
 from apps.batching.ingest_attempt import LOG_NAME, TURNING_NAME, folder_of
-from apps.batching.live_table import CaptureState
-from apps.report.html_page import html_page, html_table
+from apps.report.report_page import html_page, html_table
 from apps.report.report_schema import format_psnr
 from capture.input_error import InputError
 

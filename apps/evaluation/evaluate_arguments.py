@@ -6,8 +6,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from apps.cli.capture_options import parse_frame_range
-from apps.cli.output_paths import check_output_file, check_output_folder
+from apps.cli.shared_options import check_output_file, check_output_folder, parse_frame_range
 from capture.input_error import InputError
 from preprocess.capture_session import CaptureInputs
 

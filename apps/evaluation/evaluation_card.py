@@ -5,7 +5,8 @@ from html import escape
 from importlib.metadata import version
 from pathlib import Path
 
-from apps.evaluation.frame_scoring import REGIONS
+from apps.cli.hardware import Hardware
+from apps.evaluation.frame_scoring import LARGEST_SHOWN_ERROR, REGIONS, choose_shown
 from apps.evaluation.score_table import (
     NOT_MEASURED,
     AvatarEvaluation,
@@ -15,10 +16,8 @@ from apps.evaluation.score_table import (
     evaluations_to_json,
     table_cells,
 )
-from apps.evaluation.shown_frames import LARGEST_SHOWN_ERROR, choose_shown
-from apps.report.hardware import Hardware
-from apps.report.html_page import html_note, html_page, html_section, html_table
-from apps.report.learning_curve import CurvePoint, curve_svg, psnr_at
+from apps.report.report_figures import CurvePoint, curve_svg, psnr_at
+from apps.report.report_page import html_note, html_page, html_section, html_table
 from apps.report.report_schema import format_psnr
 from avatar.evaluation.perceptual import LPIPS_CONVENTIONS, Lpips
 from avatar.evaluation.sharpness import overall_verdict

@@ -1,12 +1,14 @@
-"""Scores of one rendering against its frame: over the whole image, the box and the mask."""
+"""Scores of one rendering against its frame, and both as the evaluation card shows them."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import final
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float32
 
+from apps.report.report_page import to_uint8, webp_data_uri
 from avatar.evaluation.held_out import HeldOutFrame, score_rendering
 from avatar.evaluation.image_metrics import (
     SSIM_BORDER_PX,
@@ -19,6 +21,7 @@ from avatar.evaluation.image_metrics import (
 )
 from avatar.evaluation.perceptual import LPIPS_CONVENTIONS, Lpips
 from avatar.evaluation.skin_patches import SCORED_PARTS, SkinPatches, label_parts, psnr_by_part
+from avatar.events import HeldOutScore
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.observation import Observation
 
@@ -42,28 +45,16 @@ METRICS = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrameScore:
+class FrameScore(HeldOutScore):
     """Scores of one rendering against its frame, both on the same background.
 
     Attributes:
-        frame: Frame number in the video.
-        psnr: PSNR of the whole image, dB.
-        psnr_mask: PSNR where alpha > 0.5, dB.
         psnr_box: PSNR in the bounding box of the mask, dB.
-        ssim: SSIM of the whole image (Wang et al. 2004), in [-1, 1].
-        blur: Equivalent blur, as a fraction of body height (`avatar.evaluation.sharpness`).
-        overlap: Soft IoU of rendered alpha and mask, in [0, 1]; NaN without an alpha.
         cpu_ms: CPU time of rendering, over all threads; NaN if it was not rendered here.
         others: The others of `METRICS` that were measured.
     """
 
-    frame: int
-    psnr: float
-    psnr_mask: float
     psnr_box: float
-    ssim: float
-    blur: float
-    overlap: float
     cpu_ms: float
     others: Mapping[str, float] = field(default_factory=dict)
 
@@ -174,4 +165,71 @@ def _bounding_box(silhouette: Bool[np.ndarray, "height width"]) -> tuple[slice, 
     for axis in (1, 0):
         where = np.flatnonzero(silhouette.any(axis=axis))
         spans.append(slice(where[0], where[-1] + 1) if where.size else slice(0, 0))
+    return spans[0], spans[1]
+
+
+MARGIN = 0.08
+"""Width of the rim around the person, as a fraction of the box."""
+LARGEST_SHOWN_ERROR = 0.25
+"""Error that is drawn in the brightest color, of 1."""
+SHOWN_FRAMES = 6
+"""Frames that a card shows of an avatar."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ShownFrame:
+    """A frame with its rendering and the error between them.
+
+    Attributes:
+        score: Scores of the frame.
+        width: Width of each image, pixels.
+        truth, rendering, error: The images, as data URIs.
+    """
+
+    score: FrameScore
+    width: int
+    truth: str
+    rendering: str
+    error: str
+
+    @classmethod
+    def of(
+        cls,
+        observation: Observation,
+        picture: PremultipliedImage,
+        background: str,
+        score: FrameScore,
+    ) -> "ShownFrame":
+        """Encode a frame and its rendering."""
+        gray, cut = BACKGROUNDS[background], _box_with_margin(observation)
+        truth = ground_truth_over(observation, gray)[cut]
+        shown = np.clip(composite_over(picture, gray), 0.0, 1.0)[cut]
+        error = np.abs(shown - truth).mean(axis=-1) / LARGEST_SHOWN_ERROR
+        heat = cv2.applyColorMap(to_uint8(error[..., None])[..., 0], cv2.COLORMAP_INFERNO)
+        return cls(
+            score=score,
+            width=truth.shape[1],
+            truth=webp_data_uri(to_uint8(truth)),
+            rendering=webp_data_uri(to_uint8(shown)),
+            error=webp_data_uri(np.ascontiguousarray(heat[..., ::-1])),
+        )
+
+
+def choose_shown(frames: Sequence[ShownFrame]) -> list[ShownFrame]:
+    """Choose `SHOWN_FRAMES` from the worst to the best in the mask, evenly by rank."""
+    ranked = sorted(frames, key=lambda shown: shown.score.psnr_mask)
+    places = np.linspace(0, len(ranked) - 1, min(SHOWN_FRAMES, len(ranked))).round().astype(int)
+    return [ranked[place] for place in places]
+
+
+def _box_with_margin(observation: Observation) -> tuple[slice, slice]:
+    """Rows and columns around the person; the whole image without one."""
+    silhouette, spans = silhouette_of(observation), []
+    for axis in (1, 0):
+        where = np.flatnonzero(silhouette.any(axis=axis))
+        if not where.size:
+            spans.append(slice(None))
+            continue
+        rim = 2 + int(MARGIN * (where[-1] - where[0]))
+        spans.append(slice(max(0, int(where[0]) - rim), int(where[-1]) + 1 + rim))
     return spans[0], spans[1]

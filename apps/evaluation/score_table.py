@@ -8,8 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from apps.evaluation.frame_scoring import METRICS, FrameScore
-from apps.evaluation.shown_frames import ShownFrame
+from apps.evaluation.frame_scoring import METRICS, FrameScore, ShownFrame
 from apps.report.report_schema import finite_mean, to_json_value
 from avatar.evaluation.perceptual import LPIPS_CONVENTIONS
 from avatar.evaluation.sharpness import SharpnessVerdict, overall_verdict

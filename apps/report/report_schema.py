@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from apps.report.learning_curve import CurvePoint
+from apps.report.report_figures import CurvePoint
 from avatar.evaluation.coverage import Coverage
 from avatar.evaluation.coverage_advice import coverage_advice
 from avatar.evaluation.sharpness import (
@@ -19,6 +19,7 @@ from avatar.evaluation.sharpness import (
 )
 from avatar.events import HeldOutScore
 from capture.process_metrics import ReservoirSample
+from preprocess.observation import DroppedFrame
 
 REPORT_FORMAT = 1
 """Version of the format of report.json."""
@@ -31,14 +32,6 @@ class MachineInfo:
     device: str
     backend: str
     threads: int
-
-
-@dataclass(frozen=True, kw_only=True)
-class DroppedFrameEntry:
-    """A dropped frame and the reason."""
-
-    index: int
-    reason: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +50,7 @@ class FrameStats:
     read: int
     used: int
     held_out: int
-    dropped: tuple[DroppedFrameEntry, ...]
+    dropped: tuple[DroppedFrame, ...]
     near_duplicates: int
     not_replayed: int
 

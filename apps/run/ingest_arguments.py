@@ -9,8 +9,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from apps.cli.capture_options import CaptureArguments, Flag, capture_name
-from apps.cli.output_paths import check_output_file
+from apps.cli.shared_options import CaptureArguments, Flag, capture_name, check_output_file
 from apps.run.run_folder import RunFolder, is_run_report
 from apps.run.solver_process import SolveJob
 from apps.tracking.person_tracking import needs_stream_tracking, open_stream

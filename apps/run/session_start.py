@@ -1,4 +1,4 @@
-"""Start of a training session: kernels, a new, resumed or extended trainer, the viewer."""
+"""Start of a training session: device, kernels, a new, resumed or extended trainer, the viewer."""
 
 import math
 from collections.abc import Iterator
@@ -6,16 +6,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+import numba
 import torch
 
+from apps.cli.command_line import exit_on_interrupt, stop_on_interrupt
 from apps.cli.console import Console, format_duration
-from apps.cli.device import CUDA_SLOW_WARNING, resolve_device, set_threads
-from apps.cli.interrupt import exit_on_interrupt, stop_on_interrupt
-from apps.evaluation.final_scoring import SCORING_LIMIT_S
-from apps.run.continual_learning import EarlierVideos
+from apps.cli.hardware import usable_cores
+from apps.run.final_scoring import SCORING_LIMIT_S, EarlierVideos
 from apps.run.ingest_arguments import PROGRAM, IngestArguments
 from apps.run.run_folder import RunFolder
-from apps.run.time_estimate import expected_held_out, post_training_seconds
+from apps.run.run_timing import expected_held_out, post_training_seconds
 from apps.run.training_session import TrainingSession
 from apps.tracking.tracked_run import remove_unused_tracking
 from avatar.backends import backend_for
@@ -28,8 +28,45 @@ from capture.input_error import InputError
 from export.bake import proxy_surface
 from preprocess.capture_session import Capture
 
+CUDA_SLOW_WARNING = (
+    "--device cuda runs the plain-torch reference, which is slower than the CPU: there are no CUDA "
+    "kernels yet. Omit --device to train on the CPU."
+)
+"""Warning for --device cuda."""
+
+
+def resolve_device(name: str) -> torch.device:
+    """Return the device for --device.
+
+    Args:
+        name: "cpu", "cuda", or "auto". Auto is the CPU, which is faster until there are CUDA
+            kernels.
+
+    Raises:
+        InputError: If CUDA is requested, but torch finds no GPU.
+    """
+    if name == "cuda" and not torch.cuda.is_available():
+        raise InputError(
+            "--device cuda requires a GPU, but torch finds none. Omit --device, or install torch "
+            "with CUDA and check nvidia-smi."
+        )
+    return torch.device("cuda" if name == "cuda" else "cpu")
+
+
+def set_threads(requested: int | None) -> int:
+    """Set the threads of torch and numba: as requested, else one per usable core.
+
+    Returns:
+        The number of threads; numba cannot exceed the number it started with.
+    """
+    threads = max(1, min(requested or usable_cores(), numba.get_num_threads()))
+    torch.set_num_threads(threads)
+    numba.set_num_threads(threads)
+    return threads
+
+
 if TYPE_CHECKING:  # viser is an optional extra
-    from apps.view.live_viewer import LiveViewer
+    from apps.run.live_viewer import LiveViewer
 
 JOINT_TOLERANCE_M = 1e-3
 """Largest difference of rest joints within one body, metres; more is another body."""
@@ -122,7 +159,7 @@ def _open_viewer(
     """Open the live viewer if --view asks for it."""
     if arguments.view is None:
         return None
-    from apps.view.live_viewer import LiveViewer
+    from apps.run.live_viewer import LiveViewer
 
     return LiveViewer(capture, run, console, arguments.view)
 

@@ -4,34 +4,42 @@ import math
 import threading
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, final
+from dataclasses import replace
+from typing import Any, Protocol, final, runtime_checkable
 
+from apps.cli.command_line import BAD_INPUT, INTERRUPTED, CommandExit
 from apps.cli.console import Console, ProgressBar, format_duration
-from apps.cli.exit_codes import BAD_INPUT, INTERRUPTED, CommandExit
-from apps.evaluation.final_scoring import SCORING_LIMIT_S, FinalScores, score_finally
-from apps.report.cpu_contention import CpuContentionMeter, CpuTime
-from apps.report.learning_curve import CurvePoint
-from apps.report.report_schema import ForgettingStats, finite_mean, format_percent, format_psnr
-from apps.report.stream_meter import StreamMeter
-from apps.run.checkpoint_writer import CheckpointWriter
-from apps.run.continual_learning import EarlierVideos, earlier_video_names
-from apps.run.package_snapshot import (
+from apps.report.report_figures import CurvePoint
+from apps.report.report_schema import finite_mean, format_percent, format_psnr
+from apps.run.final_scoring import (
+    SCORING_LIMIT_S,
+    EarlierVideos,
+    TrainingResult,
+    earlier_video_names,
+    score_finally,
+)
+from apps.run.run_folder import RunFolder
+from apps.run.run_timing import (
+    CpuContentionMeter,
+    CpuTime,
+    StreamMeter,
+    describe_position,
+    post_training_seconds,
+)
+from apps.run.snapshot_writer import (
+    CheckpointWriter,
     PackageSnapshot,
     prefer_final,
     store_scores,
     validation_views,
     write_package_snapshot,
 )
-from apps.run.run_folder import RunFolder
-from apps.run.time_estimate import describe_position, post_training_seconds
-from apps.run.training_observer import TrainingObserver, notify_observers
 from avatar.evaluation.coverage import Coverage
 from avatar.evaluation.coverage_advice import coverage_advice
 from avatar.evaluation.held_out import PIXELS_PER_FRAME, HeldOutFrame, add_held_out
 from avatar.evaluation.sharpness import overall_verdict
 from avatar.events import Evaluated, FrameArrived, HeldOutScore, Stepped, TrainEvent, Warned
-from avatar.training.frame_stream import StreamItem, prepare_items, separate_held_out
+from avatar.training.frame_stream import SplitItem, StreamItem, prepare_items, separate_held_out
 from avatar.training.train import train
 from avatar.training.trainer import Trainer
 from avatar.training.training_frame import TrainingFrame
@@ -40,45 +48,51 @@ from capture.source import RealtimePlayback
 from export.bake.fine_tuning import PosedView
 from preprocess.body.body_pose import BodyPose
 from preprocess.capture_session import Capture
+from preprocess.observation import Observation
 
 REVISED_PER_STEP = 2
 """Frames whose poses are replaced between two steps; each solves its correspondences again."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class TrainingResult:
-    """A trained avatar and how it was trained.
+@runtime_checkable
+class TrainingObserver(Protocol):
+    """Observer of a training session, such as the live viewer."""
 
-    Attributes:
-        trainer: Holds the avatar.
-        held_out: Held-out frames that have arrived.
-        curve: Learning curve, up to the final scores.
-        meter: Timing and counts of the frame stream.
-        coverage: Skin that the training frames show.
-        frames_added: Frames of this capture that were trained on.
-        interrupted: Whether Ctrl-C ended training.
-        cpu_time: CPU time used, and lost to other programs.
-        package: Outcome of packaging; None before `TrainingSession.bake`.
-        scores: Final scores of the held-out frames; empty before `bake`.
-        earlier_videos: Forgetting of earlier videos, if there were any.
+    def on_frame(self, observation: Observation, *, held_out: bool) -> None:
+        """A frame in which the person was found, before the trainer has it.
+
+        Called on the reader's thread: it must be quick, and may run no parallel kernel.
+        """
+
+    def on_event(self, event: TrainEvent) -> None:
+        """Something happened; called on the thread that trains."""
+
+    def between_steps(self, session: "TrainingSession") -> None:
+        """Between two steps, on the thread that trains: kernels may run here.
+
+        What it takes counts as training time, except inside `Trainer.paused`.
+        """
+
+
+def notify_observers(
+    items: Iterator[SplitItem], coverage: Coverage, observers: Sequence[TrainingObserver]
+) -> Iterator[SplitItem]:
+    """Passes items on; observers see every observation, coverage those that are trained on.
+
+    Args:
+        items: Observations, of which the held-out ones are wrapped.
+        coverage: Adds the observations that are not held out.
+        observers: Receive all observations.
     """
-
-    trainer: Trainer
-    held_out: list[HeldOutFrame]
-    curve: tuple[CurvePoint, ...]
-    meter: StreamMeter
-    coverage: Coverage
-    frames_added: int
-    interrupted: bool
-    cpu_time: CpuTime
-    package: PackageSnapshot | None = None
-    scores: FinalScores = field(default_factory=FinalScores)
-    earlier_videos: ForgettingStats | None = None
-
-    @property
-    def is_trained(self) -> bool:
-        """Whether any step was made on any frame."""
-        return self.trainer.steps > 0 and self.frames_added > 0
+    for item in items:
+        if isinstance(item, Observation):
+            coverage.add(item)
+            for observer in observers:
+                observer.on_frame(item, held_out=False)
+        elif isinstance(item, HeldOutFrame):
+            for observer in observers:
+                observer.on_frame(item.observation, held_out=True)
+        yield item
 
 
 @final
@@ -331,20 +345,18 @@ class TrainingSession:
         )
         return f"about {format_duration(rest)}"
 
-    def _position_text(self) -> str:
-        trainer, total = self.trainer, self._recording.source.frame_count
-        return describe_position(
+    def _progress_text(self) -> str:
+        trainer, last = self.trainer, self.curve[-1] if self.curve else None
+        rays = trainer.rays / max(trainer.wall_seconds, 1e-6)
+        frames_read = self.meter.frames_read, self._recording.source.frame_count
+        position = describe_position(
             elapsed_s=trainer.wall_seconds,
             budget_s=trainer.config.seconds,
             step=trainer.steps,
             steps=trainer.config.steps,
-            frames_read=None if self._inbox.finished else (self.meter.frames_read, total),
+            frames_read=None if self._inbox.finished else frames_read,
         )
-
-    def _progress_text(self) -> str:
-        trainer, last = self.trainer, self.curve[-1] if self.curve else None
-        rays = trainer.rays / max(trainer.wall_seconds, 1e-6)
-        parts = [self._position_text()]  # terminals cut off the end of a long line
+        parts = [position]  # terminals cut off the end of a long line
         if last is not None and last.psnr is not None:
             score = format_psnr(last.psnr, last.verdict, digits=1, provisional=True)
             parts.append(f"held-out PSNR {score}")

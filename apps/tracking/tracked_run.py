@@ -7,10 +7,9 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
-from apps.cli.capture_options import format_frame_range
+from apps.cli.command_line import INTERRUPTED, CommandExit, stop_on_interrupt
 from apps.cli.console import Console
-from apps.cli.exit_codes import INTERRUPTED, CommandExit
-from apps.cli.interrupt import stop_on_interrupt
+from apps.cli.shared_options import format_frame_range
 from apps.run.ingest_arguments import IngestArguments
 from apps.run.run_folder import RunFolder
 from apps.tracking.person_tracking import PersonTracking, needs_tracking, print_grade, track_person

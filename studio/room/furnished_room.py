@@ -32,88 +32,44 @@ SENSOR_NOISE = 1.5
 """Standard deviation of the sensor's noise, of 255."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class FurnitureBox:
     """A piece of furniture: a box.
 
     Attributes:
-        at: Its middle on the floor (x, z), metres.
-        size: Along x, y, z before it is turned.
-        yaw_deg: About the vertical.
-        base: Height of its lower face.
-        look: What covers it.
+        center_xz_m: Its middle on the floor (x, z), metres.
+        size_m: Along x, y, z before it is turned.
+        texture: What covers it.
+        base_height_m: Height of its lower face.
+        yaw_deg: Turn about the vertical.
     """
 
     center_xz_m: tuple[float, float]
     size_m: tuple[float, float, float]
-    yaw_deg: float = 0.0
-    base_height_m: float = 0.0
     texture: TexturePainter
+    base_height_m: float = 0.0
+    yaw_deg: float = 0.0
 
 
 WALNUT, OAK, PINE = (104, 74, 52), (168, 128, 86), (196, 164, 118)
 
 FURNITURE = (
-    FurnitureBox(center_xz_m=(-2.3, -2.9), size_m=(1.4, 2.1, 0.36), texture=books(WALNUT)),
-    FurnitureBox(center_xz_m=(0.3, -2.82), size_m=(1.7, 0.8, 0.48), texture=wood(OAK)),
-    FurnitureBox(
-        center_xz_m=(0.55, -2.84),
-        size_m=(0.9, 0.55, 0.1),
-        base_height_m=0.84,
-        texture=dead_leaves((70, 84, 110), 44.0),
-    ),
-    FurnitureBox(
-        center_xz_m=(-0.35, -2.8),
-        size_m=(0.25, 0.32, 0.2),
-        base_height_m=0.8,
-        yaw_deg=30.0,
-        texture=dead_leaves((190, 120, 70)),
-    ),
-    FurnitureBox(
-        center_xz_m=(1.85, -2.3),
-        size_m=(0.42, 0.46, 0.42),
-        yaw_deg=25.0,
-        texture=dead_leaves((84, 110, 72), 34.0),
-    ),
-    FurnitureBox(center_xz_m=(3.36, -1.5), size_m=(0.6, 2.15, 1.3), texture=wood(PINE)),
-    FurnitureBox(
-        center_xz_m=(2.75, -0.1),
-        size_m=(0.55, 0.5, 0.55),
-        yaw_deg=20.0,
-        texture=dead_leaves((150, 110, 64), 32.0),
-    ),
-    FurnitureBox(
-        center_xz_m=(2.72, -0.12),
-        size_m=(0.36, 0.34, 0.4),
-        base_height_m=0.5,
-        yaw_deg=-12.0,
-        texture=dead_leaves((110, 120, 150), 32.0),
-    ),
-    FurnitureBox(
-        center_xz_m=(-2.95, -0.7), size_m=(0.8, 0.05, 1.4), base_height_m=0.7, texture=wood(WALNUT)
-    ),
-    FurnitureBox(center_xz_m=(-3.25, -1.3), size_m=(0.07, 0.7, 0.07), texture=wood(WALNUT)),
-    FurnitureBox(center_xz_m=(-2.65, -1.3), size_m=(0.07, 0.7, 0.07), texture=wood(WALNUT)),
-    FurnitureBox(center_xz_m=(-3.25, -0.1), size_m=(0.07, 0.7, 0.07), texture=wood(WALNUT)),
-    FurnitureBox(center_xz_m=(-2.65, -0.1), size_m=(0.07, 0.7, 0.07), texture=wood(WALNUT)),
-    FurnitureBox(
-        center_xz_m=(-3.0, -0.55),
-        size_m=(0.3, 0.22, 0.4),
-        base_height_m=0.75,
-        yaw_deg=15.0,
-        texture=dead_leaves((170, 60, 60), 34.0),
-    ),
-    FurnitureBox(
-        center_xz_m=(-1.55, -2.0),
-        size_m=(0.42, 0.45, 0.42),
-        yaw_deg=35.0,
-        texture=dead_leaves((90, 96, 140), 34.0),
-    ),
-    FurnitureBox(
-        center_xz_m=(3.35, 0.95),
-        size_m=(0.5, 0.45, 1.1),
-        texture=dead_leaves((160, 150, 128), 36.0),
-    ),
+    FurnitureBox((-2.3, -2.9), (1.4, 2.1, 0.36), books(WALNUT)),
+    FurnitureBox((0.3, -2.82), (1.7, 0.8, 0.48), wood(OAK)),
+    FurnitureBox((0.55, -2.84), (0.9, 0.55, 0.1), dead_leaves((70, 84, 110), 44.0), 0.84),
+    FurnitureBox((-0.35, -2.8), (0.25, 0.32, 0.2), dead_leaves((190, 120, 70)), 0.8, 30.0),
+    FurnitureBox((1.85, -2.3), (0.42, 0.46, 0.42), dead_leaves((84, 110, 72), 34.0), yaw_deg=25.0),
+    FurnitureBox((3.36, -1.5), (0.6, 2.15, 1.3), wood(PINE)),
+    FurnitureBox((2.75, -0.1), (0.55, 0.5, 0.55), dead_leaves((150, 110, 64), 32.0), yaw_deg=20.0),
+    FurnitureBox((2.72, -0.12), (0.36, 0.34, 0.4), dead_leaves((110, 120, 150), 32.0), 0.5, -12.0),
+    FurnitureBox((-2.95, -0.7), (0.8, 0.05, 1.4), wood(WALNUT), 0.7),
+    FurnitureBox((-3.25, -1.3), (0.07, 0.7, 0.07), wood(WALNUT)),
+    FurnitureBox((-2.65, -1.3), (0.07, 0.7, 0.07), wood(WALNUT)),
+    FurnitureBox((-3.25, -0.1), (0.07, 0.7, 0.07), wood(WALNUT)),
+    FurnitureBox((-2.65, -0.1), (0.07, 0.7, 0.07), wood(WALNUT)),
+    FurnitureBox((-3.0, -0.55), (0.3, 0.22, 0.4), dead_leaves((170, 60, 60), 34.0), 0.75, 15.0),
+    FurnitureBox((-1.55, -2.0), (0.42, 0.45, 0.42), dead_leaves((90, 96, 140), 34.0), yaw_deg=35.0),
+    FurnitureBox((3.35, 0.95), (0.5, 0.45, 1.1), dead_leaves((160, 150, 128), 36.0)),
 )
 """None of it comes within 1.8 m of the actor, or between the actor and the camera."""
 

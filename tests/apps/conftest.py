@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from apps import ingest, play
-from apps.run import package_snapshot, report_writer, session_start
+from apps.report import report_writer
+from apps.run import session_start, snapshot_writer
 from avatar.rig import Rig
 from avatar.training import held_out_pose_fitting, warmup
 from capture.atomic_files import write_text_atomically
@@ -141,8 +142,8 @@ def without_baking(monkeypatch) -> None:
             largest_difference=0.0, fine_tuning_psnr=None, warnings=(),
         )  # fmt: skip
 
-    monkeypatch.setattr(package_snapshot, "export_avatar", export_nothing)
-    monkeypatch.setattr(package_snapshot, "update_metrics", lambda path, metrics: 8)
+    monkeypatch.setattr(snapshot_writer, "export_avatar", export_nothing)
+    monkeypatch.setattr(snapshot_writer, "update_metrics", lambda path, metrics: 8)
     monkeypatch.setattr(report_writer, "diagnose_failure", lambda report: None)
     monkeypatch.setattr(report_writer, "demo_animation", lambda player: "data:,")
     monkeypatch.setattr(report_writer.Player, "load", lambda path: None)

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import torch
 
-from apps.evaluation import final_scoring
-from apps.run import checkpoint_writer, report_writer
-from apps.run.checkpoint_writer import CheckpointWriter
-from apps.run.report_writer import diagnose_failure
+from apps.report import report_writer
+from apps.report.report_writer import diagnose_failure
+from apps.run import final_scoring, snapshot_writer
 from apps.run.run_folder import RunFolder
+from apps.run.snapshot_writer import CheckpointWriter
 from avatar.evaluation.coverage_advice import SEEN_COMPLETELY
 from avatar.training import checkpoint
 from capture.atomic_files import LIST_NAME as LIST
@@ -215,8 +215,8 @@ def test_a_run_goes_on_where_it_stopped(capture, call_ingest, without_baking, tm
 def test_a_full_disk_keeps_the_checkpoint_before(
     capture, call_ingest, without_baking, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(checkpoint_writer, "CHECKPOINT_INTERVAL_S", 0.0)
-    monkeypatch.setattr(checkpoint_writer, "CHECKPOINT_COST_SHARE", 1e6)
+    monkeypatch.setattr(snapshot_writer, "CHECKPOINT_INTERVAL_S", 0.0)
+    monkeypatch.setattr(snapshot_writer, "CHECKPOINT_COST_SHARE", 1e6)
     begin = CheckpointWriter.begin
 
     def written_at_once(writer, *args, **options):
@@ -262,7 +262,7 @@ def test_a_disk_that_has_no_room_for_anything_is_left_as_it_was(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(torch, "save", full)
-    monkeypatch.setattr("apps.run.package_snapshot.export_avatar", full)
+    monkeypatch.setattr("apps.run.snapshot_writer.export_avatar", full)
     outcome = call_ingest(capture, *FEW, "--out", tmp_path / "run")
     assert outcome.code == 3
     assert "Nothing was written" in outcome.complaint()

@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from apps.cli.exit_codes import LEARN_PACKAGES, SMALL_PACKAGES, install_advice
+from apps.cli.command_line import LEARN_PACKAGES, SMALL_PACKAGES, install_advice
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from apps import check, play
-from apps.checks.capture_validation import passes_quick_check
+from apps.capture_validation import passes_quick_check
 from preprocess.capture_session import CaptureInputs
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from apps.cli.exit_codes import run_command
+from apps.cli.command_line import run_command
 from benchmarks import results
 from benchmarks.results import ResultsJob, plan, write_page
 from benchmarks.results_page import ComparedSample, results_lines

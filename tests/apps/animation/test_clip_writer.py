@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from apps.animation.clip_writer import (
+from apps.animation.clip_rendering import (
     background_compositor,
     check_clip_path,
     choose_encoder,

@@ -15,9 +15,8 @@ import pytest
 from PIL import Image
 
 from apps import ingest, play
-from apps.animation.driving_motion import demo_motion
-from apps.animation.following_camera import FollowingCamera
-from apps.animation.package_verification import package_warnings
+from apps.animation.driving_motion import FollowingCamera, demo_motion
+from apps.animation.player_checks import package_warnings
 from capture import video_encoder
 from capture.atomic_files import LIST_NAME as LIST
 from export import player_page

@@ -6,7 +6,7 @@ python tests/apps/animation/test_player_timing.py        # writes it again
 import onnx
 from onnx import TensorProto, helper
 
-from apps.animation.player_timing import REFERENCE_GRAPH
+from apps.animation.player_checks import REFERENCE_GRAPH
 
 
 def reference_model() -> onnx.ModelProto:

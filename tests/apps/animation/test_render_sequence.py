@@ -10,10 +10,9 @@ import pytest
 from PIL import Image
 
 from apps.animation import play_arguments
-from apps.animation.driving_motion import demo_motion
-from apps.animation.following_camera import FollowingCamera, canonical_pose_of
-from apps.animation.viewpoint import Viewpoint
-from apps.report import hardware
+from apps.animation.driving_motion import FollowingCamera, canonical_pose_of, demo_motion
+from apps.animation.play_arguments import Viewpoint
+from apps.cli import hardware
 from export.player import Player
 from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
 from preprocess.poses.pose_file import read_motion

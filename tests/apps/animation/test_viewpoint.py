@@ -3,9 +3,13 @@
 import numpy as np
 import pytest
 
-from apps.animation.driving_motion import demo_motion
-from apps.animation.following_camera import DISTANCE_HEIGHTS, FollowingCamera, canonical_pose_of
-from apps.animation.viewpoint import Viewpoint
+from apps.animation.driving_motion import (
+    DISTANCE_HEIGHTS,
+    FollowingCamera,
+    canonical_pose_of,
+    demo_motion,
+)
+from apps.animation.play_arguments import Viewpoint
 from capture.input_error import InputError
 from export.player import Player
 from preprocess.body.body_pose import BodyPose

@@ -10,7 +10,7 @@ import sys
 import numpy as np
 import pytest
 
-from apps.animation.following_camera import FollowingCamera
+from apps.animation.driving_motion import FollowingCamera
 from capture.input_error import InputError
 from export import player_page
 from export.player import PictureDifference, Player, premultiply

@@ -8,12 +8,17 @@ import pytest
 from rich.console import Console as RichConsole
 
 from apps.batching.batch_folder import BatchFolder
-from apps.batching.batch_scheduler import FIRST_NEED_MB, BatchLimits, BatchScheduler, plan_captures
+from apps.batching.batch_scheduler import (
+    FIRST_NEED_MB,
+    BatchLimits,
+    BatchScheduler,
+    LiveTable,
+    plan_captures,
+)
+from apps.batching.executors import AttemptProgress
 from apps.batching.ingest_attempt import AttemptOutcome, IngestJob
-from apps.batching.live_table import LiveTable
-from apps.batching.local_executor import AttemptProgress
+from apps.cli.command_line import CommandExit
 from apps.cli.console import Console
-from apps.cli.exit_codes import CommandExit
 from capture.input_error import InputError
 
 

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from apps.batching.ingest_attempt import ROOT, ingest_words, run_attempt
-from apps.batching.node_resources import tree_memory_mb, work_folder
+from apps.batching.remote_files import work_folder
+from apps.cli.hardware import tree_memory_mb
 from capture.input_error import InputError
 
 

@@ -9,8 +9,8 @@ import pytest
 from apps.batching.batch_folder import AttemptRecord, BatchFolder
 from apps.batching.capture_discovery import find_captures
 from apps.batching.remote_files import fetch_inputs, list_files, send_files
+from apps.cli.command_line import CommandExit
 from apps.cli.console import Console
-from apps.cli.exit_codes import CommandExit
 from capture.input_error import InputError
 
 

@@ -6,7 +6,7 @@ import io
 import pytest
 
 from apps.batching.batch_folder import AttemptRecord, BatchFolder
-from apps.batching.live_table import CaptureState
+from apps.batching.batch_scheduler import CaptureState
 from apps.batching.summary_page import BatchSummary, CorePrice, summary_csv, summary_page
 from apps.cli.console import Console
 from capture.input_error import InputError

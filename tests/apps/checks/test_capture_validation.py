@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from apps import check, ingest
-from apps.checks.capture_validation import check_opened_capture, passes_quick_check
-from apps.checks.preflight_check import preflight_check
+from apps.capture_validation import check_opened_capture, passes_quick_check, preflight_check
 from apps.cli.console import Console
 from benchmarks import capture_corruptions
 from preprocess.capture_session import CaptureInputs

@@ -11,7 +11,7 @@ from apps.cli import command_line
 
 ROOT = Path(__file__).parents[3]
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
-COMMANDS = {**SCRIPTS, "python -m apps.fetch_runtime": "apps.fetch_runtime:main"}
+COMMANDS = {**SCRIPTS, "python -m apps.animation.web_server": "apps.animation.web_server:main"}
 
 
 def answered(program, words, capsys):
@@ -51,7 +51,7 @@ def test_a_checkout_has_a_version_without_installation(capsys, monkeypatch):
 
 def test_words_that_make_no_sense_are_bad_input(capsys):
     with pytest.raises(SystemExit) as end:
-        importlib.import_module("apps.fetch_runtime").main(["--bogus"])
+        importlib.import_module("apps.animation.web_server").main(["--bogus"])
     assert end.value.code == 2
     assert "--bogus" in capsys.readouterr().err
 
@@ -67,7 +67,7 @@ def test_masks_cannot_be_dark_and_bright(program, capsys):
 def test_auto_trains_on_the_cpu_even_if_torch_sees_a_gpu(monkeypatch):
     import torch
 
-    from apps.cli.device import resolve_device
+    from apps.run.session_start import resolve_device
 
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert [resolve_device(name).type for name in ("auto", "cpu", "cuda")] == ["cpu", "cpu", "cuda"]

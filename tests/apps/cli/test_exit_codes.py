@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 from rich.console import Console as RichConsole
 
-from apps.animation.clip_writer import background_compositor
+from apps.animation.clip_rendering import background_compositor
+from apps.cli.command_line import CommandExit, run_command, stop_on_interrupt
 from apps.cli.console import MAX_PRINTED_WARNINGS, Console, format_duration
-from apps.cli.exit_codes import CommandExit, run_command
-from apps.cli.interrupt import stop_on_interrupt
 from capture.image_folder import read_image
 from capture.input_error import InputError
 
@@ -96,7 +95,7 @@ def test_where_nothing_is_to_be_saved_ctrl_c_does_not_wait_for_other_threads():
     code = (
         "import os, signal, threading, time\n"
         "from apps.cli.console import Console\n"
-        "from apps.cli.interrupt import exit_on_interrupt\n"
+        "from apps.cli.command_line import exit_on_interrupt\n"
         "with exit_on_interrupt(Console(), 'ia-test'):\n"
         "    threading.Thread(target=time.sleep, args=(60,)).start()\n"
         "    os.kill(os.getpid(), signal.SIGINT)\n"
@@ -133,7 +132,7 @@ def test_work_continues_when_its_output_is_closed():
     code = (
         "import sys\n"
         "from apps.cli.console import Console\n"
-        "from apps.cli.exit_codes import CommandExit, run_command\n"
+        "from apps.cli.command_line import CommandExit, run_command\n"
         "def work():\n"
         "    for _ in range(99): Console().info('x' * 999)\n"
         "    print('done', flush=True)\n"

@@ -11,9 +11,8 @@ import pytest
 
 from apps import evaluate
 from apps.cli.console import Console
-from apps.evaluation import people_snapshot
-from apps.evaluation.neuman import find_neuman, split_by_rule
-from apps.evaluation.people_snapshot import find_people_snapshot
+from apps.evaluation import datasets
+from apps.evaluation.datasets import find_neuman, find_people_snapshot, split_by_rule
 from capture.input_error import InputError
 from capture.source_opening import open_source
 from preprocess.capture_session import CaptureInputs
@@ -54,7 +53,7 @@ def write_hdf5(path, **arrays):
 @pytest.fixture
 def snapshot(film, filmed, seen_poses, tmp_path, monkeypatch):
     """A subject of PeopleSnapshot as it is distributed, with shorter lists of frames."""
-    monkeypatch.setitem(people_snapshot.SPLITS, NAME, ("0:12:3", "12:24:4"))
+    monkeypatch.setitem(datasets.SPLITS, NAME, ("0:12:3", "12:24:4"))
     seen, _ = filmed
     place = tmp_path / "PeopleSnapshot" / NAME
     place.mkdir(parents=True)
@@ -110,7 +109,7 @@ def test_the_original_files_become_undistorted_frames_of_half_the_size(
 def test_published_poses_beside_the_original_files_are_preferred(snapshot, tmp_path):
     (snapshot / "poses").mkdir()
     given = {"thetas": np.ones((4, 72)), "transl": np.ones((4, 3)), "betas": np.zeros(10)}
-    np.savez(snapshot / people_snapshot.TRAIN_POSES, **given)
+    np.savez(snapshot / datasets.TRAIN_POSES, **given)
     (subject,) = find_people_snapshot(snapshot)
     train, test = open_splits(subject, tmp_path)
     assert (np.load(train.folder / "poses.npz")["thetas"] == 1.0).all()

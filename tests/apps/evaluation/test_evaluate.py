@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from apps import evaluate, ingest
+from apps.cli.command_line import INTERRUPTED
 from apps.cli.console import Console
-from apps.cli.exit_codes import INTERRUPTED
-from apps.evaluation import avatar_scorer, people_snapshot
+from apps.evaluation import datasets, evaluation_session
 from apps.evaluation.frame_scoring import FrameJudge, FrameScore
 from apps.evaluation.score_table import (
     AvatarEvaluation,
@@ -80,9 +80,9 @@ def test_a_package_alone_is_scored_as_within_its_run(run, film, call_evaluate, t
 @pytest.fixture
 def dataset(film, call_ingest, tmp_path, monkeypatch):
     """Two subjects in the paper's layout, with shorter lists."""
-    lists = {people_snapshot.TRAIN_POSES: np.s_[0:16:2], people_snapshot.TEST_POSES: np.s_[16:24:3]}
+    lists = {datasets.TRAIN_POSES: np.s_[0:16:2], datasets.TEST_POSES: np.s_[16:24:3]}
     names = ("female-3-casual", "male-3-casual")
-    monkeypatch.setattr(people_snapshot, "SPLITS", dict.fromkeys(names, ("0:16:2", "16:24:3")))
+    monkeypatch.setattr(datasets, "SPLITS", dict.fromkeys(names, ("0:16:2", "16:24:3")))
     for name in names:
         place = tmp_path / "PeopleSnapshot" / name
         shutil.copytree(film, place)
@@ -151,10 +151,10 @@ def test_a_stopped_lesson_leaves_the_table_of_those_before(
 def test_the_papers_lists_are_as_long_as_the_paper_says():
     counts = {"female-3-casual": (112, 51), "female-4-casual": (84, 48), "male-3-casual": (114, 55),
               "male-4-casual": (110, 36)}  # fmt: skip
-    for name, splits in people_snapshot.SPLITS.items():
+    for name, splits in datasets.SPLITS.items():
         lists = [range(*map(int, text.split(":"))) for text in splits]
         assert tuple(map(len, lists)) == counts[name]
-    assert people_snapshot.PAPER.keys() == counts.keys()
+    assert datasets.PAPER.keys() == counts.keys()
 
 
 def test_a_box_is_scored_without_the_white_around_it(film):
@@ -236,7 +236,7 @@ def test_what_was_scored_before_it_was_stopped_is_in_the_table(film):
         yield from seen[1:]
 
     players = {"hq": lambda seen: np.zeros((*seen.alpha.shape, 4), np.float32)}
-    found = avatar_scorer.AvatarScorer(None, players, FrameJudge(), fit_poses=True)
+    found = evaluation_session.AvatarScorer(None, players, FrameJudge(), fit_poses=True)
     with console.progress("scoring", 3.0) as bar:
         found.score_frames(stopped_in_the_second(), bar, stop)
     assert [len(row.scores) for row in found.rows] == [0]

@@ -7,9 +7,9 @@ import subprocess
 import pytest
 
 from apps import evaluate
-from apps.evaluation.shown_frames import SHOWN_FRAMES
-from apps.report import hardware
-from apps.report.learning_curve import CurvePoint, psnr_at
+from apps.cli import hardware
+from apps.evaluation.frame_scoring import SHOWN_FRAMES
+from apps.report.report_figures import CurvePoint, psnr_at
 from tests.apps.conftest import Outcome
 from tests.apps.report.test_report_page import Tags
 

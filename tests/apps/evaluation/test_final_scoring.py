@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from apps.cli.console import Console
-from apps.evaluation import final_scoring
-from apps.evaluation.final_scoring import (
+from apps.run import final_scoring
+from apps.run.final_scoring import (
     FRAMES_PER_FIT,
     KEPT_RENDERINGS,
     MIN_WHOLE_IMAGES,

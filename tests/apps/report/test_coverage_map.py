@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from apps.report.coverage_map import CoverageMap
+from apps.report.report_figures import CoverageMap
 from avatar.evaluation.coverage import Coverage, VisibilityStage
 
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from apps.report import cpu_contention
-from apps.report.cpu_contention import CpuContentionMeter, CpuTime
+from apps.run import run_timing
+from apps.run.run_timing import CpuContentionMeter, CpuTime
 from avatar.training.trainer import Trainer
 
 
@@ -24,7 +24,7 @@ def thread(tasks, number, *, ran_s, waited_s):
 
 def test_threads_that_were_ready_and_had_no_core_are_counted(trainer, tmp_path, monkeypatch):
     """Those that ended meanwhile, or that sleep until a frame comes, are not."""
-    monkeypatch.setattr(cpu_contention, "_throttled_s", lambda: 0.0)
+    monkeypatch.setattr(run_timing, "_throttled_s", lambda: 0.0)
     thread(tmp_path, 1, ran_s=9, waited_s=2)
     thread(tmp_path, 2, ran_s=1, waited_s=50)
     meter = CpuContentionMeter(trainer, tmp_path)
@@ -39,7 +39,7 @@ def test_threads_that_were_ready_and_had_no_core_are_counted(trainer, tmp_path, 
 
 def test_a_quota_that_holds_the_process_back_counts(trainer, tmp_path, monkeypatch):
     held_back = iter([3.0, 43.0])
-    monkeypatch.setattr(cpu_contention, "_throttled_s", lambda: next(held_back))
+    monkeypatch.setattr(run_timing, "_throttled_s", lambda: next(held_back))
     thread(tmp_path, 1, ran_s=9, waited_s=2)
     assert CpuContentionMeter(trainer, tmp_path).measure().waited_s == 40.0
 

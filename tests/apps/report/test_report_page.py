@@ -11,10 +11,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from apps.report.learning_curve import CurvePoint, curve_svg, largest_drop, largest_drops
+from apps.report.report_figures import CurvePoint, curve_svg, largest_drop, largest_drops
 from apps.report.report_page import ComparisonPair, report_page
 from apps.report.report_schema import (
-    DroppedFrameEntry,
     ForgettingStats,
     FrameStats,
     HeldOutStats,
@@ -26,13 +25,14 @@ from apps.report.report_schema import (
     finite_mean,
     format_psnr,
 )
-from apps.run.report_writer import (
+from apps.report.report_writer import (
     animated_webp_data_uri,
     diagnose_failure,
     play_command,
     webp_data_uri,
 )
 from avatar.events import HeldOutScore
+from preprocess.observation import DroppedFrame
 
 
 def point(seconds, psnr, psnr_mask=None):
@@ -50,7 +50,7 @@ def report(**changes):
             read=20,
             used=17,
             held_out=2,
-            dropped=(DroppedFrameEntry(index=7, reason="pose invalid"),),
+            dropped=(DroppedFrame(index=7, reason="pose invalid"),),
             near_duplicates=0,
             not_replayed=0,
         ),

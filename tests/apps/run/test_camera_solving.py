@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from rich.console import Console as RichConsole
 
+from apps.cli.command_line import CommandExit
 from apps.cli.console import Console
-from apps.cli.exit_codes import CommandExit
 from apps.run import solver_process
 from apps.run.camera_solving import CameraSolving, apply_camera_solution
 from apps.run.run_folder import RunFolder
@@ -270,7 +270,7 @@ def test_cameras_are_kept_when_the_avatar_is_refused(
     def refuse(*_, **__):
         raise ExportRefused("The player would not draw it.")
 
-    monkeypatch.setattr("apps.run.package_snapshot.export_avatar", refuse)
+    monkeypatch.setattr("apps.run.snapshot_writer.export_avatar", refuse)
     out = tmp_path / "run"
     shutil.copytree(solved_run / "cameras", out / "cameras")  # solved before: the same job
     outcome = call_ingest(

@@ -4,9 +4,9 @@ import threading
 
 import pytest
 
-from apps.run import checkpoint_writer
-from apps.run.checkpoint_writer import CheckpointWriter
+from apps.run import snapshot_writer
 from apps.run.run_folder import RunFolder
+from apps.run.snapshot_writer import CheckpointWriter
 from avatar.training import checkpoint
 from avatar.training.trainer import Trainer
 from preprocess.capture_session import Capture
@@ -17,8 +17,8 @@ TRAINER = Trainer.__new__(Trainer)
 @pytest.fixture
 def writer(tmp_path, monkeypatch) -> CheckpointWriter:
     monkeypatch.setattr(checkpoint, "detached_state", lambda trainer, notes: dict(notes))
-    monkeypatch.setattr(checkpoint_writer, "write_shaped_body", lambda path, shaped: None)
-    monkeypatch.setattr(checkpoint_writer, "CHECKPOINT_INTERVAL_S", 0.0)
+    monkeypatch.setattr(snapshot_writer, "write_shaped_body", lambda path, shaped: None)
+    monkeypatch.setattr(snapshot_writer, "CHECKPOINT_INTERVAL_S", 0.0)
     capture = Capture.__new__(Capture)
     object.__setattr__(capture, "shaped", None)
     return CheckpointWriter(RunFolder(path=tmp_path), capture)
@@ -32,7 +32,7 @@ def test_training_goes_on_while_a_checkpoint_is_written(writer, monkeypatch):
         written.append((state, threading.current_thread()))
 
     monkeypatch.setattr(checkpoint, "write_state", slow)
-    monkeypatch.setattr(checkpoint_writer, "CHECKPOINT_COST_SHARE", 1e9)
+    monkeypatch.setattr(snapshot_writer, "CHECKPOINT_COST_SHARE", 1e9)
     assert writer.is_due()
     writer.begin(TRAINER, {"step": 1})
     assert not writer.is_due()  # the first is not yet written
@@ -46,7 +46,7 @@ def test_training_goes_on_while_a_checkpoint_is_written(writer, monkeypatch):
 
 def test_checkpoints_that_cost_much_are_rare(writer, monkeypatch):
     monkeypatch.setattr(checkpoint, "write_state", lambda state, folder: sum(range(100_000)))
-    monkeypatch.setattr(checkpoint_writer, "CHECKPOINT_COST_SHARE", 1e-9)
+    monkeypatch.setattr(snapshot_writer, "CHECKPOINT_COST_SHARE", 1e-9)
     writer.begin(TRAINER, {})
     writer.settle()
     assert not writer.is_due()

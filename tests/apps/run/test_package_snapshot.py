@@ -3,7 +3,7 @@
 import dataclasses
 from pathlib import Path
 
-from apps.run.package_snapshot import PackageSnapshot, prefer_final
+from apps.run.snapshot_writer import PackageSnapshot, prefer_final
 from export.build import ExportReport
 
 WRITTEN = ExportReport(

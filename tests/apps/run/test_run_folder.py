@@ -11,17 +11,16 @@ from pathlib import Path
 import pytest
 
 from apps import ingest
+from apps.cli.command_line import CommandExit
 from apps.cli.console import Console
-from apps.cli.exit_codes import CommandExit
-from apps.cli.output_paths import (
+from apps.cli.shared_options import (
     check_disjoint_from_inputs,
     check_output_file,
     check_writable,
     unused_path,
 )
-from apps.run import run_lock
-from apps.run.run_folder import CHECKPOINT_FILES, STATE_FILE, RunFolder
-from apps.run.run_lock import LOCK_FILE_NAME, lock_folder
+from apps.run import run_folder
+from apps.run.run_folder import CHECKPOINT_FILES, LOCK_FILE_NAME, STATE_FILE, RunFolder, lock_folder
 from avatar.training import checkpoint, saved_frames
 from capture.atomic_files import OutputFileList, write_text_atomically
 from capture.input_error import InputError
@@ -270,7 +269,7 @@ def test_a_second_run_into_a_folder_is_refused_while_the_first_goes_on(film, tmp
 def test_a_killed_run_holds_its_folder_no_longer(tmp_path):
     code = (
         "import os, pathlib, sys\n"
-        "from apps.run.run_lock import lock_folder\n"
+        "from apps.run.run_folder import lock_folder\n"
         "from apps.cli.console import Console\n"
         "with lock_folder(pathlib.Path(sys.argv[1]), Console()): print('held', flush=True); input()"
     )
@@ -299,7 +298,7 @@ def test_a_foreign_file_is_not_taken_for_a_lock(tmp_path):
 
 
 def test_without_locks_a_run_warns_and_goes_on(tmp_path, monkeypatch):
-    monkeypatch.setattr(run_lock, "fcntl", None)
+    monkeypatch.setattr(run_folder, "fcntl", None)
     console = Console()
     with lock_folder(tmp_path, console):
         pass

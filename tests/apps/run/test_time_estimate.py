@@ -2,7 +2,7 @@
 
 import pytest
 
-from apps.run.time_estimate import describe_position, expected_held_out, post_training_seconds
+from apps.run.run_timing import describe_position, expected_held_out, post_training_seconds
 
 
 def test_what_comes_after_learning_grows_with_frames_and_pixels():

@@ -6,14 +6,18 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from apps.animation.driving_motion import ResampledMotion, demo_motion
-from apps.animation.following_camera import FollowingCamera
-from apps.cli.capture_options import option_words
+from apps.animation.driving_motion import FollowingCamera, ResampledMotion, demo_motion
+from apps.cli.command_line import DONE, INTERRUPTED, NO_AVATAR, CommandExit
 from apps.cli.console import Console
-from apps.cli.exit_codes import DONE, INTERRUPTED, NO_AVATAR, CommandExit
-from apps.report.coverage_map import CoverageMap
-from apps.report.html_page import animated_webp_data_uri, to_uint8, webp_data_uri
-from apps.report.report_page import ComparisonPair, report_page
+from apps.cli.shared_options import option_words
+from apps.report.report_figures import CoverageMap
+from apps.report.report_page import (
+    ComparisonPair,
+    animated_webp_data_uri,
+    report_page,
+    to_uint8,
+    webp_data_uri,
+)
 from apps.report.report_schema import (
     CoverageStats,
     FrameStats,
@@ -24,8 +28,8 @@ from apps.report.report_schema import (
     TrainingStats,
     format_psnr,
 )
+from apps.run.final_scoring import TrainingResult
 from apps.run.run_folder import RunFolder
-from apps.run.training_session import TrainingResult
 from avatar.evaluation.image_metrics import ground_truth_on_white
 from avatar.evaluation.sharpness import MAX_MEASURABLE_BLUR, MIN_OVERLAP, overall_verdict
 from capture.atomic_files import write_text_atomically

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from apps.checks.capture_validation import CaptureValidation
+from apps.capture_validation import CaptureValidation
 from capture.atomic_files import OutputFileList, atomic_file
 from capture.camera import same_aspect_ratio
 from capture.source import Frame
@@ -22,12 +22,8 @@ CELL_PX = 300
 """Height of a frame on the sheet."""
 DECODE_BUDGET_S = 4.0
 """Decoding time for the sheet, seconds; a long video is shown up to where that ends."""
-MASK_COLOR, BODY_COLOR, PAPER_COLOR, INK_COLOR = (
-    (255, 255, 255),
-    (255, 120, 0),
-    (245, 245, 245),
-    (40, 40, 40),
-)
+MASK_COLOR, BODY_COLOR = (255, 255, 255), (255, 120, 0)
+PAPER_COLOR, INK_COLOR = (245, 245, 245), (40, 40, 40)
 """RGB colors of the sheet."""
 LABEL_PX = 26
 """Height of a row's label."""

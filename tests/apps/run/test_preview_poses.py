@@ -6,10 +6,18 @@ import numpy as np
 import pytest
 import torch
 
-from apps.run.training_observer import notify_observers
-from apps.view.live_viewer import render_preview
-from apps.view.preview_poses import DANCE, FILMED, NEWEST, POSE_CHOICES, STANDING, PreviewPoses
-from apps.view.viser_page import BACKGROUND_RGB, BrowserCamera
+from apps.run.live_viewer import render_preview
+from apps.run.training_session import notify_observers
+from apps.run.viser_page import (
+    BACKGROUND_RGB,
+    DANCE,
+    FILMED,
+    NEWEST,
+    POSE_CHOICES,
+    STANDING,
+    BrowserCamera,
+    PreviewPoses,
+)
 from avatar.config import TrainConfig
 from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.coverage import Coverage

@@ -1,8 +1,10 @@
-"""What a measurement was made on: commit, date, machine. Stands above every table."""
+"""The machine: what a measurement was made on, its cores, and its memory."""
 
 import os
 import platform
+import socket
 import subprocess
+import sys
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -13,6 +15,8 @@ ROOT = Path(__file__).resolve().parents[2]
 LIBRARIES = ("numpy", "numba", "torch", "onnxruntime")
 CGROUP = Path("/sys/fs/cgroup")
 """Limits of a container (Linux, version 2)."""
+PAGE_MB = 4096 / 1e6 if sys.platform == "win32" else os.sysconf("SC_PAGE_SIZE") / 1e6
+"""Size of a memory page, MB."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,3 +93,50 @@ def processor_name() -> str:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         return next(line.split(":", 1)[1].strip() for line in lines if "model name" in line)
     return platform.processor() or platform.machine()
+
+
+def total_memory_mb() -> float:
+    """Return the memory of this machine or container, MB."""
+    total = os.sysconf("SC_PHYS_PAGES") * PAGE_MB
+    limit = _cgroup_mb("memory.max")
+    return total if limit is None else min(total, limit)
+
+
+def available_memory_mb() -> float:
+    """Return the memory that processes can still take without swapping, MB."""
+    available = os.sysconf("SC_AVPHYS_PAGES") * PAGE_MB
+    with suppress(OSError, ValueError, StopIteration):
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        line = next(line for line in lines if line.startswith("MemAvailable:"))
+        available = float(line.split()[1]) * 1024 / 1e6
+    limit, used = _cgroup_mb("memory.max"), _cgroup_mb("memory.current")
+    return available if limit is None or used is None else min(available, limit - used)
+
+
+def _cgroup_mb(name: str) -> float | None:
+    try:
+        return int((CGROUP / name).read_text(encoding="ascii")) / 1e6
+    except (OSError, ValueError):  # no such system, or "max"
+        return None
+
+
+def tree_memory_mb(process: int) -> float:
+    """Return the resident memory of a process and all its descendants, MB; 0 where unknown."""
+    pages, waiting = 0, [str(process)]
+    while waiting:
+        place = Path("/proc", waiting.pop())
+        with suppress(OSError, ValueError, IndexError):  # it may just have ended
+            pages += int((place / "statm").read_text(encoding="ascii").split()[1])
+            for children in (place / "task").glob("*/children"):
+                waiting += children.read_text(encoding="ascii").split()
+    return pages * PAGE_MB
+
+
+def describe_machine() -> dict[str, object]:
+    """Return host name, processor, cores and memory of this machine."""
+    return {
+        "host": socket.gethostname(),
+        "processor": processor_name(),
+        "cores": usable_cores(),
+        "memory_mb": round(total_memory_mb()),
+    }

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float32
 from scipy.spatial.transform import Rotation, Slerp
 
-from apps.checks.capture_validation import CaptureValidation, mask_lookup
-from apps.cli.output_paths import check_writable
+from apps.capture_validation import CaptureValidation, mask_lookup
+from apps.cli.shared_options import check_writable
 from capture.atomic_files import atomic_folder
-from capture.image_folder import list_images
+from capture.image_folder import list_images, write_png
 from capture.input_error import InputError
 from capture.source import FrameSource
 from capture.source_opening import open_source
@@ -205,8 +205,7 @@ def _write_mask_images(
 ) -> None:
     folder.mkdir()
     for name, alpha in masks:
-        _, code = cv2.imencode(".png", (alpha * 255.0 + 0.5).astype(np.uint8))
-        (folder / f"{name}.png").write_bytes(code.tobytes())
+        write_png(folder / f"{name}.png", (alpha * 255.0 + 0.5).astype(np.uint8))
 
 
 def _stored_masks(

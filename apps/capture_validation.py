@@ -1,12 +1,17 @@
-"""Validation of a capture: sanity of its numbers, IoU of body and masks, corrections."""
+"""Validation of a capture, for ia-check, and in part before a run starts: IoU, mistakes, advice."""
 
+import shlex
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float32
 
+from apps.cli.console import Console
+from apps.cli.shared_options import capture_name, format_frame_range, option_words, unused_path
 from capture.camera import same_aspect_ratio
+from capture.camera_device import camera_address
 from capture.input_error import InputError
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.correction_search import (
@@ -53,7 +58,7 @@ MIN_EXCESS = 1.3
 """Area of masks by the body's from which they hold more than the person."""
 MIN_COVERED = 0.85
 """Share of the body that such masks cover."""
-QUICK_OFFSETS = (1, 2)
+QUICK_OFFSETS = (1, -1, 2, -2)
 """Delays of the poses, in frames, that are tested even if poses and masks match."""
 
 
@@ -93,17 +98,17 @@ class CaptureValidation:
         """Verdict: `good`, `warn` or `unusable`."""
         if self.refusal is not None or (self.mask_iou is not None and self.mask_iou < USABLE_IOU):
             return "unusable"
-        well = self.mask_iou is not None and self.mask_iou >= GOOD_IOU
-        well = well and (not self.causes or self.is_auto_corrected)
-        well |= self.edge_ratio is not None and self.edge_ratio >= GOOD_EDGE_RATIO
+        well = (self.mask_iou or 0.0) >= GOOD_IOU and (not self.causes or self.is_auto_corrected)
+        well |= (self.edge_ratio or 0.0) >= GOOD_EDGE_RATIO
         return "good" if well and not self.anomalies else "warn"
 
     @property
     def unexplained(self) -> str:
         """What may be wrong if no correction helps."""
-        if self.sampled_masks is None or self.sampled_masks.are_boxes:
+        masks = self.sampled_masks
+        if masks is None or masks.are_boxes:
             return NO_KNOWN_MISTAKE
-        covered, areas = self.sampled_masks.excess(self.hypothesis)
+        covered, areas = masks.excess(self.hypothesis)
         if covered < MIN_COVERED or areas < MIN_EXCESS:
             return NO_KNOWN_MISTAKE
         return (
@@ -131,8 +136,8 @@ class CaptureValidation:
         scores = []
         if not all(cause.startswith("video_") for cause in self.causes):
             scores.append(f"IoU after correction: {self.corrected_iou:.2f}")
-        if self.has_film_errors and self.diagnosis.video is not None:
-            film = self.diagnosis.video
+        film = self.diagnosis.video
+        if self.has_film_errors and film is not None:
             before = f" instead of {film.score_before:.2f}" if film.score_before > 0.0 else ""
             scores.append(
                 f"Mask outlines on image edges: {film.score_after:.2f}{before} (0.5 is chance)"
@@ -151,7 +156,7 @@ class CaptureValidation:
 
 
 def check_capture(inputs: CaptureInputs) -> CaptureValidation:
-    """Open a capture and validate it; few frames are decoded.
+    """Open a capture, with its video rotated if that explains an error, and validate it.
 
     Raises:
         InputError: If a part is missing or unreadable.
@@ -159,20 +164,12 @@ def check_capture(inputs: CaptureInputs) -> CaptureValidation:
     try:
         return check_opened_capture(*_open_inputs(inputs))
     except InputError as error:
-        found = _check_transposed(inputs, str(error))
-        if found is None:
-            raise
-        return found
-
-
-def _check_transposed(inputs: CaptureInputs, refusal: str) -> CaptureValidation | None:
-    """Validate the capture with its video rotated; None if that explains nothing."""
-    try:
-        recording = open_capture(replace(inputs, transposed=True), skip_checks=True)
-        found = check_opened_capture(recording, refusal)
-    except InputError:
-        return None
-    return found if found.has_film_errors else None
+        with suppress(InputError):
+            rotated = open_capture(replace(inputs, transposed=True), skip_checks=True)
+            found = check_opened_capture(rotated, str(error))
+            if found.has_film_errors:
+                return found
+        raise
 
 
 def check_opened_capture(
@@ -187,10 +184,8 @@ def check_opened_capture(
     Raises:
         InputError: If a part is unreadable.
     """
-    hypothesis, refused = (
-        _stored_hypothesis(recording),
-        implausibility_reason(recording.motion) or polarity_error,
-    )
+    hypothesis = _stored_hypothesis(recording)
+    refused = implausibility_reason(recording.motion) or polarity_error
     try:
         recording.check()
     except InputError as error:
@@ -226,31 +221,25 @@ def passes_quick_check(recording: Capture) -> bool:
     hypothesis = replace(_stored_hypothesis(recording), masks_inverted=False)
     now = mean_score(evidence.frame_scores(hypothesis))
     shifts = [
-        mean_score(evidence.frame_scores(undo_pose_delay(k).apply(hypothesis)))
-        for n in QUICK_OFFSETS
-        for k in (n, -n)
+        mean_score(evidence.frame_scores(undo_pose_delay(offset).apply(hypothesis)))
+        for offset in QUICK_OFFSETS
     ]
     if now < GOOD_IOU or now < max(shifts):
         return False
-    film = (
-        None
-        if evidence.are_boxes
-        else _sample_film(recording, evidence, QUICK_FRAMES, QUICK_FILM_FRAMES)
-    )
-    return film is None or not needs_video_correction(
-        hypothesis, film, recording.source.frame_count or 1
-    )
+    if evidence.are_boxes:
+        return True
+    film = _sample_film(recording, evidence, QUICK_FRAMES, QUICK_FILM_FRAMES)
+    count = recording.source.frame_count or 1
+    return film is None or not needs_video_correction(hypothesis, film, count)
 
 
 def _edge_ratio(recording: Capture, hypothesis: CaptureGeometry) -> float | None:
     """Return the edge ratio along the body's outline; None if no image can be decoded."""
     skin = SkinPoints.of(recording.shaped)
-    try:
-        return edge_contrast(
-            hypothesis, skin, sample_video(hypothesis, skin, recording.cameras, recording.source)
-        )
-    except InputError:
-        return None
+    with suppress(InputError):
+        images = sample_video(hypothesis, skin, recording.cameras, recording.source)
+        return edge_contrast(hypothesis, skin, images)
+    return None
 
 
 def _sample_film(
@@ -288,11 +277,7 @@ def mask_lookup(
 
 
 def _mask_row_lookup(recording: Capture) -> Callable[[int], int]:
-    """Return a function from a frame number to its mask; in order if counts differ.
-
-    Raises:
-        InputError: If masks and video have different aspect ratios.
-    """
+    """Return a function from a frame number to its mask; in order if counts differ."""
     try:
         return associate_masks(recording.masks, recording.source)
     except InputError:
@@ -332,10 +317,81 @@ def _open_inputs(inputs: CaptureInputs) -> tuple[Capture, str | None]:
     except InputError as error:
         if inputs.invert_masks is not None:
             raise
-        recording = open_capture(replace(inputs, invert_masks=False), skip_checks=True)
-        return recording, str(error)
+        return open_capture(replace(inputs, invert_masks=False), skip_checks=True), str(error)
 
 
-def json_number(value: float | None) -> float | None:
-    """Round a number for JSON; NaN and infinity become null."""
-    return None if value is None or not np.isfinite(value) else round(float(value), 4)
+def check_command(inputs: CaptureInputs, *, fix: bool = True) -> str:
+    """Return the ia-check command line for the user's inputs, ready for a shell.
+
+    Args:
+        inputs: Inputs as the user named them.
+        fix: Whether to write a corrected copy to a new folder.
+    """
+    named = ("poses", "masks", "cameras", "body", "person")
+    options = option_words({name: getattr(inputs, name) for name in named})
+    words = ["ia-check", str(inputs.video), *options]
+    if inputs.invert_masks is not None:
+        words.append("--mask-invert" if inputs.invert_masks else "--no-mask-invert")
+    if inputs.frames is not None and inputs.frames != slice(None):
+        words.append(f"--frames={format_frame_range(inputs.frames)}")
+    if fix:
+        beside = inputs.video if inputs.video.name else inputs.video.absolute()
+        free = unused_path(beside.with_name(f"{capture_name(beside)}-corrected"))
+        words += ["--fix", str(free)]
+    return shlex.join(words)
+
+
+def preflight_check(
+    recording: Capture, inputs: CaptureInputs, console: Console, *, force: bool
+) -> None:
+    """Check a few masks and images; diagnose the capture only if they disagree.
+
+    Args:
+        recording: The capture; live sources are not checked.
+        inputs: Inputs as the user named them, for the suggested command.
+        console: Shows warnings.
+        force: Whether to warn of an unusable capture instead of refusing it.
+
+    Raises:
+        InputError: If the capture is unusable.
+    """
+    if passes_quick_check(recording):
+        return
+    with console.status("poses, masks and images disagree; diagnosing"):
+        found = check_opened_capture(recording)
+    causes, iou = set(found.causes) - {"mask_polarity"}, found.mask_iou or 0.0
+    unusable = found.verdict == "unusable"
+    if not (unusable or causes or iou < GOOD_IOU):
+        return
+    expected = f" ({GOOD_IOU} or more expected)" if unusable else ""
+    but = " The masks do not match the images." if found.has_film_errors else ""
+    message = (
+        f"IoU of body and masks: {iou:.2f}{expected}.{but} {_explain(found)} "
+        f"{_suggest_command(found, inputs)}"
+    )
+    if unusable and not force:
+        raise InputError(f"{message} To train anyway, pass --force.")
+    console.warning(message)
+
+
+def correction_hint(inputs: CaptureInputs) -> str:
+    """Suggest a correction for a capture that could not be opened; empty if none is known."""
+    if inputs.live or camera_address(inputs.video) is not None:
+        return ""
+    with suppress(InputError):
+        found = check_capture(inputs)
+        return f"{_explain(found)} {_suggest_command(found, inputs)}" if found.causes else ""
+    return ""
+
+
+def _explain(check: CaptureValidation) -> str:
+    if check.diagnosis is None or not check.diagnosis.corrections:
+        return check.unexplained
+    words = "; and ".join(each.description for each in check.diagnosis.corrections)
+    return f"Probable cause: {words}. {check.expected_improvement}".strip()
+
+
+def _suggest_command(check: CaptureValidation, inputs: CaptureInputs) -> str:
+    """Suggest the command that corrects the capture, or that shows it."""
+    aim = "correct" if check.causes else "inspect"
+    return f"To {aim} it: {check_command(inputs, fix=bool(check.causes))}"

@@ -7,15 +7,23 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from apps.cli.command_line import interrupt_event
 from apps.cli.console import Console
-from apps.cli.interrupt import interrupt_event
-from apps.report.coverage_map import CoverageMap
+from apps.report.report_figures import CoverageMap
 from apps.report.report_schema import format_percent, provisional_verdict
-from apps.run.package_snapshot import validation_views, write_package_snapshot
 from apps.run.run_folder import RunFolder
-from apps.run.training_observer import ObservableSession
-from apps.view.preview_poses import DANCE, FILMED, NEWEST, PreviewPoses
-from apps.view.viser_page import BACKGROUND_RGB, FRAME_PX, BrowserCamera, ViserPage
+from apps.run.snapshot_writer import validation_views, write_package_snapshot
+from apps.run.training_session import TrainingSession
+from apps.run.viser_page import (
+    BACKGROUND_RGB,
+    DANCE,
+    FILMED,
+    FRAME_PX,
+    NEWEST,
+    BrowserCamera,
+    PreviewPoses,
+    ViserPage,
+)
 from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.coverage_advice import coverage_advice
 from avatar.events import Evaluated, Finished, TrainEvent
@@ -85,7 +93,7 @@ class LiveViewer:
             self._next_panel = 0.0
         self._finished = isinstance(event, Finished)
 
-    def between_steps(self, session: ObservableSession) -> None:
+    def between_steps(self, session: TrainingSession) -> None:
         """Update the page within its share of the time; pause or save if requested."""
         what = "Writing the package, after" if self._finished else "Training,"
         self._update_page(session, f"{what} {self._progress_text(session)}", idle=False)
@@ -96,7 +104,7 @@ class LiveViewer:
             with session.trainer.paused():
                 self._wait_while_paused(session)
 
-    def serve_until_interrupt(self, session: ObservableSession) -> None:
+    def serve_until_interrupt(self, session: TrainingSession) -> None:
         """Keep the page open after training, until Ctrl-C."""
         self.page.disable_controls()
         status = f"Done after {session.trainer.wall_seconds:.0f} s"
@@ -110,11 +118,11 @@ class LiveViewer:
         """Close the page."""
         self.page.close()
 
-    def _progress_text(self, session: ObservableSession) -> str:
+    def _progress_text(self, session: TrainingSession) -> str:
         trainer = session.trainer
         return f"{trainer.wall_seconds:.0f} of {trainer.config.seconds:.0f} s"
 
-    def _wait_while_paused(self, session: ObservableSession) -> None:
+    def _wait_while_paused(self, session: TrainingSession) -> None:
         """Wait until the user resumes training, or presses Ctrl-C."""
         self._next_panel = 0.0
         status = f"Paused after {self._progress_text(session)}"
@@ -125,7 +133,7 @@ class LiveViewer:
             time.sleep(0.02)
         self._next_panel = 0.0
 
-    def _save_package(self, session: ObservableSession) -> None:
+    def _save_package(self, session: TrainingSession) -> None:
         """Write the avatar in its current state as a package."""
         self.page.save_requested = False
         trainer, mark = session.trainer, session.curve[-1] if session.curve else None
@@ -149,7 +157,7 @@ class LiveViewer:
         self.page.notify("Package saved", notes)
         self._console.info(f"Saved from the live viewer: {self._run.package}, {size}.")
 
-    def _update_page(self, session: ObservableSession, status: str, *, idle: bool) -> None:
+    def _update_page(self, session: TrainingSession, status: str, *, idle: bool) -> None:
         """Update the parts of the page that are due."""
         now = time.perf_counter()
         if now >= self._next_panel:
@@ -165,7 +173,7 @@ class LiveViewer:
                 share = IDLE_RENDER_TIME_SHARE if idle else RENDER_TIME_SHARE
                 self._next_picture = began + took / share
 
-    def _fill_panel(self, session: ObservableSession, status: str) -> None:
+    def _fill_panel(self, session: TrainingSession, status: str) -> None:
         trainer = session.trainer
         last = session.curve[-1] if session.curve else None
         psnr = None if last is None else last.psnr
@@ -190,7 +198,7 @@ class LiveViewer:
             self._shown_observation = newest
             self.page.show_frame(_letterbox(newest.frame.rgb))
 
-    def _fill_map(self, session: ObservableSession) -> None:
+    def _fill_map(self, session: TrainingSession) -> None:
         coverage = session.coverage
         if coverage.seen_share == self._mapped_coverage:
             return
@@ -199,7 +207,7 @@ class LiveViewer:
         self._mapped_coverage = coverage.seen_share
         self.page.show_coverage(coverage_advice(coverage), self._body_map.svg())
 
-    def _render_next_view(self, session: ObservableSession, *, idle: bool) -> bool:
+    def _render_next_view(self, session: TrainingSession, *, idle: bool) -> bool:
         """Render for the browser that has waited longest; return whether any needed it."""
         now = time.perf_counter()
         looks = self.page.browser_cameras()
@@ -232,7 +240,7 @@ class LiveViewer:
         return IDLE_HEIGHT_PX if idle else RESTING_HEIGHT_PX
 
     def _correspondence_grid(
-        self, session: ObservableSession, pose: BodyPose, now: float
+        self, session: TrainingSession, pose: BodyPose, now: float
     ) -> CorrespondenceGrid:
         """Return the pose's correspondence grid; solved again only if the pose has changed."""
         if self._cells is None or not np.array_equal(

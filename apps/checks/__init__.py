@@ -1,1 +1,0 @@
-"""ia-check: validate a capture before training."""
