@@ -173,7 +173,7 @@ class ClipFitter:
         Returns:
             Root mean square distance of the outlines before the step, px; robustly weighted.
         """
-        equations, error = self._linearise(fitted.outlines)
+        equations, error = self._linearise(fitted)
         self._add_priors(equations, fitted)
         moved, step = equations.solve()
         zoom = float(step[-1] * self._sigma_log_focal)
@@ -195,17 +195,17 @@ class ClipFitter:
         places = self.model.joints[0] + self.poses.translations
         return (views[:, :3] * places).sum(axis=1) + views[:, 3]
 
-    def _linearise(self, outlines: bool) -> tuple[ChainEquations, float]:
+    def _linearise(self, fitted: FitParameters) -> tuple[ChainEquations, float]:
         """The evidence's equations in prior standard deviations; the outlines' error, px."""
         equations = ChainEquations.empty(len(self.frames), 75, len(self.coefficients) + 1)
         squares = total = 0.0
         rest, parents = self.model.joints, self.model.space.shaped.body.parents
         carried = self.poses.joints(rest, parents).world_from_rest(rest)
         for index, frame in enumerate(self.frames):
-            if frame.mask is None or not outlines:
+            if frame.mask is None or not fitted.outlines:
                 continue
             mask = replace(frame.mask, camera=self.camera(index))
-            seen = self.model.compare(carried[index], mask)
+            seen = self.model.compare(carried[index], mask, proportions=fitted.proportions)
             if seen is None:
                 continue
             precision = self.weights.outline_rows / SIGMA_OUTLINE_PX**2

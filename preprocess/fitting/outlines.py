@@ -119,20 +119,27 @@ class OutlineModel:
         self._normals = normals.astype(np.float32)
 
     def compare(
-        self, transforms: Float[np.ndarray, "24 4 4"], mask: OutlineDistances
+        self,
+        transforms: Float[np.ndarray, "24 4 4"],
+        mask: OutlineDistances,
+        *,
+        proportions: bool = True,
     ) -> OutlineRows | None:
         """Residuals of a pose before a mask; None where the silhouette cannot be compared.
 
         Args:
             transforms: World from rest of each joint, for the present proportions.
             mask: Outline of the mask.
+            proportions: Whether these may change; else the derivatives by them are left at 0.
         """
         points, normals = self._posed(transforms)
         chosen, matched = self._match(points, normals, mask)
         if not len(matched.normals):
             return None
         rows = chosen[matched.index]
-        return self._linearise(points[rows], rows, transforms, mask.camera, matched)
+        return self._linearise(
+            points[rows], rows, transforms, mask.camera, matched, proportions=proportions
+        )
 
     def _posed(
         self, transforms: Float[np.ndarray, "24 4 4"]
@@ -155,10 +162,11 @@ class OutlineModel:
         """Rim points of the skin, and residuals between them and the mask's outline."""
         camera = mask.camera
         view = points - camera.center_world.astype(np.float32)
-        cosine = (normals * view).sum(axis=1) / (
-            np.linalg.norm(normals, axis=1) * np.linalg.norm(view, axis=1) + 1e-9
+        towards, lengths, distances = (
+            np.einsum("pa,pa->p", one, other)
+            for one, other in ((normals, view), (normals, normals), (view, view))
         )
-        near = np.flatnonzero(np.abs(cosine) < MAX_RIM_COSINE)
+        near = np.flatnonzero(towards**2 < MAX_RIM_COSINE**2 * lengths * distances)
         pixels = camera.project(points[near].astype(np.float64))
         depth_px, _ = _sample(signed_distance_px(splat_silhouette(points, camera)), pixels)
         outer = np.abs(depth_px) < MAX_RIM_DEPTH_PX
@@ -173,7 +181,8 @@ class OutlineModel:
         inside = (np.minimum(pixels[some], (width, height) - pixels[some]) > IMAGE_BORDER_PX).all(1)
         some, value, slope = some[inside], value[inside], slope[inside]
         value = value - within[some]
-        _, nearest = KDTree(pixels).query(mask.border)
+        tree = KDTree(pixels, compact_nodes=False, balanced_tree=False)  # half the time
+        _, nearest = tree.query(mask.border)
         back = ((pixels[nearest] - mask.border) * mask.normals).sum(axis=1) - within[nearest]
         return chosen, _Matches(
             index=np.concatenate([some, nearest]),
@@ -188,6 +197,8 @@ class OutlineModel:
         transforms: Float[np.ndarray, "24 4 4"],
         camera: Camera,
         matched: "_Matches",
+        *,
+        proportions: bool = True,
     ) -> OutlineRows:
         """Residuals with their derivatives, by the chain rule through projection and skinning."""
         rotation = camera.camera_from_world[:3, :3]
@@ -206,7 +217,11 @@ class OutlineModel:
         parts = weights[..., None] * by_bone
         moved = (self._below @ parts.reshape(24, -1)).reshape(parts.shape)
         lever = moved - (self._below @ weights)[..., None] * places[:, None]
-        wrench = np.cross(lever, in_world[None]) @ turns  # n·(ω × l) = ω·(l × n)
+        (x, y, z), (a, b, c) = np.moveaxis(lever, -1, 0), in_world.T
+        wrench = np.empty_like(lever)  # n·(ω × l) = ω·(l × n)
+        for axis, part in enumerate((y * c - z * b, z * a - x * c, x * b - y * a)):
+            wrench[..., axis] = part
+        wrench = wrench @ turns
         pose = wrench.swapaxes(0, 1).reshape(len(rows), 72)
         size = np.abs(matched.residuals)
         robust = 1.0 / (1.0 + (matched.residuals / ROBUST_SCALE_PX) ** 2) ** 2
@@ -214,7 +229,11 @@ class OutlineModel:
             residuals=matched.residuals,
             weights=np.where(size < MAX_MATCH_PX, robust, 0.0),
             pose_jacobian=np.column_stack([pose, in_camera]),
-            shape_jacobian=self._shape_jacobian(rows, weights, turns, in_world),
+            shape_jacobian=(
+                self._shape_jacobian(rows, weights, turns, in_world)
+                if proportions
+                else np.zeros((len(rows), self.space.count))
+            ),
             focal_jacobian=(focal * plane).sum(axis=1),
         )
 
