@@ -49,7 +49,8 @@ class EvidenceWeights(NamedTuple):
 
     Attributes:
         outline_rows: Independent distances along one outline; neighbors on it err alike.
-        keypoints: Factor of the key points' precision in the picture.
+        keypoints: Factor of the key points' precision in the picture, where an outline tells the
+            pose, too.
     """
 
     outline_rows: float = 60.0
@@ -216,20 +217,21 @@ class ClipFitter:
                 [seen.shape_jacobian, self._sigma_log_focal * seen.focal_jacobian]
             )
             equations.add(index, seen.pose_jacobian * POSE_SIGMA, shared, seen.residuals, weight)
-        self._add_keypoints(equations)
+        self._add_keypoints(equations, fitted.outlines)
         return equations, float(np.sqrt(squares / max(total, 1e-9)))
 
-    def _add_keypoints(self, equations: ChainEquations) -> None:
+    def _add_keypoints(self, equations: ChainEquations, outlines: bool) -> None:
         """Adds the key points of all frames."""
         if self._keypoints is None:
             return
+        outlined = [outlines and frame.mask is not None for frame in self.frames]
         cameras = [self.camera(index) for index in range(len(self.frames))]
         seen = self._keypoint_model.compare(
             self.poses,
             self.model.joints,
             ClipCameras.of(cameras),
             self._keypoints,
-            self.weights.keypoints,
+            np.where(outlined, self.weights.keypoints, 1.0),
         )
         focal = self._sigma_log_focal * seen.focal_jacobian[..., None]
         equations.add_all(

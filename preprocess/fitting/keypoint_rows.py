@@ -191,7 +191,7 @@ class KeypointModel:
         rest_joints: Float[np.ndarray, "24 3"],
         cameras: ClipCameras,
         found: ClipKeypoints,
-        weight: float = 1.0,
+        factors: Float[np.ndarray, "frames"],
     ) -> KeypointRows:
         """Residuals of poses, for the rest joints of the present proportions.
 
@@ -200,7 +200,7 @@ class KeypointModel:
             rest_joints: The person's.
             cameras: Of the frames.
             found: Key points of the frames.
-            weight: Factor of their precision in the picture.
+            factors: Factor of their precision in the picture, for each frame.
         """
         joints = poses.joints(rest_joints, self._parents)
         rotation = cameras.rotations[:, None]
@@ -220,7 +220,8 @@ class KeypointModel:
         view[..., 0, 0], view[..., 1, 1] = scale[..., 0], scale[..., 1]
         view[..., 2] = -scale * plane
         robust = 1.0 / (1.0 + (off**2).sum(axis=-1) / ROBUST_KEYPOINT_PX**2) ** 2
-        weights = weight * PIXEL_WEIGHTS * found.confidence * robust / SIGMA_KEYPOINT_PX**2
+        weights = factors[:, None] * PIXEL_WEIGHTS * found.confidence * robust
+        weights /= SIGMA_KEYPOINT_PX**2
         one, other = _PAIRS[:, 0], _PAIRS[:, 1]
         farther = (points[:, other, 2] - points[:, one, 2]) - (
             found.depths_m[:, other] - found.depths_m[:, one]

@@ -22,7 +22,9 @@ def problem(turning_person, mean_body, keypoint_camera, track_motion):
     def compare(step=np.zeros(75), coefficients=np.zeros(space.count), log_focal=0.0):  # noqa: B008 - not changed
         poses = start.moved(np.tile(step, (3, 1)), seen.rotations)
         focal = seen._replace(focal_px=seen.focal_px * np.exp(log_focal))
-        return model.compare(poses, space.shape(coefficients).joints, focal, found)
+        return model.compare(
+            poses, space.shape(coefficients).joints, focal, found, np.ones(len(found.pixels))
+        )
 
     return compare
 

@@ -12,7 +12,7 @@ from preprocess.body.parametric_body import ShapedBody, load_body_model
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.fitting import capture_fitting
 from preprocess.fitting.capture_fitting import apply_fit, fit_capture, fitted_motion
-from preprocess.fitting.clip_fitting import USUAL_WEIGHTS
+from preprocess.fitting.clip_fitting import USUAL_WEIGHTS, FitParameters
 from preprocess.fitting.keypoint_rows import KEYPOINT_JOINTS, KEYPOINT_OFFSETS_M
 from preprocess.fitting.tracked_frames import (
     LAG_FRAMES,
@@ -140,6 +140,16 @@ def test_key_points_that_are_off_in_all_frames_give_way_to_outlines(lifted, trut
         error[weights] = float(np.linalg.norm(away[..., :2], axis=2).mean())
     told, usual = error.values()
     assert told < 0.95 * usual
+
+
+def test_key_points_alone_count_fully_so_that_a_fast_walk_is_followed(lifted):
+    found = []
+    for share in (0.1, 1.0):
+        fitter = capture_fitting.make_fitter(lifted)
+        fitter.weights = capture_fitting.TRACKED_WEIGHTS._replace(keypoints=share)
+        fitter.iterate(FitParameters(outlines=False))
+        found.append(fitter.poses.translations)
+    np.testing.assert_allclose(*found)
 
 
 def test_poses_follow_outlines_closer_than_proportions_do(lifted, fit, monkeypatch):
