@@ -96,7 +96,7 @@ def test_commands_that_need_it_say_what_to_install(place, run, film):
     learn = "pip install 'instant-avatar-stream[learn]'"
     wanted = [
         (["ingest", str(film), "--out", "run"], f"ia-ingest: torch is not installed.* {learn}"),
-        (["evaluate", str(run)], f"ia-evaluate: numba is not installed.* {learn}"),
+        (["evaluate", str(run)], f"ia-evaluate: torch is not installed.* {learn}"),
         (["sample", "film"], f"ia-sample: numba is not installed.* {learn}"),
         (["export", str(run), "--out", "a.iavatar"], f"ia-export: torch is not .* {learn}"),
         (["export", "avatar.iavatar", "--to", "ply", "--out", "a.ply"], "pip install trimesh"),
