@@ -68,8 +68,8 @@ class TrackArguments:
     """Poses to write, .npz; the rest is written beside it (default: runs/NAME-tracked/poses.npz,
     named after the video)."""
     person: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
-    """Which person: 1 is the leftmost in the first frame that shows a person (default: the one in
-    front)."""
+    """Which person, counted from left to right from 1 in the first frame with that many persons
+    (default: the largest)."""
     tracker: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """Another installed tracker to use (default: blazepose, the built-in one; docs/formats.md)."""
     masks: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
