@@ -16,6 +16,7 @@ from capture.input_error import InputError
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.correction_search import (
     GOOD_IOU,
+    MIN_IOU_GAIN,
     USABLE_IOU,
     CorrectionResult,
     find_corrections,
@@ -60,6 +61,9 @@ MIN_COVERED = 0.85
 """Share of the body that such masks cover."""
 QUICK_OFFSETS = (1, -1, 2, -2)
 """Delays of the poses, in frames, that are tested even if poses and masks match."""
+QUICK_GAIN = 0.75 * MIN_IOU_GAIN
+"""Gain in mean IoU of such a delay from which the capture is looked into: one that brings less
+than `MIN_IOU_GAIN` would not be named, and inexact poses gain 0.01 by chance."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -224,7 +228,7 @@ def passes_quick_check(recording: Capture) -> bool:
         mean_score(evidence.frame_scores(undo_pose_delay(offset).apply(hypothesis)))
         for offset in QUICK_OFFSETS
     ]
-    if now < GOOD_IOU or now < max(shifts):
+    if now < GOOD_IOU or now < max(shifts) - QUICK_GAIN:
         return False
     if evidence.are_boxes:
         return True

@@ -372,6 +372,12 @@ def test_a_glance_is_enough_for_a_good_capture_and_notices_a_late_one(dancing, s
     )
 
 
+def test_a_delay_that_gains_little_is_chance(dancing, monkeypatch):
+    scores = iter([0.80, 0.81, 0.80, 0.79, 0.80])
+    monkeypatch.setattr("apps.capture_validation.mean_score", lambda _: next(scores))
+    assert passes_quick_check(open_capture(CaptureInputs(video=dancing)))
+
+
 def test_a_glance_notices_a_mirrored_film(spoilt):
     assert not passes_quick_check(
         open_capture(CaptureInputs(video=spoilt(capture_corruptions.mirror_video)))
