@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
+from capture.source import FrameSource
 from capture.source_opening import open_source
 from preprocess.alignment.capture_evidence import CaptureEvidence
 from preprocess.alignment.capture_geometry import CaptureGeometry
@@ -37,14 +38,15 @@ from preprocess.fitting.clip_fitting import (
 from preprocess.fitting.outlines import OUTLINE_PERSON_PX, OutlineDistances
 from preprocess.observation import Observation, associate_cameras
 
-KEY_FRAMES = 120
-"""Frames, evenly spread, whose masks are fitted; poses between them follow their neighbors."""
-MIN_ITERATIONS = 6
-"""Fewest Gauss-Newton iterations; the first ones may overshoot."""
+KEY_FRAMES = 75
+"""Frames, evenly spread, whose masks are fitted."""
+CHAIN_FRAMES = 300
+"""Frames, evenly spread, whose given poses are fitted: those without a mask follow their neighbors
+and are human; poses between them follow."""
+MIN_ITERATIONS = 4
+"""Fewest Gauss-Newton iterations."""
 MAX_ITERATIONS = 12
 """Most Gauss-Newton iterations."""
-ESTIMATED_KEY_FRAMES = 60
-"""Frames whose masks are fitted where masks must be estimated."""
 TRACKED_KEY_FRAMES = 300
 """Frames, evenly spread, whose masks are fitted together with key points."""
 TRACKED_FRAMES_PER_PRIOR = 30.0
@@ -57,14 +59,16 @@ POSE_ITERATIONS = 2
 """Iterations over poses alone after those, with `TRACKED_POSE_WEIGHTS`."""
 TRACKED_POSE_WEIGHTS = EvidenceWeights(outline_rows=480.0, keypoints=0.6)
 """Evidence of poses alone counts more against their priors; proportions would follow clothes."""
-PROPORTION_ITERATIONS = 4
+PROPORTION_ITERATIONS = 7
 """Iterations that show how well proportions and focal length alone explain the masks."""
+PROPORTION_STEP = 3
+"""Every which frame is enough for that."""
 MIN_ERROR_DECREASE = 0.01
 """Relative decrease of the error below which the iterations end."""
 MAX_ERROR_RATIO = 0.9
 """Ratio of the errors with and without corrected poses above which the poses are exact."""
 MIN_ROOT_TURN_DEG = 1.0
-"""Mean rotation of the roots below which the poses are exact, degrees."""
+"""Mean rotation of the roots below which the poses are exact, degrees; exact ones turn by 0.75."""
 MIN_FRAMES = 4
 """Fewest frames with a usable mask for which an alignment is attempted."""
 
@@ -123,12 +127,10 @@ def fit_capture(capture: Capture, *, fit_body: bool = True) -> CaptureFit | None
         return None
     everything = FitParameters(proportions=fit_body, focal=not capture.cameras.is_moving)
     if tracked:
-        errors = settling = _fit_tracked(fitter, everything)
+        settling = _fit_tracked(fitter, everything)
     else:
-        alone = everything._replace(poses=False)
-        errors = [fitter.iterate(alone) for _ in range(PROPORTION_ITERATIONS)]
         settling = _iterate_until_settled(fitter, everything)
-    before, explained, after = errors[0], settling[0], settling[-1]
+    before, after = settling[0], settling[-1]
     corrections = fitter.corrections
     turned = np.degrees(np.linalg.norm(corrections[:, :3], axis=1).mean())
     pixel_cm = 100.0 * capture.pixel_footprint_m() * _reduction(capture, fitter)
@@ -138,9 +140,22 @@ def fit_capture(capture: Capture, *, fit_body: bool = True) -> CaptureFit | None
         corrections=_interpolate_corrections(capture, fitter, corrections),
         error_before_cm=before * pixel_cm,
         error_after_cm=after * pixel_cm,
-        taken=tracked or bool(after < MAX_ERROR_RATIO * explained and turned > MIN_ROOT_TURN_DEG),
+        taken=tracked
+        or bool(
+            turned > MIN_ROOT_TURN_DEG
+            and after < MAX_ERROR_RATIO * _explained_error(capture, fitter, everything)
+        ),
         fits_body=fit_body,
     )
+
+
+def _explained_error(capture: Capture, fitter: ClipFitter, fitted: FitParameters) -> float:
+    """The outlines' error, px, where only proportions and focal length change."""
+    some = [frame for frame in fitter.frames if frame.mask is not None]
+    some = some[:: PROPORTION_STEP if len(some) > KEY_FRAMES // 2 else 1]
+    alone = ClipFitter(capture.motion, fitter.model.space, some)
+    held = fitted._replace(poses=False)
+    return [alone.iterate(held) for _ in range(PROPORTION_ITERATIONS)][-1]
 
 
 def _fit_tracked(fitter: ClipFitter, everything: FitParameters) -> list[float]:
@@ -184,9 +199,9 @@ def make_fitter(capture: Capture) -> ClipFitter | None:
         return None
     geometry, space = capture.geometry(), ProportionSpace.around(capture.shaped)
     count = TRACKED_KEY_FRAMES if track else KEY_FRAMES
-    count = ESTIMATED_KEY_FRAMES if capture.segment else count
     outlines = _read_outlines(capture, geometry, count) if has_masks else {}
-    numbers = {*outlines, *([] if track is None else track.frames.tolist())}
+    others = _spread_frames(capture.source) if track is None else track.frames.tolist()
+    numbers = {*outlines, *others}
     sizes = [each.camera.size_px for each in outlines.values()]
     size_px = sizes[0] if sizes else _reduced_size_px(capture)
     camera_row, frames = associate_cameras(capture.cameras, capture.source), []
@@ -196,7 +211,7 @@ def make_fitter(capture: Capture) -> ClipFitter | None:
             mask = outlines.get(number)
             camera = geometry.camera_at(camera_row(number), size_px)
             frames.append(ClipFrame(row=row, number=float(number), camera=camera, mask=mask))
-    if len(frames) < MIN_FRAMES:
+    if len(frames) < MIN_FRAMES or (track is None and len(outlines) < MIN_FRAMES):
         return None
     if track is None:
         return ClipFitter(capture.motion, space, frames)
@@ -209,6 +224,13 @@ def make_fitter(capture: Capture) -> ClipFitter | None:
         frames_per_prior=TRACKED_FRAMES_PER_PRIOR,
         weights=TRACKED_WEIGHTS if outlines else USUAL_WEIGHTS,
     )
+
+
+def _spread_frames(source: FrameSource) -> range:
+    """Numbers of at most `CHAIN_FRAMES` frames, evenly spread."""
+    chosen, count = source.selection, source.frame_count or 1
+    stride = chosen.step * -(-count // CHAIN_FRAMES)
+    return range(chosen.start, chosen.start + count * chosen.step, stride)
 
 
 def _reduced_size_px(capture: Capture) -> tuple[int, int]:

@@ -134,7 +134,8 @@ class ClipFitter:
         self.frames = tuple(frames)
         self.model = model or OutlineModel(space)
         self._keypoint_model = KeypointModel(space)
-        self._frames_per_prior, self.weights = frames_per_prior, weights
+        seen = sum(frame.mask is not None for frame in frames) if track is None else len(frames)
+        self._priors, self.weights = max(1.0, seen / frames_per_prior), weights
         self.coefficients = np.zeros(space.count)
         self.log_focal, self._sigma_log_focal = 0.0, sigma_log_focal
         self._given = ClipPoses.of(motion, [frame.row for frame in self.frames])
@@ -244,8 +245,7 @@ class ClipFitter:
     def _add_priors(self, equations: ChainEquations, fitted: FitParameters) -> None:
         """Adds the priors of all parameters, and holds those that are not fitted."""
         self._prior.add_to(equations, self.poses)
-        precision = np.full(len(self.coefficients) + 1, 1.0)
-        precision *= max(1.0, len(self.frames) / self._frames_per_prior)
+        precision = np.full(len(self.coefficients) + 1, self._priors)
         state = np.concatenate([self.coefficients, [self.log_focal / self._sigma_log_focal]])
         equations.add_shared(precision, state)
         held = np.zeros(len(state))

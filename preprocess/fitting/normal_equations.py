@@ -76,17 +76,21 @@ class ChainEquations:
         self.right_shared[:] -= np.tensordot(residuals, heavy_shared, axes=((0, 1), (0, 1)))
 
     def add_chain(
-        self, state: Float[np.ndarray, "frames n"], links: Float[np.ndarray, "gaps n"]
+        self,
+        state: Float[np.ndarray, "frames n"],
+        precision: Float[np.ndarray, "n"],
+        links: Float[np.ndarray, "gaps n"],
     ) -> None:
-        """Adds unit priors around 0 for each frame, and priors of equality between neighbors.
+        """Adds priors around 0 for each frame, and priors of equality between neighbors.
 
         Args:
             state: Present parameters.
+            precision: Of each parameter in one frame.
             links: Precision of the difference between neighbors.
         """
         each = np.arange(state.shape[1])
-        self.blocks[:, each, each] += 1.0
-        self.right[:] -= state
+        self.blocks[:, each, each] += precision
+        self.right[:] -= precision * state
         self.add_links(np.diff(state, axis=0), links)
 
     def add_links(

@@ -25,6 +25,16 @@ and head, collars, shoulders, elbows, wrists and hands."""
 CHANGE_PER_FRAME = 0.15
 """Standard deviation of a correction's change from a frame to the next, in prior standard
 deviations; over n frames it grows with the root of n."""
+SHARED_PRECISION = 0.1
+"""Precision of the correction that all frames share, relative to that of a frame's own: a tracker
+errs alike in all frames, and a turn that they share blurs nothing."""
+SIGMA_GUESSED_RAD = 0.08
+"""Standard deviation of the given rotations of toes and hands, which trackers guess, radians."""
+GUESSED_JOINTS = (10, 11, 22, 23)
+"""Toes and hands."""
+GIVEN_AXES = {1: "xyz", 4: "x", 7: "xz", 16: "xyz", 18: "xy"}
+"""Axes of the left joints (hip, knee, ankle, shoulder, elbow) about which people turn so freely
+that given poses say more than `LEFT_PRIORS`. Knees and elbows do not bend sideways."""
 
 
 def _pose_sigma() -> Float[np.ndarray, "75"]:
@@ -77,7 +87,7 @@ wrong is drawn to its neighbors before it may count as a fast motion (graduated 
 
 @final
 class GivenPosePrior:
-    """The poses are near given ones, and the corrections of neighboring frames are alike."""
+    """The poses are human, and near given ones, which err alike in all frames or in neighbors."""
 
     def __init__(
         self,
@@ -88,11 +98,14 @@ class GivenPosePrior:
         """Takes the given poses of the frames, and the frames' numbers."""
         self._given, self._cameras = given, camera_rotations
         links = 1.0 / (CHANGE_PER_FRAME**2 * np.maximum(np.diff(frame_numbers), 1.0))
-        self._links = np.repeat(links[:, None], 75, axis=1)
+        self._links = links[:, None] * _GIVEN_PRECISION
 
     def add_to(self, equations: ChainEquations, poses: ClipPoses) -> None:
         """Adds it to the equations of a step from the present poses, in units of `POSE_SIGMA`."""
-        equations.add_chain(poses.steps_from(self._given, self._cameras) / POSE_SIGMA, self._links)
+        apart = poses.steps_from(self._given, self._cameras) / POSE_SIGMA
+        apart -= (1.0 - SHARED_PRECISION) * apart.mean(axis=0)
+        equations.add_chain(apart, _GIVEN_PRECISION, self._links)
+        _add_human(equations, poses, _SIGMA_BESIDE_GIVEN)
 
 
 @final
@@ -125,17 +138,7 @@ class HumanPosePrior:
 
     def add_to(self, equations: ChainEquations, poses: ClipPoses) -> None:
         """Adds it to the equations of a step from the present poses, in units of `POSE_SIGMA`."""
-        vectors = rotation_vectors(poses.rotations)
-        by_step = _inverse_right_jacobian(vectors)
-        heavy = by_step / _SIGMA[..., None] ** 2
-        blocks = by_step.swapaxes(-1, -2) @ heavy
-        right = -(heavy.swapaxes(-1, -2) @ (vectors - _MEAN)[..., None])[..., 0]
-        units = POSE_SIGMA[:72].reshape(24, 3)
-        blocks *= units[:, :, None] * units[:, None]
-        for joint in range(24):
-            part = slice(3 * joint, 3 * joint + 3)
-            equations.blocks[:, part, part] += blocks[:, joint]
-        equations.right[:, :72] += (right * units).reshape(-1, 72)
+        _add_human(equations, poses, _SIGMA)
         each = np.arange(72, 75)
         equations.blocks[:, each, each] += (POSE_SIGMA[72:] / SIGMA_FREE) ** 2
         self._add_links(equations, poses)
@@ -153,6 +156,23 @@ class HumanPosePrior:
         equations.add_links(apart / POSE_SIGMA, usual * (POSE_SIGMA / self._change) ** 2)
 
 
+def _add_human(
+    equations: ChainEquations, poses: ClipPoses, sigma: Float[np.ndarray, "24 3"]
+) -> None:
+    """Adds priors of the joints' axis-angles around their means."""
+    vectors = rotation_vectors(poses.rotations)
+    by_step = _inverse_right_jacobian(vectors)
+    heavy = by_step / sigma[..., None] ** 2
+    blocks = by_step.swapaxes(-1, -2) @ heavy
+    right = -(heavy.swapaxes(-1, -2) @ (vectors - _MEAN)[..., None])[..., 0]
+    units = POSE_SIGMA[:72].reshape(24, 3)
+    blocks *= units[:, :, None] * units[:, None]
+    for joint in range(24):
+        part = slice(3 * joint, 3 * joint + 3)
+        equations.blocks[:, part, part] += blocks[:, joint]
+    equations.right[:, :72] += (right * units).reshape(-1, 72)
+
+
 def _human_priors() -> tuple[Float[np.ndarray, "24 3"], Float[np.ndarray, "24 3"]]:
     mean, sigma = np.zeros((24, 3)), np.full((24, 3), SIGMA_FREE)
     for left, (middle, spread) in LEFT_PRIORS.items():
@@ -163,7 +183,25 @@ def _human_priors() -> tuple[Float[np.ndarray, "24 3"], Float[np.ndarray, "24 3"
     return mean, sigma
 
 
+def _sigma_beside_given() -> Float[np.ndarray, "24 3"]:
+    """Standard deviations beside given poses, which alone count about `GIVEN_AXES`."""
+    sigma = _SIGMA.copy()
+    for left, axes in GIVEN_AXES.items():
+        for axis in axes:
+            sigma[left : left + 2, "xyz".index(axis)] = SIGMA_FREE
+    return sigma
+
+
+def _given_precision() -> Float[np.ndarray, "75"]:
+    """Precision of the given poses in units of `POSE_SIGMA`."""
+    precision = np.ones((25, 3))
+    guessed = list(GUESSED_JOINTS)
+    precision[guessed] = (POSE_SIGMA.reshape(25, 3)[guessed] / SIGMA_GUESSED_RAD) ** 2
+    return precision.ravel()
+
+
 _MEAN, _SIGMA = _human_priors()
+_SIGMA_BESIDE_GIVEN, _GIVEN_PRECISION = _sigma_beside_given(), _given_precision()
 
 
 def _inverse_right_jacobian(

@@ -80,15 +80,29 @@ def joint_error_cm(fitter: ClipFitter, person, truth: Motion) -> float:
     return 100.0 * float(np.mean(found))
 
 
+def turn_error_deg(fitter: ClipFitter, truth: Motion) -> float:
+    """Mean angle between the joints' rotations and the truth's: of hips and shoulders."""
+    some = [0, 1, 15, 16]
+    angles = [
+        (
+            Rotation.from_rotvec(fitter.pose(row).joint_rotations[some])
+            * Rotation.from_rotvec(truth[row].joint_rotations[some]).inv()
+        ).magnitude()
+        for row in range(len(truth))
+    ]
+    return float(np.degrees(np.mean(angles)))
+
+
 def test_poses_and_proportions_come_back(space):
     coefficients = np.zeros(space.count)
     coefficients[[11, 17, 20, 25]] = 1.5, -1.5, 1.5, 1.0  # thighs, forearms, girths
     truth, person = turning_motion(), space.shape(coefficients)
     fitter = ClipFitter(err_like_a_tracker(truth), space, outlines(space, coefficients, truth))
-    off = joint_error_cm(fitter, person, truth)
+    off, turned = joint_error_cm(fitter, person, truth), turn_error_deg(fitter, truth)
     errors_px = [fitter.iterate() for _ in range(9)]
     assert errors_px[-1] < 0.4 * errors_px[0]
     assert joint_error_cm(fitter, person, truth) < 0.6 * off
+    assert turn_error_deg(fitter, truth) < 0.6 * turned
 
 
 def test_what_is_not_fitted_stays(space):

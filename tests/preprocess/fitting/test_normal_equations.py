@@ -26,7 +26,7 @@ def test_the_chain_is_solved_as_the_whole_matrix_is():
         generator.standard_normal(shared),
     )
     links, precision = generator.random((frames - 1, own)), generator.random(shared)
-    equations.add_chain(state, links)
+    equations.add_chain(state, np.ones(state.shape[1]), links)
     equations.add_shared(precision, state_shared)
     flat = state.ravel()
     dense[range(frames * own), range(frames * own)] += 1.0
@@ -49,7 +49,7 @@ def test_the_chain_is_solved_as_the_whole_matrix_is():
 def test_what_is_held_does_not_move():
     equations = ChainEquations.empty(2, 3, 2)
     equations.add(0, np.eye(3), np.ones((3, 2)), np.ones(3), np.ones(3))
-    equations.add_chain(np.zeros((2, 3)), np.ones((1, 3)))
+    equations.add_chain(np.zeros((2, 3)), np.ones(3), np.ones((1, 3)))
     equations.add_shared(np.ones(2), np.zeros(2))
     equations.hold(np.array([1e9, 0.0]), 0.0)
     moved, shared = equations.solve()

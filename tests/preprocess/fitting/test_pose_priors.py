@@ -6,7 +6,7 @@ import numpy as np
 
 from preprocess.fitting.clip_poses import ClipPoses
 from preprocess.fitting.normal_equations import ChainEquations
-from preprocess.fitting.pose_priors import POSE_SIGMA, HumanPosePrior
+from preprocess.fitting.pose_priors import POSE_SIGMA, GivenPosePrior, HumanPosePrior
 
 
 def settle(poses: ClipPoses, iterations: int = 8) -> ClipPoses:
@@ -48,3 +48,23 @@ def test_a_steady_turn_stays_and_jitter_goes(turning_person):
     before = ClipPoses.of(shaken, range(30)).steps_from(steady, cameras)[5:-5, :3]
     assert np.abs(kept).max() < 0.01
     assert np.diff(calmed, axis=0).std() < 0.35 * np.diff(before, axis=0).std()
+
+
+def test_given_knees_bend_forwards_only_and_toes_are_straight(turning_person):
+    motion, cameras = turning_person(5), np.tile(np.eye(3), (5, 1, 1))
+    off = motion.joint_rotations.copy()
+    off[:, 3] = 0.5, 0.4, 0.3  # a knee
+    off[:, 15] = 0.2, -0.3, -1.2  # a shoulder
+    off[:, 9] = 0.0, 0.2, 0.0  # toes
+    given = ClipPoses.of(replace(motion, joint_rotations=off), range(5))
+    prior, poses = GivenPosePrior(given, cameras, np.arange(5.0)), given
+    for _ in range(8):
+        equations = ChainEquations.empty(5, 75, 1)
+        prior.add_to(equations, poses)
+        equations.add_shared(np.ones(1), np.zeros(1))
+        poses = poses.moved(equations.solve()[0] * POSE_SIGMA, cameras)
+    joints = poses[2].joint_rotations
+    assert np.abs(joints[3, 1:]).max() < 0.15
+    assert joints[3, 0] > 0.4
+    assert np.allclose(joints[15], off[2, 15], atol=1e-3)
+    assert abs(joints[9, 1]) < 0.05
