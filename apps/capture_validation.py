@@ -62,8 +62,7 @@ MIN_COVERED = 0.85
 QUICK_OFFSETS = (1, -1, 2, -2)
 """Delays of the poses, in frames, that are tested even if poses and masks match."""
 QUICK_GAIN = 0.75 * MIN_IOU_GAIN
-"""Gain in mean IoU of such a delay from which the capture is looked into: one that brings less
-than `MIN_IOU_GAIN` would not be named, and inexact poses gain 0.01 by chance."""
+"""Gain in mean IoU of such a delay that is looked into: inexact poses gain 0.01 by chance."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
