@@ -50,8 +50,8 @@ class HeldOutScore:
         psnr: PSNR of the whole frame, dB.
         psnr_mask: PSNR where alpha > 0.5, dB.
         ssim: SSIM of the whole frame, in [-1, 1].
-        blur: Equivalent blur, as a share of the person's height (`avatar.evaluation.sharpness`);
-            NaN if not measured.
+        blur: Equivalent blur, as a share of the person's height (`image_metrics`); NaN if not
+            measured.
         overlap: Soft IoU of the rendered alpha and the mask, in [0, 1]; NaN if not measured.
     """
 

@@ -14,21 +14,20 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
+from avatar.avatar_model import Avatar, OrientationShading
 from avatar.correspondence_grid import (
     CorrespondenceCheck,
     CorrespondenceGrid,
     cull_cells,
     screen_bounds,
 )
-from avatar.field.avatar_model import Avatar
-from avatar.field.orientation_shading import OrientationShading
-from avatar.field.radiance_field import RadianceField
 from avatar.kernels.backend_protocol import (
     CorrespondenceTables,
     DensityGrid,
     MarchSettings,
     RayBatch,
 )
+from avatar.radiance_field import RadianceField
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
 

@@ -19,10 +19,10 @@ from typing import NamedTuple
 import torch
 import tyro
 
+from avatar.avatar_model import Avatar
 from avatar.evaluation.held_out import HeldOutFrame
-from avatar.field.avatar_model import Avatar
 from avatar.rig import Rig
-from avatar.training.training_frame import TrainingFrame
+from avatar.training.frame_stream import TrainingFrame
 from baselines.instant_avatar.samplers import BaselineScheme
 from benchmarks.ablation_page import AblationPage, written
 from benchmarks.hardware import Hardware

@@ -175,7 +175,7 @@ def psnr_by_cameras(capture: Path, runs: Path) -> dict[str, float]:
     import torch
 
     from avatar.rig import Rig
-    from avatar.training.warmup import warm_up
+    from avatar.training.train import warm_up
     from benchmarks.sample_training import load_trainer, train_for_core_seconds, training_config
     from benchmarks.stopwatch import limit_threads
     from benchmarks.training_quality import mean_psnr

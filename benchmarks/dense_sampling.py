@@ -28,8 +28,8 @@ from avatar.kernels.backend_protocol import (
     RaySamples,
 )
 from avatar.render import EMPTY_LOG_DENSITY
+from avatar.training.frame_stream import TrainingFrame
 from avatar.training.replay_buffer import ReplayBuffer
-from avatar.training.training_frame import TrainingFrame
 
 MAX_DENSE_SAMPLES = 512
 REACH_M = 1.0

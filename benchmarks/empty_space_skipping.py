@@ -16,9 +16,9 @@ from avatar.evaluation.held_out import HeldOutFrame
 from avatar.evaluation.image_metrics import composite_on_white, psnr
 from avatar.kernels.backend_protocol import RayBatch
 from avatar.render import correspondence_tables, render
-from avatar.training.optimizer import cosine_decay
+from avatar.training.frame_stream import RayView, TrainingFrame, rebuild_frame
 from avatar.training.replay_buffer import ReplayBuffer
-from avatar.training.training_frame import RayView, TrainingFrame, rebuild_frame
+from avatar.training.trainer import cosine_decay
 from benchmarks.dense_sampling import DenseSampler, dense_as_in_paper, dense_in_box
 from benchmarks.measurements import Measurement
 from benchmarks.sample_training import LoadedTrainer

@@ -26,8 +26,7 @@ def main() -> None:
     from avatar.events import Stepped
     from avatar.rig import Rig
     from avatar.training.frame_stream import prepare_stream
-    from avatar.training.train import Trainer, train
-    from avatar.training.warmup import warm_up
+    from avatar.training.train import Trainer, train, warm_up
     from capture.inbox import Inbox
 
     set_threads(None)

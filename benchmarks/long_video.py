@@ -18,7 +18,7 @@ import numpy as np
 
 from apps.cli.console import Console
 from apps.run.run_folder import RunFolder
-from avatar.training.warmup import warm_up
+from avatar.training.train import warm_up
 from benchmarks.hardware import ROOT
 from benchmarks.measurements import Measurement
 from benchmarks.sample_training import open_sample

@@ -12,10 +12,9 @@ from avatar.config import TrainConfig
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.events import HeldOutScore
 from avatar.rig import Rig
-from avatar.training.optimizer import cosine_decay
-from avatar.training.trainer import Trainer
-from avatar.training.training_frame import TrainingFrame
-from avatar.training.warmup import warm_up
+from avatar.training.frame_stream import TrainingFrame
+from avatar.training.train import warm_up
+from avatar.training.trainer import Trainer, cosine_decay
 from baselines.instant_avatar.samplers import BaselineScheme, BaselineTrainer
 from benchmarks.sample_training import training_config
 from benchmarks.stopwatch import limit_threads

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
+from avatar.avatar_model import Avatar
 from avatar.config import HELD_OUT_STRIDE
 from avatar.evaluation.held_out import HeldOutFrame
 from avatar.evaluation.image_metrics import composite_on_white, ground_truth_on_white, psnr
-from avatar.field.avatar_model import Avatar
 from avatar.render import render
 from avatar.training.frame_stream import prepare_stream
 from benchmarks.end_to_end import novel_observations

@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float
 
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
-from avatar.pose.pose_optimizer import PoseOptimizer
 from avatar.training import checkpoint
+from avatar.training.checkpoint import LAST_RUN_FILE, SavedFrames
 from avatar.training.held_out_pose_fitting import fit_test_poses
-from avatar.training.saved_frames import LAST_RUN_FILE, SavedFrames
+from avatar.training.pose_optimizer import PoseOptimizer
 from avatar.training.trainer import Trainer
 from baselines.systems.compared_capture import novel_observations
 from capture.camera import Camera

@@ -10,10 +10,9 @@ import torch
 from avatar.config import TrainConfig
 from avatar.evaluation.held_out import HeldOutFrame
 from avatar.rig import Rig
-from avatar.training.frame_stream import prepare_stream
-from avatar.training.optimizer import cosine_decay
+from avatar.training.frame_stream import TrainingFrame, prepare_stream
 from avatar.training.train import Trainer
-from avatar.training.training_frame import TrainingFrame
+from avatar.training.trainer import cosine_decay
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.open_capture import open_capture
 from studio.shoot import ShootConfig, film_capture

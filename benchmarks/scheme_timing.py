@@ -7,9 +7,9 @@ from functools import partial
 
 import numpy as np
 
+from avatar.avatar_model import Avatar
 from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.held_out import HeldOutFrame, score_rendering
-from avatar.field.avatar_model import Avatar
 from avatar.render import render
 from baselines.instant_avatar.samplers import BaselineScheme
 from baselines.instant_avatar.scheme_rendering import render_sampler, render_samples

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from avatar.backends import TorchBackend
 from avatar.config import TrainConfig
-from avatar.field.field_priors import sample_tv_pairs
 from avatar.kernels import torch_reference
 from avatar.kernels.backend_protocol import MarchSettings
+from avatar.radiance_field import sample_tv_pairs
 from avatar.training.replay_buffer import ReplayBuffer, TrainingBatch
 from avatar.training.training_step import compute_gradients
 from baselines.instant_avatar.autograd_steps import (

@@ -8,15 +8,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from avatar.avatar_model import Avatar
 from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.held_out import HeldOutFrame, subsample_evenly
-from avatar.field.avatar_model import Avatar
 from avatar.rig import Rig
 from avatar.training.frame_stream import is_held_out, prepare_stream
-from avatar.training.optimizer import cosine_decay
-from avatar.training.train import train
-from avatar.training.trainer import Trainer
-from avatar.training.warmup import warm_up
+from avatar.training.train import train, warm_up
+from avatar.training.trainer import Trainer, cosine_decay
 from benchmarks.hardware import Hardware
 from benchmarks.measurements import Measurement
 from benchmarks.sample_training import load_trainer, open_sample, training_config

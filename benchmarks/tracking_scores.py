@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float
 
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.training import checkpoint
+from avatar.training.checkpoint import LAST_RUN_FILE, SavedFrames
 from avatar.training.held_out_pose_fitting import fit_test_poses
-from avatar.training.saved_frames import LAST_RUN_FILE, SavedFrames
 from benchmarks.real_scores import TRACKED_JOINTS
 from capture.input_error import InputError
 from preprocess.alignment.silhouette_objective import spaced_indices

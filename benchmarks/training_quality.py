@@ -8,14 +8,13 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from avatar.avatar_model import Avatar
 from avatar.config import TrainConfig
 from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
-from avatar.field.avatar_model import Avatar
 from avatar.rig import Rig
 from avatar.training.frame_stream import prepare_stream
-from avatar.training.train import Trainer, train
-from avatar.training.warmup import warm_up
+from avatar.training.train import Trainer, train, warm_up
 from benchmarks.end_to_end import novel_observations
 from benchmarks.hardware import Hardware
 from benchmarks.measurements import Measurement

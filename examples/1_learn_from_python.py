@@ -23,7 +23,7 @@ try:
     from avatar.rig import Rig
     from avatar.training.train import train
     from avatar.training.trainer import Trainer
-    from avatar.training.warmup import warm_up
+    from avatar.training.train import warm_up
     from capture.input_error import InputError
     from capture.inbox import Inbox
     from export.build import export_avatar

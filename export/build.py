@@ -19,8 +19,8 @@ import torch
 from jaxtyping import Float32, UInt8
 from PIL import Image
 
+from avatar.avatar_model import Avatar
 from avatar.evaluation.image_metrics import psnr
-from avatar.field.avatar_model import Avatar
 from avatar.render import render
 from avatar.rig import Rig
 from capture.camera import Camera

@@ -15,8 +15,7 @@ from avatar.events import HeldOutScore
 from avatar.kernels.backend_protocol import HashLevels
 from avatar.rig import Rig
 from avatar.training.frame_stream import prepare_stream
-from avatar.training.optimizer import cosine_decay
-from avatar.training.trainer import Trainer
+from avatar.training.trainer import Trainer, cosine_decay
 from capture.camera import Camera
 from capture.source import Frame
 from preprocess.body.body_pose import BodyPose

@@ -160,7 +160,7 @@ def test_the_checks_of_what_is_loaded_can_fail():
         "scipy",
         "cv2",
     ]
-    assert loads(["avatar.field.radiance_field"], ("torch",)) == ["torch"]
+    assert loads(["avatar.radiance_field"], ("torch",)) == ["torch"]
 
 
 @pytest.mark.parametrize("stage", STAGES)

@@ -19,8 +19,8 @@ from apps.evaluation.score_table import (
 from apps.report.report_figures import CurvePoint, curve_svg, psnr_at
 from apps.report.report_page import html_note, html_page, html_section, html_table
 from apps.report.report_schema import format_psnr
+from avatar.evaluation.image_metrics import overall_verdict
 from avatar.evaluation.perceptual import LPIPS_CONVENTIONS, Lpips
-from avatar.evaluation.sharpness import overall_verdict
 from avatar.evaluation.skin_patches import SCORED_PARTS
 from capture.atomic_files import atomic_folder
 

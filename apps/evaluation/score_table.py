@@ -10,8 +10,8 @@ from typing import Any
 
 from apps.evaluation.frame_scoring import METRICS, FrameScore, ShownFrame
 from apps.report.report_schema import finite_mean, to_json_value
+from avatar.evaluation.image_metrics import SharpnessVerdict, overall_verdict
 from avatar.evaluation.perceptual import LPIPS_CONVENTIONS
-from avatar.evaluation.sharpness import SharpnessVerdict, overall_verdict
 
 
 @dataclass(frozen=True, kw_only=True)

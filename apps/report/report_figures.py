@@ -28,7 +28,7 @@ class CurvePoint:
         frames_seen: Frames trained on up to here.
         psnr: Mean PSNR of the whole images of the frames scored here, dB.
         psnr_mask: Mean PSNR inside their masks, dB.
-        verdict: Verdict on the scores (`avatar.evaluation.sharpness`).
+        verdict: Verdict on the scores (`avatar.evaluation.image_metrics`).
         frames: Frame number in the video and PSNR of the whole image of each frame scored here.
             Evaluations may score different frames, so only a frame's own scores show a drop.
         video: Number of the video that the frames are from, 1 for the first.

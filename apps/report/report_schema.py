@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from apps.report.report_figures import CurvePoint
-from avatar.evaluation.coverage import Coverage
-from avatar.evaluation.coverage_advice import coverage_advice
-from avatar.evaluation.sharpness import (
+from avatar.evaluation.coverage import Coverage, coverage_advice
+from avatar.evaluation.image_metrics import (
     SharpnessVerdict,
     better_verdict,
     median_blur,
@@ -95,8 +94,8 @@ class HeldOutStats:
         psnr: Mean PSNR of the whole image, dB; null if nothing was scored.
         psnr_mask: Mean PSNR where alpha > 0.5, dB.
         ssim: Mean SSIM of the whole image.
-        verdict: sharp, soft, blurred or failed (`avatar.evaluation.sharpness`); null if nothing was
-            scored.
+        verdict: sharp, soft, blurred or failed (`avatar.evaluation.image_metrics`); null if
+            nothing was scored.
         blur: Median equivalent blur, as a fraction of body height; null beyond the largest
             measurable one.
         overlap: Median soft IoU of rendered alpha and mask.

@@ -30,8 +30,12 @@ from apps.report.report_schema import (
 )
 from apps.run.final_scoring import TrainingResult
 from apps.run.run_folder import RunFolder
-from avatar.evaluation.image_metrics import ground_truth_on_white
-from avatar.evaluation.sharpness import MAX_MEASURABLE_BLUR, MIN_OVERLAP, overall_verdict
+from avatar.evaluation.image_metrics import (
+    MAX_MEASURABLE_BLUR,
+    MIN_OVERLAP,
+    ground_truth_on_white,
+    overall_verdict,
+)
 from capture.atomic_files import write_text_atomically
 from capture.camera_device import camera_address
 from capture.process_metrics import peak_memory_mb

@@ -22,6 +22,7 @@ from apps.report.report_schema import ForgettingStats, finite_mean, format_psnr
 from apps.run.run_folder import RunFolder
 from apps.run.run_timing import CpuTime, StreamMeter
 from apps.run.snapshot_writer import PackageSnapshot
+from avatar.avatar_model import Avatar
 from avatar.evaluation.coverage import Coverage
 from avatar.evaluation.held_out import (
     HeldOutFrame,
@@ -31,13 +32,10 @@ from avatar.evaluation.held_out import (
     score_frame,
     score_rendering,
 )
-from avatar.evaluation.image_metrics import composite_on_white
-from avatar.evaluation.sharpness import better_verdict, overall_verdict
+from avatar.evaluation.image_metrics import better_verdict, composite_on_white, overall_verdict
 from avatar.events import HeldOutScore
-from avatar.field.avatar_model import Avatar
 from avatar.render import render
-from avatar.training.held_out_pose_fitting import fit_test_poses
-from avatar.training.saved_frames import (
+from avatar.training.checkpoint import (
     EARLIER_VIDEOS_FILE,
     INDEX_SHIFT_PER_VIDEO,
     LAST_RUN_FILE,
@@ -45,6 +43,7 @@ from avatar.training.saved_frames import (
     number_in_video,
     video_age,
 )
+from avatar.training.held_out_pose_fitting import fit_test_poses
 from avatar.training.trainer import Trainer
 
 SCORING_LIMIT_S = 20.0

@@ -24,10 +24,10 @@ from apps.run.viser_page import (
     PreviewPoses,
     ViserPage,
 )
+from avatar.avatar_model import Avatar
 from avatar.correspondence_grid import CorrespondenceGrid
-from avatar.evaluation.coverage_advice import coverage_advice
+from avatar.evaluation.coverage import coverage_advice
 from avatar.events import Evaluated, Finished, TrainEvent
-from avatar.field.avatar_model import Avatar
 from avatar.render import render
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose

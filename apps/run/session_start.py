@@ -22,7 +22,7 @@ from avatar.backends import backend_for
 from avatar.config import HELD_OUT_STRIDE, TrainConfig
 from avatar.evaluation.held_out import MAX_HELD_OUT
 from avatar.rig import Rig
-from avatar.training import checkpoint, warmup
+from avatar.training import checkpoint, train
 from avatar.training.trainer import Trainer
 from capture.input_error import InputError
 from export.bake import proxy_surface
@@ -113,7 +113,7 @@ def prepare_trainer(
             console.info(f"No checkpoint in {run.path}; starting a new run.")
         prepared = _new_run(arguments, capture)
     with console.status("warming up"):
-        warmup.warm_up(prepared.trainer)
+        train.warm_up(prepared.trainer)
         proxy_surface.warm_up()
     _announce_duration(arguments, capture, prepared.trainer, console)
     return prepared

@@ -34,15 +34,19 @@ from apps.run.snapshot_writer import (
     validation_views,
     write_package_snapshot,
 )
-from avatar.evaluation.coverage import Coverage
-from avatar.evaluation.coverage_advice import coverage_advice
+from avatar.evaluation.coverage import Coverage, coverage_advice
 from avatar.evaluation.held_out import PIXELS_PER_FRAME, HeldOutFrame, add_held_out
-from avatar.evaluation.sharpness import overall_verdict
+from avatar.evaluation.image_metrics import overall_verdict
 from avatar.events import Evaluated, FrameArrived, HeldOutScore, Stepped, TrainEvent, Warned
-from avatar.training.frame_stream import SplitItem, StreamItem, prepare_items, separate_held_out
+from avatar.training.frame_stream import (
+    SplitItem,
+    StreamItem,
+    TrainingFrame,
+    prepare_items,
+    separate_held_out,
+)
 from avatar.training.train import train
 from avatar.training.trainer import Trainer
-from avatar.training.training_frame import TrainingFrame
 from capture.inbox import Inbox
 from capture.source import RealtimePlayback
 from export.bake.fine_tuning import PosedView

@@ -15,20 +15,22 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Int
 
+from avatar.avatar_model import Avatar
 from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.image_metrics import (
     MASK_THRESHOLD,
+    BlurCalibration,
+    calibrate_blur,
     composite_on_white,
     composite_over,
+    equivalent_blur,
     ground_truth_on_white,
     ground_truth_over,
     psnr_of_errors,
     soft_iou,
     ssim,
 )
-from avatar.evaluation.sharpness import BlurCalibration, calibrate_blur, equivalent_blur
 from avatar.events import HeldOutScore
-from avatar.field.avatar_model import Avatar
 from avatar.render import PosedAvatar, render
 from avatar.rig import Rig
 from preprocess.observation import Observation

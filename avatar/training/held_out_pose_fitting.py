@@ -10,13 +10,12 @@ import torch
 
 from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.held_out import HeldOutFrame, score_fine_sample
-from avatar.pose.pose_optimizer import PoseOptimizer
-from avatar.pose.temporal_prior import interpolate_correction
 from avatar.training.frame_exposure import FrameExposures
-from avatar.training.optimizer import cosine_decay
+from avatar.training.frame_stream import prepare_frame
+from avatar.training.pose_correction import interpolate_correction
+from avatar.training.pose_optimizer import PoseOptimizer
 from avatar.training.replay_buffer import ReplayBuffer
-from avatar.training.trainer import Trainer, correct_one_pose, resolve_correspondences
-from avatar.training.training_frame import prepare_frame
+from avatar.training.trainer import Trainer, correct_one_pose, cosine_decay, resolve_correspondences
 from avatar.training.training_step import OccupancySampler, compute_gradients
 
 MIN_SCORED_GAIN = 0.01

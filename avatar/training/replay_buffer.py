@@ -15,10 +15,15 @@ from torch import Tensor
 
 from avatar.correspondence_grid import CORRESPONDENCE_CELL_M, CorrespondenceGrid
 from avatar.kernels.backend_protocol import CorrespondenceTables, RayBatch
-from avatar.pose.pose_optimizer import RootCorrection
 from avatar.rig import Rig
-from avatar.training.frame_stream import view_descriptor
-from avatar.training.training_frame import PixelRuns, RayView, TrainingFrame, camera_in_body
+from avatar.training.frame_stream import (
+    PixelRuns,
+    RayView,
+    TrainingFrame,
+    camera_in_body,
+    view_descriptor,
+)
+from avatar.training.pose_optimizer import RootCorrection
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
 

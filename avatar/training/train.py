@@ -1,8 +1,12 @@
-"""Online training: trains an avatar while frames arrive, and yields events."""
+"""Online training: compiles the kernels, then trains an avatar while frames arrive."""
 
+import dataclasses
 import time
 from collections.abc import Iterator
 from typing import final
+
+import numpy as np
+from jaxtyping import UInt8
 
 from avatar.evaluation.held_out import (
     FRAMES_PER_EVALUATION,
@@ -22,10 +26,20 @@ from avatar.events import (
     WaitingForFrame,
     Warned,
 )
-from avatar.training.frame_stream import RedundantFrame, StreamItem
-from avatar.training.optimizer import cosine_decay
-from avatar.training.trainer import Trainer
+from avatar.render import render
+from avatar.rig import Rig
+from avatar.training.frame_stream import (
+    RayView,
+    RedundantFrame,
+    StreamItem,
+    TrainingFrame,
+    rebuild_frame,
+)
+from avatar.training.pose_optimizer import FIRST_CORRECTION_STEPS
+from avatar.training.trainer import Trainer, cosine_decay
+from capture.camera import Camera
 from capture.inbox import Inbox
+from preprocess.body.body_pose import BodyPose
 from preprocess.observation import DroppedFrame
 
 READING_FIRST_AFTER_SHARE = 0.5
@@ -296,3 +310,52 @@ def _evaluation_times(*, after: float) -> Iterator[float]:
         if mark > after:
             yield mark
         mark += 30.0
+
+
+WARMUP_IMAGE_PX = 16
+"""Width and height of the warm-up's image, pixels."""
+
+
+def warm_up(trainer: Trainer) -> float:
+    """Compiles, or loads from disk, every kernel that training and rendering use.
+
+    Must run on the thread that will train. The trainer itself is not changed.
+
+    Returns:
+        How many seconds it took: tens on a machine's first run, about one later.
+    """
+    began = time.perf_counter()
+    rig, device = trainer.avatar.rig, trainer.avatar.field.table.device
+    config = dataclasses.replace(trainer.config, rays=64, empty_space_points=16, density_tv_pairs=8)
+    stand_in = Trainer(rig, config, device)
+    camera = _front_camera(rig)
+    stand_in.add_frame(_dummy_frame(rig, camera))
+    stand_in.steps = FIRST_CORRECTION_STEPS
+    for _ in range(config.occupancy_interval):
+        stand_in.step(rate=1.0, hard_surface_share=1.0)
+    poses = stand_in.poses  # an exact pose does not move, and nothing would have followed it
+    stand_in.backend.update_roots(
+        stand_in.replay.correspondences, 0, poses.skinning, poses.bones[0]
+    )
+    render(stand_in.avatar, BodyPose.rest(), camera)
+    return time.perf_counter() - began
+
+
+def _front_camera(rig: Rig) -> Camera:
+    camera_from_world = np.diag([1.0, -1.0, -1.0, 1.0])
+    camera_from_world[:3, 3] = -camera_from_world[:3, :3] @ (rig.rest_joints[0] + [0.0, 0.0, 3.0])
+    return Camera(
+        focal_px=(WARMUP_IMAGE_PX * 1.5, WARMUP_IMAGE_PX * 1.5),
+        center_px=(WARMUP_IMAGE_PX / 2, WARMUP_IMAGE_PX / 2),
+        size_px=(WARMUP_IMAGE_PX, WARMUP_IMAGE_PX),
+        camera_from_world=camera_from_world,
+    )
+
+
+def _dummy_frame(rig: Rig, camera: Camera) -> TrainingFrame:
+    pose = BodyPose.rest()
+    width, height = camera.size_px
+    near = np.full((height, width), True)
+    colors: UInt8[np.ndarray, "pixels 4"] = np.full((near.size, 4), 255, dtype=np.uint8)
+    view = RayView(camera=camera, near_person_bits=np.packbits(near))
+    return rebuild_frame(0, pose, view, colors, rig)

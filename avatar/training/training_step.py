@@ -6,11 +6,9 @@ import torch
 from jaxtyping import Float32, Int32, Int64
 from torch import Tensor
 
+from avatar import radiance_field
+from avatar.avatar_model import Avatar
 from avatar.config import TrainConfig
-from avatar.field import field_priors
-from avatar.field.avatar_model import Avatar
-from avatar.field.occupancy_grid import OccupancyGrid
-from avatar.field.radiance_field import RadianceField
 from avatar.kernels.backend_protocol import (
     Backend,
     CorrespondenceTables,
@@ -19,7 +17,9 @@ from avatar.kernels.backend_protocol import (
     RayBatch,
     RaySamples,
 )
-from avatar.pose.pose_optimizer import PoseOptimizer
+from avatar.occupancy_grid import OccupancyGrid
+from avatar.radiance_field import RadianceField
+from avatar.training.pose_optimizer import PoseOptimizer
 from avatar.training.replay_buffer import TrainingBatch
 
 
@@ -160,11 +160,11 @@ def _regularization_points(
         sampler.sample_empty(config.empty_space_points, generator).to(points)
         if config.empty_space_weight
         else none,
-        field_priors.sample_tv_pairs(points, config, generator),
+        radiance_field.sample_tv_pairs(points, config, generator),
         occupancy.sample_interior(config.interior_points, generator).to(points)
         if config.interior_weight
         else none,
-        field_priors.sample_smoothness_pairs(points, config, generator),
+        radiance_field.sample_smoothness_pairs(points, config, generator),
         occupancy.sample_inner_leg(config.inner_leg_points, generator).to(points)
         if config.inner_leg_weight
         else none,
@@ -179,26 +179,32 @@ def _regularization_gradients(
 ) -> list[Float32[Tensor, "_ 4"]]:
     """Gradients of the raw outputs at `_regularization_points`, in the same order."""
     empty, pairs, solid, close, gaps = raw
-    grad_pairs = field_priors.density_tv_gradient(pairs, config.density_tv_weight_at(surface_share))
+    grad_pairs = radiance_field.density_tv_gradient(
+        pairs, config.density_tv_weight_at(surface_share)
+    )
     if config.double_well_weight:
-        grad_pairs += field_priors.double_well_gradient(
+        grad_pairs += radiance_field.double_well_gradient(
             pairs, config.double_well_weight * surface_share
         )
     grad_close = torch.zeros_like(close)
     if len(close):
-        grad_close += field_priors.density_slope_gradient(
+        grad_close += radiance_field.density_slope_gradient(
             close,
             points[3],
             config.max_log_density_slope_per_m,
             config.density_slope_weight * surface_share,
         )
-        grad_close += field_priors.color_tv_gradient(close, config.color_tv_weight * surface_share)
+        grad_close += radiance_field.color_tv_gradient(
+            close, config.color_tv_weight * surface_share
+        )
     return [
-        field_priors.empty_space_gradient(empty, config.empty_space_weight),
+        radiance_field.empty_space_gradient(empty, config.empty_space_weight),
         grad_pairs,
-        field_priors.interior_gradient(solid, config.interior_weight) if len(solid) else solid,
+        radiance_field.interior_gradient(solid, config.interior_weight) if len(solid) else solid,
         grad_close,
-        field_priors.log_density_l1_gradient(gaps, config.inner_leg_weight) if len(gaps) else gaps,
+        radiance_field.log_density_l1_gradient(gaps, config.inner_leg_weight)
+        if len(gaps)
+        else gaps,
     ]
 
 

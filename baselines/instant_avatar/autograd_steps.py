@@ -23,13 +23,12 @@ from jaxtyping import Bool, Float32
 from torch import Tensor
 
 from avatar.config import TrainConfig
-from avatar.field.field_priors import OPACITY_LENGTH_M
-from avatar.field.radiance_field import RadianceField
 from avatar.kernels import torch_reference
 from avatar.kernels.backend_protocol import DensityGrid, HashLevels, RaySamples
+from avatar.radiance_field import OPACITY_LENGTH_M, RadianceField
 from avatar.rig import Rig
+from avatar.training.frame_stream import TrainingFrame
 from avatar.training.replay_buffer import TrainingBatch
-from avatar.training.training_frame import TrainingFrame
 from baselines.instant_avatar.broyden_kernels import START_BONES
 
 

@@ -8,8 +8,6 @@ import torch
 from jaxtyping import Bool, Float32, Int32
 from torch import Tensor
 
-from avatar.field.occupancy_grid import OccupancyGrid, in_occupied_cells
-from avatar.field.radiance_field import RadianceField
 from avatar.kernels.backend_protocol import (
     CorrespondenceTables,
     DensityGrid,
@@ -17,6 +15,8 @@ from avatar.kernels.backend_protocol import (
     RayBatch,
 )
 from avatar.kernels.torch_reference import MAX_LOG_DENSITY
+from avatar.occupancy_grid import OccupancyGrid, in_occupied_cells
+from avatar.radiance_field import RadianceField
 from avatar.rig import Rig
 from baselines.instant_avatar.broyden_kernels import (
     START_BONES,

@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Float32, Int64, UInt8
 from torch import Tensor
 
-from avatar.field.occupancy_grid import OccupancyGrid
 from avatar.kernels.backend_protocol import CorrespondenceTables
+from avatar.occupancy_grid import OccupancyGrid
 from avatar.rig import Rig
 from baselines.instant_avatar.occupied_samples import PosedOccupancy
 from baselines.instant_avatar.posed_field import PosedField

@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
+from avatar.avatar_model import Avatar
 from avatar.config import TrainConfig
-from avatar.field.avatar_model import Avatar
 from avatar.kernels.backend_protocol import (
     Backend,
     CorrespondenceTables,
@@ -21,8 +21,8 @@ from avatar.kernels.backend_protocol import (
     RaySamples,
 )
 from avatar.rig import Rig
+from avatar.training.frame_stream import TrainingFrame
 from avatar.training.trainer import Trainer
-from avatar.training.training_frame import TrainingFrame
 from avatar.training.training_step import OccupancySampler, RaySampler, StepResult
 from baselines.instant_avatar.occupied_samples import sample_occupied_cells
 from baselines.instant_avatar.posed_field import (

@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
+from avatar.avatar_model import Avatar
 from avatar.correspondence_grid import CorrespondenceGrid
-from avatar.field.avatar_model import Avatar
-from avatar.field.radiance_field import RadianceField
 from avatar.kernels.backend_protocol import CorrespondenceTables, RayBatch, RaySamples
 from avatar.kernels.torch_reference import MAX_LOG_DENSITY
+from avatar.radiance_field import RadianceField
 from avatar.render import (
     EMPTY_LOG_DENSITY,
     MAX_SAMPLES_PER_PASS,

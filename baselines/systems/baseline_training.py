@@ -9,9 +9,9 @@ from jaxtyping import Float, Float32, Int64
 from torch import Tensor, nn
 
 from avatar.render import BodyFrameRays, pixel_chunks
-from avatar.training.optimizer import UncompiledAdam, cosine_decay
+from avatar.training.frame_stream import TrainingFrame
 from avatar.training.replay_buffer import NEAR_PERSON_RAY_SHARE
-from avatar.training.training_frame import TrainingFrame
+from avatar.training.trainer import UncompiledAdam, cosine_decay
 from baselines.systems.method_settings import MethodSettings
 from baselines.systems.posed_person import OccupiedCells, PoseTable, SkinnedPerson
 from baselines.systems.ray_rendering import BodyRays, PosedRadiance, render_rays

@@ -9,10 +9,9 @@ import torch
 from avatar.config import HELD_OUT_STRIDE, TrainConfig
 from avatar.evaluation.held_out import HeldOutFrame
 from avatar.rig import Rig
-from avatar.training.frame_stream import prepare_stream
+from avatar.training.frame_stream import TrainingFrame, prepare_stream
+from avatar.training.train import warm_up
 from avatar.training.trainer import Trainer
-from avatar.training.training_frame import TrainingFrame
-from avatar.training.warmup import warm_up
 from capture.input_error import InputError
 from preprocess.body.parametric_body import ShapedBody, load_body_model
 from preprocess.capture_session import Capture, CaptureInputs

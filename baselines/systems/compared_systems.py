@@ -10,8 +10,7 @@ from jaxtyping import Float32
 
 from avatar.config import TrainConfig
 from avatar.render import render
-from avatar.training.optimizer import cosine_decay
-from avatar.training.trainer import Trainer
+from avatar.training.trainer import Trainer, cosine_decay
 from baselines.systems import anim_nerf, instant_ngp, neural_body, snarf
 from baselines.systems.baseline_training import BaselineSystem
 from baselines.systems.compared_capture import ComparedCapture

@@ -12,9 +12,9 @@ from torch import Tensor, nn
 
 from avatar.backends import backend_for
 from avatar.config import COARSEST_M, TrainConfig
-from avatar.field.radiance_field import RadianceField
 from avatar.kernels.backend_protocol import HashLevels
 from avatar.kernels.torch_reference import MAX_LOG_DENSITY
+from avatar.radiance_field import RadianceField
 from avatar.training.trainer import NETWORK_RATE_FACTOR
 from baselines.systems.method_settings import MethodSettings
 from baselines.systems.posed_person import CELL_M, OccupiedCells, PosedBodies

@@ -10,7 +10,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor, nn
 
 from avatar.rig import Rig
-from avatar.training.training_frame import TrainingFrame
+from avatar.training.frame_stream import TrainingFrame
 from preprocess.body.kinematics import body_from_rest
 from preprocess.body.parametric_body import ShapedBody
 

@@ -12,7 +12,7 @@ from apps import ingest, play
 from apps.report import report_writer
 from apps.run import session_start, snapshot_writer
 from avatar.rig import Rig
-from avatar.training import held_out_pose_fitting, warmup
+from avatar.training import held_out_pose_fitting, train
 from capture.atomic_files import write_text_atomically
 from export.bake import bake_tables, fine_tuning
 from export.build import ExportReport
@@ -105,7 +105,7 @@ def capture(film, tmp_path) -> Path:
 def call_ingest(capsys, monkeypatch, rig) -> Command:
     """Runs ia-ingest, for a few steps unless the test says otherwise."""
     monkeypatch.setattr(session_start.Rig, "from_shaped_body", lambda shaped: rig)
-    monkeypatch.setattr(warmup, "warm_up", lambda trainer: 0.0)
+    monkeypatch.setattr(train, "warm_up", lambda trainer: 0.0)
 
     def call(*arguments: object, steps: int = FEW_STEPS) -> Outcome:
         words = [str(argument) for argument in arguments]

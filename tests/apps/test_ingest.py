@@ -17,7 +17,7 @@ from apps.report.report_writer import diagnose_failure
 from apps.run import final_scoring, snapshot_writer
 from apps.run.run_folder import RunFolder
 from apps.run.snapshot_writer import CheckpointWriter
-from avatar.evaluation.coverage_advice import SEEN_COMPLETELY
+from avatar.evaluation.coverage import SEEN_COMPLETELY
 from avatar.training import checkpoint
 from capture.atomic_files import LIST_NAME as LIST
 from capture.atomic_files import write_text_atomically

@@ -13,9 +13,9 @@ from avatar.correspondence_grid import (
     CorrespondenceGrid,
     cull_cells,
 )
-from avatar.field.occupancy_grid import OccupancyGrid
 from avatar.kernels.backend_protocol import MarchSettings, RayBatch
 from avatar.kernels.torch_correspondence import skin_points
+from avatar.occupancy_grid import OccupancyGrid
 from avatar.render import correspondence_tables
 
 CPU = torch.device("cpu")

@@ -8,13 +8,13 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from avatar.avatar_model import Avatar
 from avatar.correspondence_grid import (
     CorrespondenceCheck,
     CorrespondenceGrid,
     cull_cells,
     screen_bounds,
 )
-from avatar.field.avatar_model import Avatar
 from avatar.kernels import torch_reference
 from avatar.kernels.backend_protocol import MarchSettings, RayBatch
 from avatar.kernels.torch_reference import MAX_LOG_DENSITY

@@ -11,11 +11,10 @@ import torch
 from avatar.config import TrainConfig
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.events import Evaluated, Finished
-from avatar.pose import gauss_newton
-from avatar.pose.pose_optimizer import FIRST_CORRECTION_STEPS
-from avatar.training import checkpoint, held_out_pose_fitting
+from avatar.training import checkpoint, held_out_pose_fitting, pose_correction
 from avatar.training import train as train_module
 from avatar.training.frame_stream import prepare_stream
+from avatar.training.pose_optimizer import FIRST_CORRECTION_STEPS
 from avatar.training.train import train
 from avatar.training.trainer import Trainer
 from baselines.instant_avatar.samplers import BaselineScheme, BaselineTrainer
@@ -59,9 +58,9 @@ def trainer(device, rig, clip):
     trainer.steps = FIRST_CORRECTION_STEPS - 3
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            gauss_newton, "MIN_EVIDENCE", -1.0
+            pose_correction, "MIN_EVIDENCE", -1.0
         )  # these poses are exact, and would not move
-        patch.setattr(gauss_newton, "FULL_EVIDENCE", 0.0)
+        patch.setattr(pose_correction, "FULL_EVIDENCE", 0.0)
         for _ in range(12):
             trainer.step(rate=1.0, hard_surface_share=1.0)
     return trainer

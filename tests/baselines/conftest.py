@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.field.occupancy_grid import SOLID_DENSITY
+from avatar.occupancy_grid import SOLID_DENSITY
 from avatar.render import render
 
 

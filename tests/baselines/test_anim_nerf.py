@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.training.training_frame import prepare_frame
+from avatar.training.frame_stream import prepare_frame
 from baselines.systems.anim_nerf import PRESETS, AnimNerf
 from baselines.systems.baseline_training import BaselineSystem
 from baselines.systems.method_settings import MethodSettings

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from avatar.config import TrainConfig
-from avatar.pose.pose_optimizer import PoseOptimizer
+from avatar.training.frame_stream import prepare_frame
+from avatar.training.pose_optimizer import PoseOptimizer
 from avatar.training.replay_buffer import ReplayBuffer
-from avatar.training.training_frame import prepare_frame
 from avatar.training.training_step import OccupancySampler, compute_gradients
 from baselines.instant_avatar.samplers import BaselineScheme, BaselineTrainer
 

@@ -3,7 +3,7 @@
 import torch
 
 from avatar.config import TrainConfig
-from avatar.training.training_frame import prepare_frame
+from avatar.training.frame_stream import prepare_frame
 from baselines.systems.baseline_training import BaselineSystem
 from baselines.systems.instant_ngp import InstantNgp
 from baselines.systems.method_settings import MethodSettings

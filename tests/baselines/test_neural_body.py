@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import nn
 
-from avatar.training.training_frame import prepare_frame
+from avatar.training.frame_stream import prepare_frame
 from baselines.systems.baseline_training import BaselineSystem
 from baselines.systems.method_settings import MethodSettings
 from baselines.systems.neural_body import NeuralBody

@@ -19,7 +19,6 @@ FEW = ("--frames", "0:8", GIVEN)
 def test_another_video_is_added_and_forgetting_is_reported(
     capture, call_ingest, without_baking, tmp_path, monkeypatch
 ):
-    from avatar.training import saved_frames
 
     out, other = tmp_path / "run", tmp_path / "other"
     shutil.copytree(capture, other)
@@ -27,7 +26,7 @@ def test_another_video_is_added_and_forgetting_is_reported(
     assert first.code == 0
     before = json.loads((out / "report.json").read_text())
     assert before["earlier_videos"] is None
-    assert (out / "checkpoint" / saved_frames.LAST_RUN_FILE).exists()
+    assert (out / "checkpoint" / checkpoint.LAST_RUN_FILE).exists()
     outcome = call_ingest(other, "--out", out, "--resume", "--frames", "12:24", GIVEN)
     assert outcome.code == 0
     after = json.loads((out / "report.json").read_text())
@@ -51,7 +50,7 @@ def test_another_video_is_added_and_forgetting_is_reported(
     assert after["frames"] == {**before["frames"], "dropped": []}  # of the new video alone
     assert after["training"]["steps"] == 2 * before["training"]["steps"]
     # both videos are learnt from, and an interrupted run finds both again
-    kept = saved_frames.SavedFrames.load(out / "checkpoint" / saved_frames.LAST_RUN_FILE)
+    kept = checkpoint.SavedFrames.load(out / "checkpoint" / checkpoint.LAST_RUN_FILE)
     numbers = [frame.index for frame in kept.replay_frames]
     assert sum(number < 0 for number in numbers) == sum(number >= 0 for number in numbers) == 9
     again = call_ingest(other, "--out", out, "--resume", "--frames", "12:24", GIVEN)

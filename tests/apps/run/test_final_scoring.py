@@ -13,9 +13,9 @@ from apps.run.final_scoring import (
     MIN_WHOLE_IMAGES,
     score_finally,
 )
+from avatar.avatar_model import Avatar
 from avatar.config import TrainConfig
 from avatar.evaluation.held_out import HeldOutFrame, PixelSample, score_rendering
-from avatar.field.avatar_model import Avatar
 from avatar.training.trainer import Trainer
 from capture.camera import Camera
 from capture.source import Frame

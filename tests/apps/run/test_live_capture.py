@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from apps import ingest
-from avatar.training import warmup
-from avatar.training.warmup import warm_up
+from avatar.training import train
+from avatar.training.train import warm_up
 from capture import camera_device
 from capture.source_opening import open_source
 
@@ -23,7 +23,7 @@ def watch(call_ingest, without_baking, monkeypatch, tmp_path, capsys):
     """Runs ia-ingest on a live source; returns its exit code and its report."""
 
     def watch(*arguments):
-        monkeypatch.setattr(warmup, "warm_up", warm_up)  # a live source waits for no compiler
+        monkeypatch.setattr(train, "warm_up", warm_up)  # a live source waits for no compiler
         code = ingest.main([*map(str, arguments), "--out", str(tmp_path / "run")])
         path = tmp_path / "run" / "report.json"
         return code, json.loads(path.read_text()) if path.exists() else None

@@ -21,7 +21,7 @@ from apps.cli.shared_options import (
 )
 from apps.run import run_folder
 from apps.run.run_folder import CHECKPOINT_FILES, LOCK_FILE_NAME, STATE_FILE, RunFolder, lock_folder
-from avatar.training import checkpoint, saved_frames
+from avatar.training import checkpoint
 from capture.atomic_files import OutputFileList, write_text_atomically
 from capture.input_error import InputError
 
@@ -166,8 +166,8 @@ def test_the_names_of_a_checkpoint_are_those_that_are_written():
         checkpoint.CHECKPOINT_FILE,
         "person.npz",
         "fit.npz",
-        saved_frames.LAST_RUN_FILE,
-        saved_frames.EARLIER_VIDEOS_FILE,
+        checkpoint.LAST_RUN_FILE,
+        checkpoint.EARLIER_VIDEOS_FILE,
     }
     assert set(CHECKPOINT_FILES) == names
     assert checkpoint.CHECKPOINT_FILE == STATE_FILE

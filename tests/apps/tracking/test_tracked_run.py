@@ -15,7 +15,7 @@ from apps.evaluation.evaluation_frames import held_out_frames
 from apps.run.run_folder import RunFolder
 from apps.tracking import person_tracking, tracked_run
 from apps.tracking.person_tracking import open_stream
-from avatar.training import warmup
+from avatar.training import train
 from avatar.training.trainer import Trainer
 from capture.input_error import InputError
 from preprocess.blazepose.blazepose_tracker import BlazePoseTracker
@@ -30,7 +30,7 @@ from tests.apps.conftest import Outcome
 @pytest.fixture
 def ingest_video(video, tmp_path, capsys, monkeypatch):
     """Runs ia-ingest on the video; returns how it ended and the run's folder."""
-    monkeypatch.setattr(warmup, "warm_up", lambda trainer: 0.0)
+    monkeypatch.setattr(train, "warm_up", lambda trainer: 0.0)
 
     def call(*words, steps=10):
         out = tmp_path / "run"

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from avatar.evaluation.coverage import Coverage, VisibilityStage
-from avatar.evaluation.coverage_advice import (
+from avatar.evaluation.coverage import (
     NOT_SEEN_YET,
     SEEN_COMPLETELY,
+    Coverage,
+    VisibilityStage,
     coverage_advice,
     unseen_regions,
 )

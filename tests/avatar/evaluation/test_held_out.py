@@ -19,9 +19,8 @@ from avatar.evaluation.held_out import (
     subsample_evenly,
 )
 from avatar.evaluation.image_metrics import composite_on_white, ground_truth_on_white, psnr, ssim
-from avatar.training.frame_stream import is_held_out, prepare_stream
+from avatar.training.frame_stream import TrainingFrame, is_held_out, prepare_stream
 from avatar.training.trainer import Trainer
-from avatar.training.training_frame import TrainingFrame
 from capture.camera import Camera
 from capture.source import Frame
 from preprocess.body.body_pose import BodyPose

@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from avatar.evaluation.image_metrics import psnr
-from avatar.evaluation.sharpness import (
+from avatar.evaluation.image_metrics import (
     CALIBRATION_BLURS,
     MAX_MEASURABLE_BLUR,
     MAX_SHARP_BLUR,
@@ -17,6 +16,7 @@ from avatar.evaluation.sharpness import (
     calibrate_blur,
     equivalent_blur,
     overall_verdict,
+    psnr,
     sharpness_verdict,
 )
 

@@ -9,7 +9,6 @@ from scipy.ndimage import distance_transform_cdt
 
 from avatar.backends import TorchBackend, backend_for
 from avatar.correspondence_grid import CorrespondenceGrid
-from avatar.field.occupancy_grid import OccupancyGrid
 from avatar.kernels import torch_reference
 from avatar.kernels.backend_protocol import (
     FEATURES_PER_LEVEL,
@@ -21,6 +20,7 @@ from avatar.kernels.backend_protocol import (
     RaySamples,
 )
 from avatar.kernels.numba_backend import NumbaBackend
+from avatar.occupancy_grid import OccupancyGrid
 from avatar.render import correspondence_tables
 from capture.input_error import InputError
 

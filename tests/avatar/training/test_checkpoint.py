@@ -14,8 +14,8 @@ from avatar.config import TrainConfig
 from avatar.render import render
 from avatar.rig import Rig
 from avatar.training import checkpoint
+from avatar.training.frame_stream import prepare_frame
 from avatar.training.trainer import Trainer
-from avatar.training.training_frame import prepare_frame
 from capture.input_error import InputError
 
 CPU = torch.device("cpu")

@@ -11,10 +11,10 @@ from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.kernels.backend_protocol import RayBatch
 from avatar.training import checkpoint
 from avatar.training.frame_exposure import MAX_FRAME_GAP, FrameExposures
+from avatar.training.frame_stream import prepare_frame
 from avatar.training.held_out_pose_fitting import fit_test_poses
 from avatar.training.replay_buffer import TrainingBatch
 from avatar.training.trainer import Trainer
-from avatar.training.training_frame import prepare_frame
 
 CPU = torch.device("cpu")
 CONFIG = TrainConfig(

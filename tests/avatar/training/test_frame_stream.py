@@ -1,8 +1,12 @@
 """The stream decides once which frames are held out, and layers in between cannot change it."""
 
 from avatar.evaluation.held_out import HeldOutFrame
-from avatar.training.frame_stream import prepare_items, prepare_stream, separate_held_out
-from avatar.training.training_frame import TrainingFrame
+from avatar.training.frame_stream import (
+    TrainingFrame,
+    prepare_items,
+    prepare_stream,
+    separate_held_out,
+)
 
 
 def indices_of(items, kind):

@@ -12,10 +12,10 @@ from avatar.training.frame_stream import (
     MIN_KEYFRAME_DISTANCE,
     KeyframeSelector,
     RedundantFrame,
+    TrainingFrame,
     prepare_stream,
     view_descriptor,
 )
-from avatar.training.training_frame import TrainingFrame
 from preprocess.body.body_pose import BodyPose
 
 

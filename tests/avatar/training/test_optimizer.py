@@ -15,11 +15,16 @@ import torch
 from avatar.backends import backend_for
 from avatar.config import TrainConfig
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
-from avatar.field.radiance_field import RadianceField
-from avatar.training import optimizer
+from avatar.radiance_field import RadianceField
+from avatar.training import trainer as trainer_module
 from avatar.training.frame_stream import prepare_stream
-from avatar.training.optimizer import EMA_HORIZON_STEPS, EMA_INTERVAL, UncompiledAdam, update_ema
-from avatar.training.trainer import Trainer
+from avatar.training.trainer import (
+    EMA_HORIZON_STEPS,
+    EMA_INTERVAL,
+    Trainer,
+    UncompiledAdam,
+    update_ema,
+)
 
 CPU = torch.device("cpu")
 
@@ -77,7 +82,7 @@ def test_while_the_rate_is_high_the_mean_is_closer_to_unseen_frames_than_the_las
             held.append(item)
         else:
             trainer.add_frame(item)
-    for _ in range(50 * optimizer.EMA_INTERVAL):
+    for _ in range(50 * trainer_module.EMA_INTERVAL):
         trainer.step(rate=1.0, hard_surface_share=1.0)
     last = dataclasses.replace(trainer.avatar, field=trainer.field)
     mean, swinging = (
@@ -89,7 +94,7 @@ def test_while_the_rate_is_high_the_mean_is_closer_to_unseen_frames_than_the_las
 
 WITHOUT_COMPILER = """
 import sys, torch
-from avatar.training.optimizer import UncompiledAdam
+from avatar.training.trainer import UncompiledAdam
 numbers = torch.nn.Parameter(torch.zeros(3))
 numbers.grad = torch.ones(3)
 adam = UncompiledAdam([numbers], fused=True)

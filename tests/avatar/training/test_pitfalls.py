@@ -14,12 +14,11 @@ import numpy as np
 import pytest
 import torch
 
+from avatar.avatar_model import Avatar
 from avatar.backends import TorchBackend
 from avatar.config import TrainConfig
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.evaluation.image_metrics import soft_iou
-from avatar.field.avatar_model import Avatar
-from avatar.field.occupancy_grid import MIN_STEP_OPACITY, OCCUPANCY_DECAY, OccupancyGrid
 from avatar.kernels.backend_protocol import (
     CorrespondenceTables,
     DensityGrid,
@@ -28,12 +27,11 @@ from avatar.kernels.backend_protocol import (
 )
 from avatar.kernels.numba_backend import NumbaBackend
 from avatar.kernels.torch_reference import OPAQUE_DEPTH
+from avatar.occupancy_grid import MIN_STEP_OPACITY, OCCUPANCY_DECAY, OccupancyGrid
 from avatar.render import render
 from avatar.rig import Rig
-from avatar.training.frame_stream import prepare_stream
-from avatar.training.optimizer import cosine_decay
-from avatar.training.trainer import Trainer
-from avatar.training.training_frame import TrainingFrame
+from avatar.training.frame_stream import TrainingFrame, prepare_stream
+from avatar.training.trainer import Trainer, cosine_decay
 from baselines.instant_avatar.scheme_rendering import render_samples
 from capture.source import Frame
 from preprocess.observation import Observation

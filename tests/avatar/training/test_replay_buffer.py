@@ -8,8 +8,8 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from avatar.training.frame_stream import PixelRuns, prepare_frame
 from avatar.training.replay_buffer import HEAD_RAY_SHARE, NEAR_PERSON_RAY_SHARE, ReplayBuffer
-from avatar.training.training_frame import PixelRuns, prepare_frame
 from preprocess.body.body_pose import BodyPose
 
 CPU = torch.device("cpu")

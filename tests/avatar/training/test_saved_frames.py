@@ -5,15 +5,15 @@ import pytest
 import torch
 
 from avatar.evaluation.held_out import HeldOutFrame
-from avatar.training.replay_buffer import ReplayBuffer
-from avatar.training.saved_frames import (
+from avatar.training.checkpoint import (
     INDEX_SHIFT_PER_VIDEO,
     MAX_HELD_OUT_KEPT,
     SavedFrames,
     number_in_video,
     video_age,
 )
-from avatar.training.training_frame import prepare_frame, rebuild_frame
+from avatar.training.frame_stream import prepare_frame, rebuild_frame
+from avatar.training.replay_buffer import ReplayBuffer
 from capture.input_error import InputError
 
 CPU = torch.device("cpu")

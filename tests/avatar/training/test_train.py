@@ -15,10 +15,9 @@ from avatar.evaluation.held_out import HeldOutFrame
 from avatar.events import Evaluated, Finished, FrameArrived, Stepped, WaitingForFrame, Warned
 from avatar.render import render
 from avatar.training import train as train_module
-from avatar.training.frame_stream import prepare_stream
+from avatar.training.frame_stream import prepare_frame, prepare_stream
 from avatar.training.train import train
 from avatar.training.trainer import Trainer
-from avatar.training.training_frame import prepare_frame
 from capture.inbox import Inbox
 from preprocess.observation import DroppedFrame
 

@@ -6,16 +6,15 @@ import math
 import pytest
 import torch
 
+from avatar import radiance_field
 from avatar.backends import TorchBackend
 from avatar.config import MAX_SAMPLE_STEP_M, TrainConfig
-from avatar.field import field_priors
 from avatar.kernels import torch_reference
 from avatar.kernels.backend_protocol import MarchSettings, RaySamples
 from avatar.kernels.numba_backend import NumbaBackend
-from avatar.pose.pose_optimizer import PoseOptimizer
-from avatar.training.optimizer import cosine_decay
-from avatar.training.trainer import Trainer
-from avatar.training.training_frame import prepare_frame
+from avatar.training.frame_stream import prepare_frame
+from avatar.training.pose_optimizer import PoseOptimizer
+from avatar.training.trainer import Trainer, cosine_decay
 from avatar.training.training_step import (
     OccupancySampler,
     compute_gradients,
@@ -62,7 +61,7 @@ def mean_loss(trainer, parameters, samples, empty, pairs, solid, close, gaps, ba
     parts = [len(part) for part in (empty, pairs, solid, close, gaps)]
     loss = loss + FIRM_SHARE * of_close_pairs(raw[count:].split(parts)[3], close)
     density = torch.exp(raw[count:, 3].clamp(max=torch_reference.MAX_LOG_DENSITY))
-    opacity = 1.0 - torch.exp(-density * field_priors.OPACITY_LENGTH_M)
+    opacity = 1.0 - torch.exp(-density * radiance_field.OPACITY_LENGTH_M)
     of_empty, of_pairs, of_solid, *_ = opacity.split(parts)
     loss = loss + CONFIG.empty_space_weight * of_empty.mean()
     if len(gaps):
@@ -104,10 +103,10 @@ def one_step(trainer, backend):
     empty = occupancy.sample_empty(CONFIG.empty_space_points, generator)
     drawn = CONFIG.density_tv_pairs if len(samples.points) else 0
     chosen = torch.randint(max(len(samples.points), 1), (drawn,), generator=generator)
-    apart = field_priors.TV_PAIR_SIGMA_M * torch.randn(drawn, 3, generator=generator)
+    apart = radiance_field.TV_PAIR_SIGMA_M * torch.randn(drawn, 3, generator=generator)
     pairs = torch.cat([samples.points[chosen], samples.points[chosen] + apart])
     solid = occupancy.sample_interior(CONFIG.interior_points, generator)
-    close = field_priors.sample_smoothness_pairs(samples.points, CONFIG, generator)
+    close = radiance_field.sample_smoothness_pairs(samples.points, CONFIG, generator)
     gaps = occupancy.sample_inner_leg(CONFIG.inner_leg_points, generator)
     background = torch.rand(len(batch.target), 3, generator=generator)
     grads = [parameter.grad.clone() for parameter in field.parameters()]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from avatar.pose.temporal_prior import (
+from avatar.training.pose_correction import (
     MAX_FRAME_GAP,
     MIN_NEIGHBOR_PAIRS,
     NEIGHBOR_PRECISION,

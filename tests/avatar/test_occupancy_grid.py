@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.field.occupancy_grid import (
+from avatar.occupancy_grid import (
     INTERIOR_DEPTH_M,
     MIN_STEP_OPACITY,
     OFF_SKIN_M,

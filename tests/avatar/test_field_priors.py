@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
+from avatar import radiance_field
 from avatar.config import TrainConfig
-from avatar.field import field_priors
-from avatar.field.field_priors import OPACITY_LENGTH_M, OpacityWithSlope
+from avatar.radiance_field import OPACITY_LENGTH_M, OpacityWithSlope
 
 
 def raw_of(*opacities: float) -> torch.Tensor:
@@ -32,7 +32,7 @@ def test_opacity_is_that_of_one_centimetre():
 
 
 def test_the_double_well_drives_fog_apart_at_one_half():
-    thin, even, thick = followed(raw_of(0.4, 0.5, 0.6), field_priors.double_well_gradient)
+    thin, even, thick = followed(raw_of(0.4, 0.5, 0.6), radiance_field.double_well_gradient)
     assert thin < 0.01
     assert even == pytest.approx(0.5, abs=1e-3)
     assert thick > 0.95
@@ -41,18 +41,20 @@ def test_the_double_well_drives_fog_apart_at_one_half():
 def test_where_a_body_is_solid_even_nothing_becomes_something():
     """Opacity's own slope is gone where there is nothing; cross-entropy's is 1."""
     raw = raw_of(1e-4)
-    assert float(field_priors.interior_gradient(raw, 1.0)[0, 3]) == pytest.approx(-1.0, abs=1e-3)
-    assert -float(field_priors.empty_space_gradient(raw, 1.0)[0, 3]) == pytest.approx(0.0, abs=1e-3)
-    assert followed(raw, field_priors.interior_gradient)[0] > 0.99
+    assert float(radiance_field.interior_gradient(raw, 1.0)[0, 3]) == pytest.approx(-1.0, abs=1e-3)
+    assert -float(radiance_field.empty_space_gradient(raw, 1.0)[0, 3]) == pytest.approx(
+        0.0, abs=1e-3
+    )
+    assert followed(raw, radiance_field.interior_gradient)[0] > 0.99
 
 
 def test_emptiness_clears_fog():
-    assert followed(raw_of(0.9), field_priors.empty_space_gradient)[0] < 0.01
+    assert followed(raw_of(0.9), radiance_field.empty_space_gradient)[0] < 0.01
 
 
 def test_variation_draws_a_pair_together_and_leaves_an_even_one_alone():
     thin, even, thick, same = followed(
-        raw_of(0.2, 0.5, 0.8, 0.5), field_priors.density_tv_gradient, steps=200
+        raw_of(0.2, 0.5, 0.8, 0.5), radiance_field.density_tv_gradient, steps=200
     )
     assert thick - thin < 0.1
     assert even == same == pytest.approx(0.5)
@@ -61,10 +63,10 @@ def test_variation_draws_a_pair_together_and_leaves_an_even_one_alone():
 @pytest.mark.parametrize(
     "prior",
     [
-        field_priors.empty_space_gradient,
-        field_priors.interior_gradient,
-        field_priors.density_tv_gradient,
-        field_priors.double_well_gradient,
+        radiance_field.empty_space_gradient,
+        radiance_field.interior_gradient,
+        radiance_field.density_tv_gradient,
+        radiance_field.double_well_gradient,
     ],
 )
 def test_priors_of_density_leave_colors_alone_and_accept_no_points(prior):
@@ -83,48 +85,50 @@ def along_a_line(*logs: float) -> tuple[torch.Tensor, torch.Tensor]:
 def test_a_steep_edge_flattens_to_the_limit_and_a_gentle_one_stays():
     raw, points = along_a_line(5.0, -5.0)
     for _ in range(2000):
-        raw -= field_priors.density_slope_gradient(raw, points, 600.0, 0.01)
+        raw -= radiance_field.density_slope_gradient(raw, points, 600.0, 0.01)
     assert float(raw[0, 3] - raw[1, 3]) == pytest.approx(1.2, abs=0.03)
     raw, points = along_a_line(3.0, 2.0)
-    assert not field_priors.density_slope_gradient(raw, points, 600.0, 0.01).any()
+    assert not radiance_field.density_slope_gradient(raw, points, 600.0, 0.01).any()
 
 
 def test_the_slope_of_empty_space_is_not_penalised():
     raw, points = along_a_line(-1.0, -20.0)
-    assert not field_priors.density_slope_gradient(raw, points, 600.0, 1.0).any()
+    assert not radiance_field.density_slope_gradient(raw, points, 600.0, 1.0).any()
 
 
 def test_needless_density_is_penalized():
     raw, points = along_a_line(8.0, 8.0)
     for _ in range(4000):
-        raw -= field_priors.density_slope_gradient(raw, points, 600.0, 0.01)
-    assert raw[:, 3].tolist() == pytest.approx([field_priors.MAX_USEFUL_LOG_DENSITY] * 2, abs=0.01)
+        raw -= radiance_field.density_slope_gradient(raw, points, 600.0, 0.01)
+    assert raw[:, 3].tolist() == pytest.approx(
+        [radiance_field.MAX_USEFUL_LOG_DENSITY] * 2, abs=0.01
+    )
 
 
 def test_only_the_colors_of_visible_pairs_become_even():
     raw = torch.tensor([[1.0, 0.0, -1.0, 5.0], [-1.0, 0.0, 1.0, -9.0]])
     for _ in range(2000):
-        raw -= field_priors.color_tv_gradient(raw, 0.01)
+        raw -= radiance_field.color_tv_gradient(raw, 0.01)
     assert float((raw[0, :3] - raw[1, :3]).abs().max()) < 0.02
     assert raw[:, 3].tolist() == [5.0, -9.0]
     raw[:, 3] = 1.0
-    assert not field_priors.color_tv_gradient(raw, 1.0).any()
+    assert not radiance_field.color_tv_gradient(raw, 1.0).any()
 
 
 def test_close_pairs_are_drawn_only_if_a_prior_needs_them(generator):
     samples = torch.rand(100, 3, generator=generator)
     before = generator.get_state()
-    assert len(field_priors.sample_smoothness_pairs(samples, TrainConfig(), generator)) == 0
+    assert len(radiance_field.sample_smoothness_pairs(samples, TrainConfig(), generator)) == 0
     assert torch.equal(generator.get_state(), before)
     config = TrainConfig(density_slope_weight=0.1, smoothness_pairs=5000)
-    one, other = field_priors.sample_smoothness_pairs(samples, config, generator).chunk(2)
+    one, other = radiance_field.sample_smoothness_pairs(samples, config, generator).chunk(2)
     assert float((other - one).std()) == pytest.approx(0.5 * config.finest_m, rel=0.03)
 
 
 def test_pairs_lie_about_a_centimetre_apart(generator):
     config = TrainConfig(density_tv_pairs=5000)
     samples = torch.rand(100, 3, generator=generator)
-    one, other = field_priors.sample_tv_pairs(samples, config, generator).chunk(2)
+    one, other = radiance_field.sample_tv_pairs(samples, config, generator).chunk(2)
     assert len(one) == config.density_tv_pairs
-    assert float((other - one).std()) == pytest.approx(field_priors.TV_PAIR_SIGMA_M, rel=0.03)
+    assert float((other - one).std()) == pytest.approx(radiance_field.TV_PAIR_SIGMA_M, rel=0.03)
     assert (one[:, None] == samples).all(dim=2).any(dim=1).all()

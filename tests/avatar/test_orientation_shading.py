@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+from avatar.avatar_model import OrientationShading
 from avatar.config import TrainConfig
-from avatar.field.orientation_shading import OrientationShading
 from avatar.render import render
 from avatar.training import checkpoint
+from avatar.training.frame_stream import prepare_frame
 from avatar.training.trainer import Trainer
-from avatar.training.training_frame import prepare_frame
 
 CPU = torch.device("cpu")
 CONFIG = TrainConfig(rays=256, sample_step_m=0.03, finest_m=0.03, levels=4, table_size=1 << 13)

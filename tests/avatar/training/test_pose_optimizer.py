@@ -19,7 +19,11 @@ from avatar.kernels.backend_protocol import (
     RaySamples,
 )
 from avatar.kernels.numba_backend import NumbaBackend
-from avatar.pose.pose_optimizer import (
+from avatar.render import correspondence_tables
+from avatar.training import checkpoint
+from avatar.training.frame_stream import prepare_stream
+from avatar.training.held_out_pose_fitting import fit_test_poses
+from avatar.training.pose_optimizer import (
     FIRST_CORRECTION_STEPS,
     FREEZE_AFTER_STEPS,
     MAX_ESTIMATED_INTERVAL,
@@ -28,12 +32,7 @@ from avatar.pose.pose_optimizer import (
     MIN_STEPS_BEFORE_FREEZE,
     PoseOptimizer,
 )
-from avatar.render import correspondence_tables
-from avatar.training import checkpoint
-from avatar.training.frame_stream import prepare_stream
-from avatar.training.held_out_pose_fitting import fit_test_poses
-from avatar.training.optimizer import cosine_decay
-from avatar.training.trainer import Trainer
+from avatar.training.trainer import Trainer, cosine_decay
 from preprocess.body.body_pose import BodyPose
 
 TORCH, NUMBA = TorchBackend(), NumbaBackend()

@@ -3,7 +3,7 @@
 A tracker's jitter of 2° and 1 cm costs 5-8 dB, more than anything else on real people. The field's
 gradient at a sample reaches the pose through the warp's implicit derivative, root included, as one
 wrench per bone (`avatar.kernels.numba_skinning`). A few hundred rays of a frame make one
-Gauss-Newton step (`avatar.pose.gauss_newton`); exact poses do not move, and are soon probed rarely.
+Gauss-Newton step (`pose_correction`); exact poses do not move, and are soon probed rarely.
 A correction that all frames share is a change of the canonical body rather than an error of a
 frame, so the mean correction is removed continually.
 """
@@ -18,9 +18,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from avatar.kernels.backend_protocol import SkinningVolume
-from avatar.pose.gauss_newton import MIN_EVIDENCE, gauss_newton_step
-from avatar.pose.temporal_prior import TemporalPosePrior
 from avatar.rig import Rig
+from avatar.training.pose_correction import MIN_EVIDENCE, TemporalPosePrior, gauss_newton_step
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import (
     body_from_rest,

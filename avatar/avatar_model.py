@@ -1,11 +1,13 @@
-"""Shading by orientation: light that stays in the room while the person turns.
+"""The avatar: rig, radiance field and occupancy of one person, and the light they were filmed in.
 
-The field's colors move with the skin. What the room's light adds depends on where the skin faces in
-the world: one factor per direction, in spherical harmonics of the first order (a second order won
-nothing). Its four numbers are shared by all frames and found by linear least squares from running
-sums. The field and the package hold neutral colors.
+The light stays in the room while the person turns. The field's colors move with the skin. What the
+room's light adds depends on where the skin faces in the world: one factor per direction, in
+spherical harmonics of the first order (a second order won nothing). Its four numbers are shared by
+all frames and found by linear least squares from running sums. The field and the package hold
+neutral colors.
 """
 
+from dataclasses import dataclass
 from typing import final
 
 import numpy as np
@@ -17,12 +19,16 @@ from torch import Tensor
 from avatar.kernels.backend_protocol import (
     Backend,
     CorrespondenceTables,
+    DensityGrid,
     NormalVolume,
     PremultipliedPixels,
     RawOutputs,
     RayBatch,
     RaySamples,
 )
+from avatar.kernels.torch_reference import activate
+from avatar.occupancy_grid import OccupancyGrid, in_occupied_cells
+from avatar.radiance_field import RadianceField
 from avatar.rig import Rig
 
 HARMONICS = 4
@@ -157,3 +163,36 @@ class OrientationShading:
 def _harmonics(normals: Float32[Tensor, "rays 3"]) -> Float32[Tensor, "rays 4"]:
     """Spherical harmonics up to the first order, not normalized."""
     return torch.cat([torch.ones_like(normals[:, :1]), normals], dim=1)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Avatar:
+    """A person who can be rendered in any pose.
+
+    Attributes:
+        rig: Articulation.
+        field: Canonical color and density.
+        occupancy: Occupied canonical cells.
+        sample_step_m: Distance between samples along a ray in training, metres.
+        shading: Light of the room in which the person was filmed.
+    """
+
+    rig: Rig
+    field: RadianceField
+    occupancy: OccupancyGrid
+    sample_step_m: float
+    shading: OrientationShading
+
+    def rendering_grid(self) -> DensityGrid:
+        """Occupancy for rendering, grown so that images have no holes."""
+        return self.occupancy.for_rendering(self.sample_step_m)
+
+    def color_and_density_at(
+        self, points: Float32[Tensor, "points 3"]
+    ) -> tuple[Float32[Tensor, "points 3"], Float32[Tensor, "points"]]:
+        """Color in [0, 1] and density, 1/m, at canonical points; zero in empty cells."""
+        held = in_occupied_cells(self.rendering_grid(), points).nonzero()[:, 0]
+        color, density = activate(self.field.raw_outputs_at(points[held].contiguous()))
+        all_colors, all_densities = torch.zeros_like(points), torch.zeros_like(points[:, 0])
+        all_colors[held], all_densities[held] = color, density
+        return all_colors, all_densities

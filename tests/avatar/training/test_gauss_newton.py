@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from avatar.pose.gauss_newton import (
+from avatar.training.pose_correction import (
     FULL_EVIDENCE,
     MIN_EVIDENCE,
     PRIOR_SIGMA_M,
     PRIOR_SIGMA_RAD,
+    PosePrior,
     gauss_newton_step,
 )
-from avatar.pose.temporal_prior import PosePrior
 
 NONE = np.zeros((25, 3))
 SCALE = np.append(np.full(24, PRIOR_SIGMA_RAD), PRIOR_SIGMA_M)[:, None]

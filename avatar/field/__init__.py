@@ -1,1 +1,0 @@
-"""The canonical radiance field, its occupancy grid and regularizers."""

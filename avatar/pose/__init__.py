@@ -1,1 +1,0 @@
-"""Pose refinement: Gauss-Newton steps and a prior over time."""
