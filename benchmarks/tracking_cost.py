@@ -19,7 +19,7 @@ from apps.tracking.person_tracking import fit_tracked_video
 from capture.source_opening import open_source
 from preprocess.capture_session import CaptureInputs
 from preprocess.masks.mask_refinement import MaskRefiner
-from preprocess.tracking.tracker_registry import make_tracker
+from preprocess.plugins import make_tracker
 from preprocess.tracking.video_tracking import track_video
 
 WARM_FRAMES = slice(0, 12)

@@ -1,4 +1,4 @@
-"""Makes the networks in preprocess/blazepose/weights from the published BlazePose models.
+"""Makes the networks in preprocess/tracking/weights from the published BlazePose models.
 
 For developers only; using the project does not require it. From the project's root:
 
@@ -28,7 +28,7 @@ from dev.tflite_model import TfliteModel  # noqa: E402
 
 PACKAGE_SHA256 = "8bb349a7b3a3ba699df23be804ddd3b3eab810b50b15406894be257859388a84"
 """Of mediapipe-pose-0.5.1675469404.tgz."""
-WEIGHTS = ROOT / "preprocess/blazepose/weights"
+WEIGHTS = ROOT / "preprocess/tracking/weights"
 LANDMARK_OUTPUTS = {
     "Identity": "landmarks",
     "Identity_1": "presence",

@@ -13,19 +13,18 @@ from capture.input_error import InputError
 from capture.source import Frame, FrameSource, PacingClock, RealtimePlayback
 from capture.watched_image_folder import IDLE_TIMEOUT_S
 from preprocess.alignment.capture_geometry import CaptureGeometry
-from preprocess.alignment.mask_alignment import BodyPlacement
+from preprocess.alignment.mask_alignment import BodyPlacement, LiveAlignment
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.capture_paths import CapturePaths, find_parts
 from preprocess.fitting.capture_fit import CaptureFit
-from preprocess.live.live_alignment import LiveAlignment
-from preprocess.live.live_inputs import LiveInputs
-from preprocess.live.tracked_stream import LiveTracking
+from preprocess.live_inputs import LiveInputs
 from preprocess.masks.given_mask_refinement import GivenMaskRefiner
 from preprocess.masks.mask_files import Masks
-from preprocess.masks.mask_origin import Segmenter, segmenter_name
 from preprocess.observation import DroppedFrame, Observation, observation_builder
+from preprocess.plugins import Segmenter, segmenter_name
+from preprocess.tracked_stream import LiveTracking
 
 
 @dataclass(frozen=True, kw_only=True)

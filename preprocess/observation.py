@@ -17,7 +17,7 @@ from preprocess.cameras.camera_file import CameraTrack
 from preprocess.frame_association import associate_by_name, associate_by_order, associate_by_time
 from preprocess.masks.given_mask_refinement import GivenMaskRefiner
 from preprocess.masks.mask_files import Masks
-from preprocess.masks.mask_origin import Segmenter
+from preprocess.plugins import Segmenter
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -20,25 +20,29 @@ from preprocess.alignment.capture_alignment import (
     place_motion,
 )
 from preprocess.alignment.capture_evidence import CaptureEvidence
-from preprocess.alignment.mask_alignment import body_height_m, rescale_motion, scale_to_height
+from preprocess.alignment.mask_alignment import (
+    LiveAlignment,
+    body_height_m,
+    rescale_motion,
+    scale_to_height,
+)
 from preprocess.body.body_pose import Motion
 from preprocess.body.parametric_body import ShapedBody, load_body_model, read_shaped_body
 from preprocess.body.proportion_space import shape_for_motion
 from preprocess.cameras.camera_file import CameraTrack, assume_static_camera
 from preprocess.cameras.camera_orientation import read_upright_cameras
-from preprocess.capture_paths import CapturePaths, find_capture_paths, find_live_capture_paths
+from preprocess.capture_paths import (
+    CapturePaths,
+    MaskOrigin,
+    choose_mask_origin,
+    find_capture_paths,
+    find_live_capture_paths,
+)
 from preprocess.capture_session import Capture, CaptureInputs
-from preprocess.live.live_alignment import LiveAlignment
-from preprocess.live.live_inputs import LiveInputs
+from preprocess.live_inputs import LiveInputs
 from preprocess.masks.given_mask_refinement import GivenMaskRefiner
 from preprocess.masks.mask_files import Masks, open_masks, open_tracker_masks
-from preprocess.masks.mask_origin import (
-    MaskOrigin,
-    Segmenter,
-    choose_mask_origin,
-    make_segmenter,
-    segmenter_name,
-)
+from preprocess.plugins import Segmenter, make_segmenter, segmenter_name
 from preprocess.poses.motion_builder import place_in_camera_world
 from preprocess.poses.plausibility import (
     lost_pose_warnings,

@@ -10,15 +10,20 @@ from capture.source_opening import open_live_source, open_source
 from preprocess.alignment.capture_alignment import BodyAlignment
 from preprocess.body.parametric_body import load_body_model, read_shaped_body
 from preprocess.cameras.camera_orientation import assume_camera
-from preprocess.capture_paths import CapturePaths, find_own_masks, find_stream_cameras
+from preprocess.capture_paths import (
+    CapturePaths,
+    MaskOrigin,
+    choose_mask_origin,
+    find_own_masks,
+    find_stream_cameras,
+)
 from preprocess.capture_session import Capture, CaptureInputs
-from preprocess.live.live_masks import LiveMasks, check_mask_folder
-from preprocess.live.tracked_stream import LiveTracking, MaskReader, TrackedStream
+from preprocess.live_inputs import LiveMasks, check_mask_folder
 from preprocess.masks.mask_files import open_masks
-from preprocess.masks.mask_origin import MaskOrigin, choose_mask_origin, make_segmenter
 from preprocess.observation import alpha_channel_mask, associate_masks
 from preprocess.open_capture import describe_capture, make_mask_refiner
-from preprocess.tracking.person_tracker import PersonTracker
+from preprocess.plugins import PersonTracker, make_segmenter
+from preprocess.tracked_stream import LiveTracking, MaskReader, TrackedStream
 from preprocess.tracking.video_tracking import MaskRefinement
 
 

@@ -1,12 +1,103 @@
-"""Parts that other packages register as entry points: segmenters and trackers."""
+"""Trackers and segmenters by name: this project's own, or others that packages register.
+
+A tracker's networks find one person's key points and mask, frame by frame; a segmenter's find the
+person's mask where poses are given. Both of this project's own are BlazePose; another package may
+register one as an entry point.
+"""
 
 from importlib.metadata import entry_points
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from capture.camera import Camera
 from capture.input_error import InputError
+from capture.source import Frame
+from preprocess.body.body_pose import BodyPose
+from preprocess.body.parametric_body import ShapedBody
+from preprocess.tracking.keypoints import PersonKeypoints
+
+DEFAULT_TRACKER = "blazepose"
+"""Name of this project's own tracker."""
+SEGMENTER_PREFIX = "segmenter:"
+"""What precedes a segmenter's name in --masks."""
+DEFAULT_SEGMENTER = "blazepose"
+"""Name of this project's own segmenter."""
 
 
-def make_plugin(kind: str, name: str, *arguments: object, own: str, option: str) -> Any:
+@runtime_checkable
+class PersonTracker(Protocol):
+    """Follows one person, frame by frame, in the order of the frames."""
+
+    def __call__(self, rgb: UInt8[np.ndarray, "height width 3"]) -> PersonKeypoints | None:
+        """Find the person in the next frame; None where there is none."""
+        ...
+
+
+@runtime_checkable
+class Segmenter(Protocol):
+    """Segments the person, frame by frame, in the order of the frames."""
+
+    def __call__(
+        self, frame: Frame, pose: BodyPose, camera: Camera
+    ) -> Float32[np.ndarray, "height width"]:
+        """Estimate how far each pixel is person, in [0, 1].
+
+        Args:
+            frame: The frame, of any size.
+            pose: The tracker's pose of the body.
+            camera: Camera of the frame's size.
+        """
+        ...
+
+
+def segmenter_name(masks: object) -> str | None:
+    """The name after `segmenter:` in --masks; None if it names a file or nothing."""
+    text = str(masks)
+    return text.removeprefix(SEGMENTER_PREFIX) if text.startswith(SEGMENTER_PREFIX) else None
+
+
+def make_segmenter(name: str, shaped: ShapedBody) -> Segmenter:
+    """Make this project's segmenter, or one of an installed package.
+
+    Another package's entry point `make(shaped)` returns a Segmenter.
+
+    Raises:
+        InputError: If no package registers that name, or its segmenter cannot be loaded.
+    """
+    if name == DEFAULT_SEGMENTER:
+        from preprocess.tracking.blazepose_segmenter import BlazePoseSegmenter
+
+        return BlazePoseSegmenter(shaped)
+    option = f"--masks {SEGMENTER_PREFIX}{name}"
+    return _make_registered("segmenter", name, shaped, own=DEFAULT_SEGMENTER, option=option)
+
+
+def make_tracker(name: str = DEFAULT_TRACKER, person: int | None = None) -> PersonTracker:
+    """Make this project's tracker, or one of an installed package.
+
+    Another package's entry point NAME = "module:make" lies in the group
+    `instant_avatar.trackers`; `make(person)` returns a PersonTracker.
+
+    Args:
+        name: The tracker's.
+        person: Whom to follow, counted from left to right from 1, in the first frame with that
+            many persons; the largest one if it is not given.
+
+    Raises:
+        InputError: If no package registers that name, or its tracker cannot be loaded.
+    """
+    if name == DEFAULT_TRACKER:
+        from preprocess.tracking.blazepose_tracker import BlazePoseTracker
+
+        return BlazePoseTracker(person=person)
+    return _make_registered(
+        "tracker", name, person, own=DEFAULT_TRACKER, option=f"--tracker {name}"
+    )
+
+
+def _make_registered(kind: str, name: str, *arguments: object, own: str, option: str) -> Any:
     """Make a part that an installed package registers.
 
     Its entry point NAME = "module:make" lies in the group `instant_avatar.KINDs`.

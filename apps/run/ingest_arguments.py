@@ -20,8 +20,8 @@ from capture.watched_image_folder import IDLE_TIMEOUT_S
 from preprocess.alignment.mask_alignment import MAX_HEIGHT_CM, MIN_HEIGHT_CM
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.fitting.capture_fit import load_capture_fit
-from preprocess.masks.mask_origin import segmenter_name
 from preprocess.open_capture import open_capture
+from preprocess.plugins import segmenter_name
 
 PROGRAM = "ia-ingest"
 """Name of the command."""

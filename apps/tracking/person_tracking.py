@@ -27,16 +27,14 @@ from preprocess.capture_paths import find_live_poses, find_own_masks, find_own_p
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.fitting.capture_fitting import fit_capture, fitted_motion
 from preprocess.masks.mask_files import open_masks
-from preprocess.masks.mask_origin import segmenter_name
 from preprocess.masks.mask_refinement import MaskRefiner
 from preprocess.observation import associate_cameras, associate_masks
 from preprocess.open_capture import open_capture
 from preprocess.open_stream import open_tracked_stream
+from preprocess.plugins import DEFAULT_TRACKER, PersonTracker, make_tracker, segmenter_name
 from preprocess.poses.pose_file import read_motion, write_motion
-from preprocess.tracking.keypoint_track import KeypointTrack
-from preprocess.tracking.person_tracker import PersonTracker
+from preprocess.tracking.keypoints import KeypointTrack
 from preprocess.tracking.pose_lift import lift_keypoints
-from preprocess.tracking.tracker_registry import DEFAULT_TRACKER, make_tracker
 from preprocess.tracking.tracking_grade import TrackingGrade, grade_tracking
 from preprocess.tracking.video_tracking import TrackedVideo, track_video
 

@@ -29,8 +29,8 @@ from preprocess.body.body_surface import (
     splat_silhouette,
 )
 from preprocess.cameras.camera_file import CameraTrack
-from preprocess.masks.mask_origin import DEFAULT_SEGMENTER, make_segmenter
 from preprocess.observation import associate_cameras
+from preprocess.plugins import DEFAULT_SEGMENTER, make_segmenter
 
 IMAGE_PERSON_PX = 130
 """Height of the person in the reduced images by the poses, px."""

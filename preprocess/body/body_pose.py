@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from preprocess.tracking.keypoint_track import KeypointTrack
+from preprocess.tracking.keypoints import KeypointTrack
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

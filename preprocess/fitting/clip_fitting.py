@@ -22,7 +22,7 @@ from preprocess.fitting.keypoint_rows import ClipCameras, ClipKeypoints, Keypoin
 from preprocess.fitting.normal_equations import ChainEquations
 from preprocess.fitting.outlines import OutlineDistances, OutlineModel
 from preprocess.fitting.pose_priors import POSE_SIGMA, GivenPosePrior, HumanPosePrior
-from preprocess.tracking.keypoint_track import KeypointTrack
+from preprocess.tracking.keypoints import KeypointTrack
 
 SIGMA_OUTLINE_PX = 1.0
 """Standard deviation of an outline's distance, px of the reduced masks."""

@@ -16,7 +16,7 @@ from capture.camera import Camera
 from preprocess.body.kinematics import descendant_matrix
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.fitting.clip_poses import ClipPoses, PosedJoints
-from preprocess.tracking.keypoint_track import KeypointTrack
+from preprocess.tracking.keypoints import KeypointTrack
 
 KEYPOINT_JOINTS = np.array(
     [15, 15, 15, 15, 15, 15, 15, 15, 15, 15, 15, 16, 17, 18, 19, 20, 21, 20, 21, 20, 21, 20, 21,

@@ -29,8 +29,7 @@ from preprocess.fitting.clip_fitting import (
 )
 from preprocess.fitting.outlines import OUTLINE_PERSON_PX, OutlineDistances, OutlineModel
 from preprocess.observation import shrink_to_longer_side
-from preprocess.tracking.keypoint_track import KeypointTrack
-from preprocess.tracking.keypoints import PersonKeypoints
+from preprocess.tracking.keypoints import KeypointTrack, PersonKeypoints
 from preprocess.tracking.pose_lift import lift_keypoints
 
 WINDOW_FRAMES = 10

@@ -16,10 +16,14 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int, UInt8
 
-from preprocess.masks.background_plate import BackgroundPlate, PlateColors
-from preprocess.masks.local_colors import color_density, local_densities
+from preprocess.masks.color_models import (
+    BackgroundPlate,
+    DarkFilmBrightener,
+    PlateColors,
+    color_density,
+    local_densities,
+)
 from preprocess.masks.matting import apply_coefficients, guided_coefficients, refine_border
-from preprocess.tracking.dark_film import DarkFilmBrightener
 from preprocess.tracking.keypoints import CroppedMask
 
 WORKING_SCALE = 2.0

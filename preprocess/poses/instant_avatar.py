@@ -25,7 +25,7 @@ from preprocess.body.body_pose import RelativeFocalLength
 from preprocess.frame_association import frame_numbers_from_names
 from preprocess.poses.motion_builder import MotionByPerson
 from preprocess.poses.pose_file import CAMERA_KEYS, POSE_KEY_LAYOUTS, motion_from_arrays
-from preprocess.tracking.keypoint_track import KEYPOINT_SHAPES
+from preprocess.tracking.keypoints import KEYPOINT_SHAPES
 
 KEY_ALIASES = {
     "global_orient": ("root_orient", "root_pose", "poses_root"),

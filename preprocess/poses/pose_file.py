@@ -11,7 +11,7 @@ from capture.input_error import InputError
 from preprocess.body.body_pose import Motion, PoseSpace
 from preprocess.body.kinematics import stack_axis_angles
 from preprocess.file_content import read_npz
-from preprocess.tracking.keypoint_track import KeypointTrack
+from preprocess.tracking.keypoints import KeypointTrack
 
 POSE_KEY_LAYOUTS = (
     ("global_orient", "body_pose", "transl"),

@@ -3,21 +3,35 @@
 The root follows from the trunk's four key points, limbs from the directions between theirs. How far
 an upper arm or a thigh twists about itself follows from where the elbow or the knee bends to. The
 distance is the one at which the body covers its key points in the picture.
+
+Short stretches in which a tracker took the person's left for the right are repaired first: only
+frames close in time are compared, and only a stretch that both its neighbors contradict is changed.
 """
 
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.poses.motion_builder import fill_gaps, place_by_pixels
-from preprocess.tracking.keypoint_track import KeypointTrack
-from preprocess.tracking.swap_repair import repair_swaps
+from preprocess.tracking.keypoints import KeypointTrack
 
+LEFT_POINTS = (1, 2, 3, *range(7, 33, 2))
+"""The person's left key points."""
+RIGHT_POINTS = (4, 5, 6, *range(8, 33, 2))
+"""The right ones, in the same order."""
+COMPARED_POINTS = (11, 13, 23, 25, 27)
+"""Left shoulder, elbow, hip, knee and ankle."""
+MAX_COSINE = -0.4
+"""Cosine between the directions from right to left of two frames below which one is swapped."""
+MAX_STRETCH_FRAMES = 15
+"""Longest stretch that is repaired, frames."""
+MAX_GAP_FRAMES = 3
+"""Frames between two rows beyond which they are not compared."""
 MIN_PRESENCE = 0.5
 """Probability of a person below which a frame's key points are not used."""
 TRUNK_POINTS = (11, 12, 23, 24)
@@ -36,6 +50,50 @@ PLACED_JOINTS = (1, 2, 4, 5, 7, 8, 16, 17, 18, 19, 20, 21)
 """Joints that are placed at their key points in the picture."""
 PLACED_POINTS = (23, 24, 25, 26, 27, 28, 11, 12, 13, 14, 15, 16)
 """Their key points."""
+
+
+def repair_swaps(track: KeypointTrack) -> tuple[KeypointTrack, Bool[np.ndarray, "rows"]]:
+    """Exchange left and right where a short stretch contradicts the frames on both its sides.
+
+    Returns:
+        The track, and the rows that were changed.
+    """
+    swapped = find_swaps(track)
+    mirrored = np.arange(33)
+    mirrored[list(LEFT_POINTS)], mirrored[list(RIGHT_POINTS)] = RIGHT_POINTS, LEFT_POINTS
+    order = np.where(swapped[:, None], mirrored, np.arange(33))
+    rows = np.arange(len(track))[:, None]
+    repaired = replace(
+        track,
+        image_px=track.image_px[rows, order],
+        world_m=track.world_m[rows, order],
+        visibility=track.visibility[rows, order],
+    )
+    return repaired, swapped
+
+
+def find_swaps(track: KeypointTrack) -> Bool[np.ndarray, "rows"]:
+    """Rows in which left and right are exchanged, by their neighbors."""
+    across = track.world_m[:, list(COMPARED_POINTS)]
+    across = across - track.world_m[:, [point + 1 for point in COMPARED_POINTS]]
+    flat = across.reshape(len(track), -1)
+    near = np.diff(track.frames) <= MAX_GAP_FRAMES
+    turns = np.flatnonzero(near & (_cosines(flat) < MAX_COSINE)) + 1
+    found = np.zeros(len(track), dtype=bool)
+    bounds = [0, *turns.tolist(), len(track)]
+    for index in range(1, len(bounds) - 2):
+        start, stop = bounds[index], bounds[index + 1]
+        length = stop - start
+        beside = min(start - bounds[index - 1], bounds[index + 2] - stop)
+        if length <= min(MAX_STRETCH_FRAMES, beside) and not found[start - 1]:
+            found[start:stop] = True
+    return found
+
+
+def _cosines(rows: Float[np.ndarray, "rows n"]) -> Float[np.ndarray, "gaps"]:
+    """Cosine between each row and the next."""
+    size = np.maximum(np.linalg.norm(rows, axis=1), 1e-9)
+    return (rows[1:] * rows[:-1]).sum(axis=1) / (size[1:] * size[:-1])
 
 
 def lift_keypoints(track: KeypointTrack, shaped: ShapedBody, camera: Camera) -> Motion:

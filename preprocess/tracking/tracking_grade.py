@@ -14,8 +14,8 @@ from capture.camera import Camera
 from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import rotation_matrices
 from preprocess.body.parametric_body import ShapedBody
-from preprocess.tracking.keypoint_track import KeypointTrack
-from preprocess.tracking.tracking_problems import PROBLEM_BITS, TrackingProblem
+from preprocess.tracking.keypoints import KeypointTrack
+from preprocess.tracking.video_tracking import PROBLEM_BITS, TrackingProblem
 
 MIN_IOU = 0.7
 """Least mean IoU of body and mask of poses that are good enough for an avatar."""

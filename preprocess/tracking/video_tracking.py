@@ -1,14 +1,16 @@
 """Tracks the person of a recording: key points in memory, masks as pictures in a folder.
 
-Networks run on one thread; masks are refined and written on another, so two cores are busy.
+Networks run on one thread; masks are refined and written on another, so two cores are busy. Frames
+in which borders of the picture or other persons make the track doubtful are marked.
 """
 
 import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from enum import Enum
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Protocol, final, runtime_checkable
 
 import cv2
 import numpy as np
@@ -16,17 +18,115 @@ from jaxtyping import Float32, UInt8
 
 from capture.input_error import InputError
 from capture.source import FrameSource
-from preprocess.tracking.keypoint_track import KeypointTrack
-from preprocess.tracking.keypoints import CroppedMask, PersonKeypoints
-from preprocess.tracking.person_tracker import PersonTracker
-from preprocess.tracking.tracking_problems import PROBLEM_BITS, ProblemFinder
+from preprocess.plugins import PersonTracker
+from preprocess.tracking.keypoints import CroppedMask, KeypointTrack, PersonKeypoints
 
+BORDER_SAMPLES = 128
+"""Places along each border of a frame at which the mask is read."""
+MIN_TOUCHING = 2
+"""Places with the person in them that make a touch."""
+BODY_POINTS = (0, 7, 8, *range(11, 17), *range(23, 29))
+"""Key points of the body, without fingers, heels and toes."""
+CUT_MARGIN = 0.05
+"""Distance of a key point of the body from a border within which the person is cut there, person
+heights. Shoes and fingertips that touch a border are farther: they cut nothing off."""
+ELSEWHERE = 0.6
+"""Distance from the last place, in sides of the square around the person, that is worth a word."""
 MIN_FOUND = 8
 """Fewest frames in which the person must be found; 4 of fewer than 16 frames."""
 FRAMES_REFINED_AGAIN = 60
 """First frames whose masks are made again in the end, when the background behind them is known."""
 QUEUED_MASKS = 8
 """Most masks that wait to be written."""
+
+
+class TrackingProblem(Enum):
+    """Kinds of doubtful frames; the value is what a user reads."""
+
+    CROWDED = "another person is so near that the two may be mixed up"
+    ELSEWHERE = "the person was found again in another place, perhaps it is another person"
+    LEFT = "the person is cut by the picture's left border"
+    RIGHT = "the person is cut by the picture's right border"
+    TOP = "the person is cut by the picture's upper border"
+    BOTTOM = "the person is cut by the picture's lower border"
+
+
+PROBLEM_BITS = {problem: 1 << place for place, problem in enumerate(TrackingProblem)}
+"""The bit of each problem in the numbers that files hold."""
+
+
+@final
+class ProblemFinder:
+    """Finds the problems of a track, frame by frame."""
+
+    def __init__(self) -> None:
+        """Starts without frames."""
+        self._last_found: PersonKeypoints | None = None
+        self._is_absent = False
+
+    def problems(
+        self, found: PersonKeypoints | None, size_px: tuple[int, int]
+    ) -> frozenset[TrackingProblem]:
+        """The problems of the next frame.
+
+        Args:
+            found: The person in it; None if there was none.
+            size_px: Width and height of the frame.
+        """
+        if found is None:
+            self._is_absent = True
+            return frozenset()
+        problems = touched_borders(found, size_px)
+        if found.crowded:
+            problems.add(TrackingProblem.CROWDED)
+        if self._is_absent and self._last_found and has_moved(self._last_found, found):
+            problems.add(TrackingProblem.ELSEWHERE)
+        self._last_found, self._is_absent = found, False
+        return frozenset(problems)
+
+
+def touched_borders(found: PersonKeypoints, size_px: tuple[int, int]) -> set[TrackingProblem]:
+    """The borders of the frame that cut a person: the mask touches them, key points are near."""
+    width, height = size_px
+    body = found.image_px[list(BODY_POINTS)]
+    low_xy, high_xy = body.min(axis=0), body.max(axis=0)
+    margin = CUT_MARGIN * float(np.ptp(found.image_px, axis=0).max())
+    near = {
+        TrackingProblem.LEFT: low_xy[0] < margin,
+        TrackingProblem.RIGHT: high_xy[0] > width - margin,
+        TrackingProblem.TOP: low_xy[1] < margin,
+        TrackingProblem.BOTTOM: high_xy[1] > height - margin,
+    }
+    crop_from_image = np.linalg.inv(np.vstack([found.mask.image_from_crop, [0, 0, 1]]))[:2]
+    inset = np.hypot(*found.mask.image_from_crop[:, 0])  # one of the mask's own pixels
+    along = (np.arange(BORDER_SAMPLES) + 0.5) / BORDER_SAMPLES
+    low, high = np.full(BORDER_SAMPLES, inset), np.ones(BORDER_SAMPLES)
+    lines = {
+        TrackingProblem.LEFT: (low, along * height),
+        TrackingProblem.RIGHT: (high * width - inset, along * height),
+        TrackingProblem.TOP: (along * width, low),
+        TrackingProblem.BOTTOM: (along * width, high * height - inset),
+    }
+    rows, columns = found.mask.values.shape
+    touched = set()
+    for problem, (x, y) in lines.items():
+        if not near[problem]:
+            continue
+        column, row = np.floor(crop_from_image @ np.array([x, y, high])).astype(int)
+        inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+        if (found.mask.values[row[inside], column[inside]] > 127).sum() >= MIN_TOUCHING:
+            touched.add(problem)
+    return touched
+
+
+def has_moved(before: PersonKeypoints, after: PersonKeypoints) -> bool:
+    """Whether two squares around a person are far from each other."""
+    middles = []
+    for found in (before, after):
+        rows, columns = found.mask.values.shape
+        middles.append(found.mask.image_from_crop @ [columns / 2, rows / 2, 1])
+    side = before.mask.values.shape[1] * np.hypot(*before.mask.image_from_crop[:, 0])
+    return bool(np.hypot(*(middles[1] - middles[0])) > ELSEWHERE * side)
 
 
 @runtime_checkable

@@ -12,7 +12,7 @@ from PIL import Image
 from capture.source_opening import open_source
 from capture.video_decoder import OpenCvDecoder
 from preprocess.capture_session import CaptureInputs
-from preprocess.live.live_inputs import LATE_ALPHA_WARNING
+from preprocess.live_inputs import LATE_ALPHA_WARNING
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
 

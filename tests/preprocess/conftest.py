@@ -17,7 +17,7 @@ from preprocess.body.kinematics import PARENTS
 from preprocess.body.parametric_body import ShapedBody, load_body_model
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.fitting.keypoint_rows import KEYPOINT_JOINTS, KeypointModel
-from preprocess.tracking.keypoint_track import KeypointTrack
+from preprocess.tracking.keypoints import KeypointTrack
 
 
 @pytest.fixture

@@ -12,13 +12,13 @@ from apps import check, track
 from apps.cli.console import Console
 from apps.tracking import person_tracking
 from capture.source_opening import open_source
-from preprocess.blazepose.blazepose_tracker import BlazePoseTracker
 from preprocess.body.parametric_body import load_body_model
 from preprocess.body.proportion_space import shape_for_motion
 from preprocess.capture_session import CaptureInputs
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
 from preprocess.poses.pose_file import read_motion
+from preprocess.tracking.blazepose_tracker import BlazePoseTracker
 
 
 @pytest.fixture(scope="module")

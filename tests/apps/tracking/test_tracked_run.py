@@ -18,12 +18,12 @@ from apps.tracking.person_tracking import open_stream
 from avatar.training import train
 from avatar.training.trainer import Trainer
 from capture.input_error import InputError
-from preprocess.blazepose.blazepose_tracker import BlazePoseTracker
+from preprocess import tracked_stream
 from preprocess.capture_session import CaptureInputs
 from preprocess.fitting import tracked_frames
-from preprocess.live import tracked_stream
 from preprocess.masks.mask_refinement import MaskRefiner
 from preprocess.poses.pose_file import read_motion
+from preprocess.tracking.blazepose_tracker import BlazePoseTracker
 from tests.apps.conftest import Outcome
 
 

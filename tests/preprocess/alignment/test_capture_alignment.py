@@ -11,7 +11,7 @@ from capture.source import Frame
 from capture.source_opening import open_source
 from preprocess.alignment.capture_alignment import BodyAlignment, align_body, align_to_person
 from preprocess.alignment.capture_evidence import CaptureEvidence
-from preprocess.alignment.mask_alignment import body_height_m, scale_to_height
+from preprocess.alignment.mask_alignment import LiveAlignment, body_height_m, scale_to_height
 from preprocess.body.body_pose import Motion
 from preprocess.body.body_surface import SkinPoints, splat_silhouette
 from preprocess.body.parametric_body import (
@@ -23,7 +23,6 @@ from preprocess.body.parametric_body import (
 )
 from preprocess.body.proportion_space import shape_for_motion
 from preprocess.cameras.camera_file import CameraTrack
-from preprocess.live.live_alignment import LiveAlignment
 from preprocess.masks.mask_files import open_masks
 from preprocess.observation import Observation
 

@@ -15,14 +15,13 @@ from preprocess.alignment.capture_alignment import NO_PERSON_FOUND, align_body
 from preprocess.alignment.capture_evidence import CaptureEvidence
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.image_alignment import ImageSample, edge_contrast, estimate_silhouettes
-from preprocess.alignment.mask_alignment import move_pelvis, place_body_on_masks
+from preprocess.alignment.mask_alignment import LiveAlignment, move_pelvis, place_body_on_masks
 from preprocess.body.body_pose import Motion
 from preprocess.body.body_surface import MeshSilhouette, SkinPoints
 from preprocess.body.kinematics import rotation_matrices
 from preprocess.body.parametric_body import ShapedBody, load_body_model
 from preprocess.body.proportion_space import shape_for_motion
 from preprocess.cameras.camera_file import CameraTrack
-from preprocess.live.live_alignment import LiveAlignment
 
 SIZE, FRAMES = (96, 128), 4
 CAMERA = Camera(focal_px=(190.0, 190.0), center_px=(48.0, 64.0), size_px=SIZE,

@@ -23,8 +23,7 @@ from preprocess.fitting.tracked_frames import (
 )
 from preprocess.open_capture import open_capture
 from preprocess.poses.pose_file import read_motion, write_motion
-from preprocess.tracking.keypoint_track import KeypointTrack
-from preprocess.tracking.keypoints import CroppedMask, PersonKeypoints
+from preprocess.tracking.keypoints import CroppedMask, KeypointTrack, PersonKeypoints
 from preprocess.tracking.pose_lift import lift_keypoints
 from studio.shoot import ShootConfig, film_capture
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from preprocess.masks.background_plate import BackgroundPlate
+from preprocess.masks.color_models import BackgroundPlate
 
 SIZE = 40, 60
 FREE = np.ones(SIZE, dtype=bool)

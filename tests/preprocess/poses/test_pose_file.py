@@ -8,7 +8,7 @@ import pytest
 from capture.input_error import InputError
 from preprocess.poses.pose_file import read_motion, write_motion
 from preprocess.poses.pose_format_registry import read_poses
-from preprocess.tracking.keypoint_track import KeypointTrack
+from preprocess.tracking.keypoints import KeypointTrack
 
 
 @pytest.fixture

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from preprocess.tracking.keypoint_track import KeypointTrack
-from preprocess.tracking.swap_repair import LEFT_POINTS, RIGHT_POINTS, repair_swaps
+from preprocess.tracking.keypoints import KeypointTrack
+from preprocess.tracking.pose_lift import LEFT_POINTS, RIGHT_POINTS, repair_swaps
 
 LEFT, RIGHT = list(LEFT_POINTS), list(RIGHT_POINTS)
 

@@ -8,9 +8,9 @@ import pytest
 from capture.camera import Camera
 from preprocess.body.body_pose import Motion
 from preprocess.body.parametric_body import load_body_model
-from preprocess.tracking.keypoint_track import KeypointTrack
+from preprocess.tracking.keypoints import KeypointTrack
 from preprocess.tracking.tracking_grade import TrackingGrade, grade_tracking
-from preprocess.tracking.tracking_problems import PROBLEM_BITS, TrackingProblem
+from preprocess.tracking.video_tracking import PROBLEM_BITS, TrackingProblem
 
 FRAMES = 60
 FPS = 30.0

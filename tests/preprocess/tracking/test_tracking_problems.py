@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from preprocess.tracking.keypoints import CroppedMask, PersonKeypoints
-from preprocess.tracking.tracking_problems import (
+from preprocess.tracking.video_tracking import (
     ProblemFinder,
     TrackingProblem,
     touched_borders,

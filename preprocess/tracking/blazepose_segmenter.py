@@ -13,13 +13,12 @@ from jaxtyping import Float, Float32
 from capture.camera import Camera
 from capture.input_error import InputError
 from capture.source import Frame
-from preprocess.blazepose.blazepose_landmarks import BlazePoseLandmarks
-from preprocess.blazepose.person_square import PersonSquare
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.body_surface import NEAR_PLANE_M, SkinPoints
 from preprocess.body.parametric_body import ShapedBody
+from preprocess.masks.color_models import DarkFilmBrightener
 from preprocess.masks.mask_refinement import MaskRefiner
-from preprocess.tracking.dark_film import DarkFilmBrightener
+from preprocess.tracking.blazepose_networks import BlazePoseLandmarks, PersonSquare
 from preprocess.tracking.keypoints import CroppedMask
 
 HIP_JOINTS, NECK_JOINT = (1, 2), 12

@@ -19,6 +19,7 @@ from jaxtyping import Float32
 from capture.camera import Camera
 from capture.input_error import InputError
 from capture.source import Frame, FrameSource
+from preprocess.alignment.mask_alignment import LiveAlignment
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.cameras.camera_file import CameraTrack
@@ -31,16 +32,14 @@ from preprocess.fitting.tracked_frames import (
     fit_first_frames,
     reduced_size_px,
 )
-from preprocess.live.live_alignment import LiveAlignment
 from preprocess.masks.given_mask_refinement import GivenMaskRefiner
-from preprocess.masks.mask_origin import Segmenter
 from preprocess.observation import (
     DroppedFrame,
     Observation,
     compose_observation_builder,
     shrink_to_longer_side,
 )
-from preprocess.tracking.person_tracker import PersonTracker
+from preprocess.plugins import PersonTracker, Segmenter
 from preprocess.tracking.video_tracking import MaskRefinement
 
 START_FRAMES = 8

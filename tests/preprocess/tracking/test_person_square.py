@@ -1,9 +1,9 @@
-"""Tests of `preprocess/blazepose/person_square.py` and of masks in such a square."""
+"""Tests of `preprocess/tracking/blazepose_networks.py`: the square, and masks in such a square."""
 
 import numpy as np
 import pytest
 
-from preprocess.blazepose.person_square import PersonSquare
+from preprocess.tracking.blazepose_networks import PersonSquare
 from preprocess.tracking.keypoints import CroppedMask
 
 SIZE = 64

@@ -12,14 +12,15 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from capture.input_error import InputError
-from preprocess.blazepose.blazepose_detector import (
+from preprocess.masks.color_models import DarkFilmBrightener
+from preprocess.tracking.blazepose_networks import (
     SAME_PERSON_DISTANCE,
     BlazePoseDetector,
+    BlazePoseLandmarks,
+    FoundLandmarks,
     PersonDetection,
+    PersonSquare,
 )
-from preprocess.blazepose.blazepose_landmarks import BlazePoseLandmarks, FoundLandmarks
-from preprocess.blazepose.person_square import PersonSquare
-from preprocess.tracking.dark_film import DarkFilmBrightener
 from preprocess.tracking.keypoints import PersonKeypoints
 
 SHOULDERS, HIPS, KNEES = (11, 12), (23, 24), (25, 26)

@@ -11,8 +11,7 @@ import pytest
 from capture.input_error import InputError
 from capture.source import Frame, PacingClock
 from preprocess.body.body_pose import Motion
-from preprocess.live.live_masks import LiveMasks
-from preprocess.live.live_poses import LivePoses
+from preprocess.live_inputs import LiveMasks, LivePoses
 from preprocess.poses.pose_file import read_motion, write_motion
 
 

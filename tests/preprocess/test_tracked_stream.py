@@ -9,16 +9,16 @@ from PIL import Image
 
 from capture.input_error import InputError
 from capture.source import Frame
+from preprocess import tracked_stream
 from preprocess.body.body_surface import splat_silhouette
 from preprocess.body.parametric_body import load_body_model
 from preprocess.cameras.camera_file import CameraTrack, write_cameras
 from preprocess.cameras.camera_orientation import assume_camera
 from preprocess.capture_session import CaptureInputs
 from preprocess.fitting.tracked_frames import LAG_FRAMES, EarlierPoses
-from preprocess.live import tracked_stream
-from preprocess.live.tracked_stream import NOT_FOUND, LiveTracking, TrackedStream
 from preprocess.observation import DroppedFrame, Observation
 from preprocess.open_stream import open_tracked_stream
+from preprocess.tracked_stream import NOT_FOUND, LiveTracking, TrackedStream
 from preprocess.tracking.keypoints import CroppedMask, PersonKeypoints
 
 COUNT = 24

@@ -1,4 +1,4 @@
-"""Tests of `preprocess/blazepose/*.py`: the real networks on the studio's actors."""
+"""Tests of `preprocess/tracking/blazepose_*.py`: the real networks on the studio's actors."""
 
 from dataclasses import dataclass, replace
 
@@ -6,17 +6,17 @@ import cv2
 import numpy as np
 import pytest
 
-from preprocess.blazepose.blazepose_detector import (
+from preprocess.tracking.blazepose_networks import (
     BlazePoseDetector,
     PersonDetection,
+    PersonSquare,
     anchors,
     is_same_person,
     parts_of_frame,
+    refine,
 )
-from preprocess.blazepose.blazepose_landmarks import refine
-from preprocess.blazepose.blazepose_tracker import BlazePoseTracker, LastPlace
-from preprocess.blazepose.person_square import PersonSquare
-from preprocess.tracking.tracking_problems import ProblemFinder, TrackingProblem
+from preprocess.tracking.blazepose_tracker import BlazePoseTracker, LastPlace
+from preprocess.tracking.video_tracking import ProblemFinder, TrackingProblem
 from studio import actor_motions
 from studio.actor import Actor
 from studio.room import painted_backdrop

@@ -8,13 +8,13 @@ import pytest
 from capture.camera import Camera
 from capture.input_error import InputError
 from capture.source import Frame
-from preprocess.blazepose.blazepose_segmenter import (
+from preprocess.body.body_pose import BodyPose
+from preprocess.body.body_surface import soft_iou
+from preprocess.tracking.blazepose_segmenter import (
     MAX_CLOTHING_M,
     BlazePoseSegmenter,
     _limit_to_body,
 )
-from preprocess.body.body_pose import BodyPose
-from preprocess.body.body_surface import soft_iou
 from preprocess.tracking.keypoints import CroppedMask
 from studio import actor_motions
 from studio.actor import Actor

@@ -1,11 +1,44 @@
-"""Tests for segmenters: this project's own by name, and those of other packages."""
+"""Tests of `preprocess/plugins.py`: trackers and segmenters by name, this project's and others."""
 
 import pytest
 
 from capture.input_error import InputError
 from preprocess import plugins
-from preprocess.blazepose.blazepose_segmenter import BlazePoseSegmenter
-from preprocess.masks.mask_origin import make_segmenter, segmenter_name
+from preprocess.plugins import PersonTracker, make_segmenter, make_tracker, segmenter_name
+from preprocess.tracking.blazepose_segmenter import BlazePoseSegmenter
+from preprocess.tracking.blazepose_tracker import BlazePoseTracker
+
+
+class FakeEntryPoint:
+    """Another package's tracker, which finds no person."""
+
+    name = "empty_room"
+
+    def __init__(self, group):
+        self.group = group
+
+    def load(self):
+        return lambda person: lambda rgb: (self.group, person, rgb)
+
+
+def test_another_packages_tracker_is_made_for_the_person(monkeypatch):
+    monkeypatch.setattr(plugins, "entry_points", lambda group: [FakeEntryPoint(group)])
+    assert make_tracker("empty_room", 2)(7) == ("instant_avatar.trackers", 2, 7)
+    with pytest.raises(
+        InputError, match=r"--tracker vitpose: .*installed are blazepose, empty_room"
+    ):
+        make_tracker("vitpose")
+
+
+def test_the_projects_own_tracker_needs_no_entry_point():
+    tracker = make_tracker()
+    assert isinstance(tracker, BlazePoseTracker)
+    assert isinstance(tracker, PersonTracker)
+
+
+def test_persons_are_counted_from_one():
+    with pytest.raises(InputError, match="--person 0: persons are counted from 1"):
+        make_tracker(person=0)
 
 
 def test_a_segmenter_is_named_by_its_prefix():

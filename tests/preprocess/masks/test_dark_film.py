@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from preprocess.tracking.dark_film import BRIGHT_LEVEL, DarkFilmBrightener
+from preprocess.masks.color_models import BRIGHT_LEVEL, DarkFilmBrightener
 
 
 def picture(level: int) -> np.ndarray:

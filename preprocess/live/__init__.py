@@ -1,1 +1,0 @@
-"""Poses, masks and alignment of a live source."""

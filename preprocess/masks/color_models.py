@@ -1,0 +1,324 @@
+"""How likely colors are on the person and behind it, and the brightening of dark films.
+
+A striped shirt has several colors, none of which is their mean. So the sure pixels of a frame are
+sorted into a few colors (k-means), each with a spread; near a pixel the person's colors are these,
+mixed as often as they are found on the person around it, and the same for the background.
+
+A static camera sees the same behind the person again and again: a plate keeps a running mean and
+variance of every pixel's color. A phone's exposure and white balance drift, so each frame is
+compared after one gain per channel. If too much of the background differs nevertheless, the camera
+has moved: the plate starts again.
+"""
+
+from typing import NamedTuple, final
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float32, Int, UInt8
+
+COLORS = 5
+"""Colors of the person, and as many of the background."""
+ROUNDS = 2
+"""Rounds of k-means."""
+REDUCTION = 3
+"""Reduction of the image from which colors are learnt."""
+COLOR_SPREAD = 9.0
+"""Standard deviation, in levels, that is added to each color's own."""
+ANYWHERE = 0.1
+"""Weight of the colors of the whole person, or background, beside those nearby."""
+UNSEEN = 0.02
+"""Density of a color that neither has, relative to `REFERENCE_SPREAD`."""
+REFERENCE_SPREAD = 16.0
+"""Standard deviation, in levels, at whose peak a density is 1."""
+
+ONE = np.float32(1.0)
+Pixels = Float32[np.ndarray, "pixels"]
+Numbers = Int[np.ndarray, "pixels"]
+MEMORY_FRAMES = 30.0
+"""Length of the running mean, frames."""
+MIN_SEEN_FRAMES = 2.0
+"""Frames in which a pixel must have been background before its color is known."""
+MIN_SPREAD = 6.0
+"""Least standard deviation of a background pixel's color, in levels."""
+CHANGED_DIFFERENCE = 12.0
+"""Difference from the plate, in levels, of a background pixel that has changed."""
+MAX_CHANGED_FRACTION = 0.12
+"""Fraction of changed background pixels from which the camera has moved: static ones have at most
+0.1 (texts, shadows, passers-by), a hand-held one 0.2 to 0.3."""
+MIN_GAIN = 0.2
+"""Least gain; less is a frame without light, after which the plate starts again."""
+PLATE_STRIDE = 7
+"""Gains are estimated from every n-th row and column."""
+MIN_SAMPLES = 50
+"""Fewest known background pixels from which gains are estimated."""
+
+
+SIGHT_WINDOW_PX = 7
+"""Edge of the windows in which a background is recognized, px."""
+MIN_TEXTURE = 7.0
+"""Least standard deviation of a channel in a window that can be recognized, in levels."""
+MAX_UNLIKE_FRACTION = 0.2
+"""Largest squared difference from the plate in a window, relative to the plate's own variance."""
+MIN_KNOWN_FRACTION = 0.7
+"""Least fraction of a window that must be known."""
+
+PixelMask = Bool[np.ndarray, "height width"]
+DARK_LEVEL, BRIGHT_LEVEL = 80.0, 180.0
+"""Level of the brightest pixels (2 %) below which a film is brightened, and the level after it."""
+NOISE_BLUR_PX = 1.0
+"""Gaussian σ, px, by which the noise of a dark film is smoothed."""
+LEVEL_STRIDE = 4
+"""The level is taken from every n-th row and column."""
+
+
+def color_density(
+    squared: Float32[np.ndarray, "*pixels"], variance: Float32[np.ndarray, "*pixels"]
+) -> Float32[np.ndarray, "*pixels"]:
+    """Density of a color at a squared distance from its mean, relative to the reference peak."""
+    ratio = np.float32(REFERENCE_SPREAD**2) / variance
+    return np.exp(np.float32(-0.5) * squared / variance) * ratio * np.sqrt(ratio)
+
+
+def local_densities(
+    image: Float32[np.ndarray, "3 height width"],
+    sure: tuple[PixelMask, PixelMask],
+    at: tuple[Numbers, Numbers],
+    sigma_px: float,
+) -> tuple[Pixels, Pixels]:
+    """Density of pixels' colors among the sure colors of person and of background near each.
+
+    Args:
+        image: The channels, in levels.
+        sure: Pixels that are surely person, and surely background.
+        at: Rows and columns of the pixels.
+        sigma_px: Gaussian σ of the neighborhood, px.
+    """
+    height, width = image.shape[1:]
+    small_px = -(-width // REDUCTION), -(-height // REDUCTION)
+    small = cv2.merge([cv2.resize(each, small_px, interpolation=cv2.INTER_AREA) for each in image])
+    chosen = [
+        cv2.resize(each.astype(np.float32), small_px, interpolation=cv2.INTER_AREA) > 0.99
+        for each in sure
+    ]
+    means, variance, labels = _sort_colors(small, (chosen[0], chosen[1]))
+    cells = at[0] // REDUCTION * small_px[0] + at[1] // REDUCTION
+    used = np.flatnonzero(np.bincount(cells))
+    place = np.zeros(small_px[0] * small_px[1], np.int32)
+    place[used] = np.arange(len(used))
+    place = place[cells]
+    likely = _squared_distances(image[:, at[0], at[1]], means, np.float32(-0.5) / variance)
+    np.exp(likely, out=likely)
+    peaks = (np.float32(REFERENCE_SPREAD**2) / variance) ** np.float32(1.5)
+    each_color = np.eye(len(means), dtype=np.float32)
+
+    def density(where: PixelMask) -> Pixels:
+        found = each_color[labels] * where[..., None]
+        overall = np.ones(labels.size, np.float32) @ found.reshape(labels.size, -1)
+        overall += np.float32(1e-6)
+        overall /= overall.sum()
+        near = cv2.GaussianBlur(found, (0, 0), sigma_px / REDUCTION).reshape(labels.size, -1)[used]
+        near += np.float32(1e-6) * overall  # nothing of it is near: any of it
+        near *= np.float32(1.0 - ANYWHERE) / (near @ np.ones((len(means), 1), np.float32))
+        near += np.float32(ANYWHERE) * overall
+        return np.einsum("pc,pc->p", (near * peaks)[place], likely) + np.float32(UNSEEN)
+
+    return density(chosen[0]), density(chosen[1])
+
+
+def _sort_colors(
+    image: Float32[np.ndarray, "height width 3"], sure: tuple[PixelMask, PixelMask]
+) -> tuple[
+    Float32[np.ndarray, "colors 3"],
+    Float32[np.ndarray, "colors"],
+    Int[np.ndarray, "height width"],
+]:
+    """Means and variances of a few colors, and the number of each pixel's."""
+    taught = image[sure[0] | sure[1]].T
+    means = np.concatenate([_frequent_colors(image[each].T) for each in sure])
+    if not len(means):
+        means = np.zeros((1, 3), np.float32)
+    for _ in range(ROUNDS if taught.size else 0):
+        nearest = _squared_distances(taught, means).argmin(axis=1)
+        means = _mean_colors(taught, nearest, len(means))
+    away = _squared_distances(taught, means)
+    nearest = away.argmin(axis=1)
+    counts = np.maximum(np.bincount(nearest, minlength=len(means)), 1)
+    variance = np.bincount(nearest, away.min(axis=1), minlength=len(means)) / (3.0 * counts)
+    everywhere = _squared_distances(image.reshape(-1, 3).T, means).argmin(axis=1)
+    return (
+        means,
+        (variance + COLOR_SPREAD**2).astype(np.float32),
+        everywhere.reshape(image.shape[:2]),
+    )
+
+
+def _frequent_colors(colors: Float32[np.ndarray, "3 pixels"]) -> Float32[np.ndarray, "colors 3"]:
+    """Means of the fullest of 8 x 8 x 8 bins."""
+    red, green, blue = colors.astype(np.int64) >> 5
+    bins = (red << 6) | (green << 3) | blue
+    fullest = np.argsort(-np.bincount(bins, minlength=512), kind="stable")[:COLORS]
+    places = np.full(512, COLORS)
+    places[fullest] = np.arange(COLORS)
+    return _mean_colors(colors, places[bins], COLORS)
+
+
+def _mean_colors(
+    colors: Float32[np.ndarray, "3 pixels"], numbers: Numbers, count: int
+) -> Float32[np.ndarray, "colors 3"]:
+    """Mean of the colors of each number below a count that has any."""
+    many = np.bincount(numbers, minlength=count)[:count]
+    sums = [np.bincount(numbers, each, minlength=count)[:count][many > 0] for each in colors]
+    return (np.stack(sums, axis=1) / many[many > 0, None]).astype(np.float32)
+
+
+def _squared_distances(
+    colors: Float32[np.ndarray, "3 pixels"],
+    means: Float32[np.ndarray, "colors 3"],
+    scale: Float32[np.ndarray, "*colors"] | np.float32 = ONE,
+) -> Float32[np.ndarray, "pixels colors"]:
+    """Squared distance of each color from each mean, times a factor of each mean."""
+    red, green, blue = colors
+    squared = red * red + green * green + blue * blue
+    terms = np.stack([red, green, blue, squared, np.ones_like(red)])
+    factors = [
+        *(np.float32(-2.0) * means.T),
+        np.ones(len(means), np.float32),
+        (means**2).sum(axis=1),
+    ]
+    return terms.T @ (np.stack(factors) * scale)
+
+
+class PlateColors(NamedTuple):
+    """The background in a part of a frame.
+
+    Attributes:
+        known: Which pixels are known.
+        mean: Their colors at the frame's exposure, in levels.
+        variance: Variance of a channel.
+    """
+
+    known: PixelMask
+    mean: Float32[np.ndarray, "3 height width"]
+    variance: Float32[np.ndarray, "height width"]
+
+    def in_sight(self, image: Float32[np.ndarray, "3 height width"]) -> PixelMask:
+        """Where the same part of the frame shows the background's texture: no person is before it.
+
+        A flat background of a sleeve's color says little, leaves and books say nearly everything.
+        """
+        window = SIGHT_WINDOW_PX, SIGHT_WINDOW_PX
+        weight = self.known.astype(np.float32)
+        share = cv2.blur(weight, window)
+        off, texture, squared = (np.zeros_like(weight) for _ in range(3))
+        for seen, mean in zip(image, self.mean, strict=True):
+            expected = mean * weight
+            off += (seen - mean) ** 2
+            squared += expected * mean
+            texture -= cv2.blur(expected, window) ** 2
+        off = cv2.blur(off * weight, window)
+        texture /= np.maximum(share, np.float32(0.01))
+        texture += cv2.blur(squared, window)
+        textured = texture > np.float32(3.0 * MIN_TEXTURE**2) * share
+        alike = off < np.float32(MAX_UNLIKE_FRACTION) * texture
+        return self.known & (share > MIN_KNOWN_FRACTION) & textured & alike
+
+
+@final
+class BackgroundPlate:
+    """Mean and variance of the background's colors, per pixel of a frame."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self._mean = np.zeros((3, 0, 0), np.float32)
+        self._variance = self._frames = np.zeros((0, 0), np.float32)
+        self._gain = np.ones(3, np.float32)
+
+    def align(
+        self,
+        image: Float32[np.ndarray, "3 height width"],
+        background: Bool[np.ndarray, "height width"],
+    ) -> None:
+        """Estimate the frame's gains; forget everything if the camera has moved.
+
+        Args:
+            image: The frame's channels, in levels; another size than before rescales the plate.
+            background: Pixels that are surely background.
+        """
+        self._gain = np.ones(3, np.float32)
+        self._rescale(background.shape)
+        some = np.s_[::PLATE_STRIDE, ::PLATE_STRIDE]
+        known = background[some] & (self._frames[some] >= MIN_SEEN_FRAMES)
+        if known.sum() < MIN_SAMPLES:
+            return
+        seen, before = (
+            np.stack([plane[some][known] for plane in planes]) for planes in (image, self._mean)
+        )
+        alike = np.ones(seen.shape[1], dtype=bool)
+        for _ in range(2):  # again without what does not fit
+            count = np.float32(alike.sum())  # of one level: a black background has gain 1
+            total = (before[:, alike] ** 2).sum(axis=1) + count
+            self._gain = ((seen[:, alike] * before[:, alike]).sum(axis=1) + count) / total
+            alike = np.abs(seen - self._gain[:, None] * before).max(axis=0) < CHANGED_DIFFERENCE
+            if alike.mean() < 1.0 - MAX_CHANGED_FRACTION or self._gain.min() < MIN_GAIN:
+                self._frames[:] = 0.0
+                self._gain = np.ones(3, np.float32)
+                return
+
+    def within(self, part: tuple[slice, slice]) -> PlateColors:
+        """The background in some rows and columns of the aligned frame."""
+        frames = self._frames[part]
+        # The mean of a few frames is uncertain itself.
+        variance = np.maximum(self._variance[part], np.float32(MIN_SPREAD**2))
+        variance *= np.float32(1.0) + np.float32(2.0) / np.maximum(frames, np.float32(1.0))
+        mean = self._mean[:, part[0], part[1]] * self._gain[:, None, None]
+        return PlateColors(frames >= MIN_SEEN_FRAMES, mean, variance)
+
+    def update(
+        self,
+        image: Float32[np.ndarray, "3 height width"],
+        background: Bool[np.ndarray, "height width"],
+    ) -> None:
+        """Average the sure background of the aligned frame into the plate."""
+        self._frames += background
+        share = background / np.clip(self._frames, np.float32(1.0), np.float32(MEMORY_FRAMES))
+        squared = np.zeros_like(self._variance)
+        for seen, mean, gain in zip(image, self._mean, self._gain, strict=True):
+            off = seen / gain - mean
+            mean += off * share
+            squared += off * off
+        # Welford 1962: the variance takes the squared deviation across the old and the new mean.
+        squared *= (np.float32(1.0) - share) / np.float32(3.0)
+        self._variance += share * (squared - self._variance)
+
+    def _rescale(self, shape: tuple[int, int]) -> None:
+        """Change the plate's resolution; an empty one is made."""
+        if self._frames.shape == shape:
+            return
+        if not self._frames.size:
+            self._mean = np.zeros((3, *shape), np.float32)
+            self._variance, self._frames = np.zeros((2, *shape), np.float32)
+            return
+        planes = (*self._mean, self._variance, self._frames)
+        scaled = [np.asarray(cv2.resize(each, shape[::-1]), np.float32) for each in planes]
+        self._mean, self._variance, self._frames = np.stack(scaled[:3]), scaled[3], scaled[4]
+
+
+@final
+class DarkFilmBrightener:
+    """Brightens the frames of a dark film, and leaves those of others as they are."""
+
+    def __init__(self) -> None:
+        """No frame was seen."""
+        self._brightest = 1.0
+
+    def __call__(
+        self, rgb: UInt8[np.ndarray, "height width 3"]
+    ) -> UInt8[np.ndarray, "height width 3"]:
+        """Brighten the next frame, as much as the brightest one until now allows: some fade in."""
+        if self._brightest < DARK_LEVEL:
+            level = float(np.percentile(rgb[::LEVEL_STRIDE, ::LEVEL_STRIDE], 98))
+            self._brightest = max(self._brightest, level)
+        if self._brightest >= DARK_LEVEL:
+            return rgb
+        smooth = cv2.GaussianBlur(rgb.astype(np.float32), (0, 0), NOISE_BLUR_PX)
+        return np.clip(BRIGHT_LEVEL / self._brightest * smooth, 0.0, 255.0).astype(np.uint8)

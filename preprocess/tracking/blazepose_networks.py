@@ -1,0 +1,366 @@
+"""BlazePose's networks: one finds the persons in a frame, one a person's key points and mask.
+
+Both (Bazarevsky et al. 2020, arXiv:2006.10204) take a square around a person, turned so that the
+person stands upright in it. Where a person is, is described by a circle: its middle is that of the
+hips, and it encloses the whole body. The square stands around that circle, a quarter wider. The
+detector is a single-shot one (Liu et al. 2016): for each of 2,254 anchors, evenly spread over the
+picture, it says how sure it is of a person there, and where that person's middle and size are.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import onnxruntime
+from jaxtyping import Float, Float32, UInt8
+
+from preprocess.tracking.keypoints import KEYPOINT_COUNT, CroppedMask, PersonKeypoints
+
+WEIGHTS = Path(__file__).parent / "weights"
+"""Folder of this project's own networks."""
+MARGIN = 1.25
+"""Side of the square, in diameters of the circle."""
+ANCHOR_GRIDS = ((8, 2), (16, 2), (32, 6))
+"""Distance of the anchors, pixels, and how many there are at each place."""
+MIN_SCORE = 0.5
+"""Least probability of a person."""
+MAX_OVERLAP = 0.3
+"""Largest intersection over union of two persons' boxes."""
+SAME_PERSON_DISTANCE = 0.12
+"""Two detections whose middles are nearer than this share of their squares' side are one person."""
+SMALL_PERSON = 0.6
+"""A person whose square is smaller than this share of the searched one is searched again, larger:
+the network was made for persons who fill the picture."""
+HEATMAP_REACH = 3
+"""Cells of a heat map on each side of a key point that make it more exact."""
+MIN_HEAT = 0.5
+"""Least peak of a heat map that is used."""
+
+
+class OnnxNetwork:
+    """A network that takes one picture.
+
+    Attributes:
+        picture_size: Width and height of the picture, pixels.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Loads the network; it computes on one thread, which costs least per picture."""
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = 1
+        options.inter_op_num_threads = 1
+        options.log_severity_level = 3
+        self._session = onnxruntime.InferenceSession(
+            str(path), options, providers=["CPUExecutionProvider"]
+        )
+        (image,) = self._session.get_inputs()
+        self._image = image.name
+        self._outputs = [output.name for output in self._session.get_outputs()]
+        self.picture_size = int(image.shape[1])
+
+    def run(
+        self, picture: UInt8[np.ndarray, "size size 3"], low: float, high: float
+    ) -> dict[str, Float32[np.ndarray, "..."]]:
+        """Run the network on one picture, whose values are spread from `low` to `high`.
+
+        Returns:
+            The outputs by their names, without the dimension of pictures.
+        """
+        values = picture.astype(np.float32)
+        values *= np.float32((high - low) / 255)
+        if low:
+            values += np.float32(low)
+        outputs = self._session.run(None, {self._image: values[None]})
+        return {
+            name: np.asarray(output)[0] for name, output in zip(self._outputs, outputs, strict=True)
+        }
+
+
+def sigmoid(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
+    """The logistic function."""
+    return 1 / (1 + np.exp(-np.clip(values, -50, 50)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PersonSquare:
+    """A turned square in a frame; the first pixel's middle is at (0.5, 0.5).
+
+    Attributes:
+        x, y: Its middle, pixels.
+        side: Length of its sides, pixels.
+        angle: Turn from upright, radians, clockwise as seen in the picture.
+    """
+
+    x: float
+    y: float
+    side: float
+    angle: float = 0.0
+
+    @classmethod
+    def around(
+        cls, hips: Float[np.ndarray, "2"], above_head: Float[np.ndarray, "2"]
+    ) -> "PersonSquare":
+        """The square of a person.
+
+        Args:
+            hips: Middle of the hips, pixels.
+            above_head: The point of the circle around the person that lies above the head.
+        """
+        x, y = (above_head - hips).tolist()
+        return cls(
+            x=float(hips[0]),
+            y=float(hips[1]),
+            side=float(2 * MARGIN * np.hypot(x, y)),
+            angle=float(np.arctan2(x, -y)),
+        )
+
+    @classmethod
+    def of_frame(cls, rgb: UInt8[np.ndarray, "height width 3"]) -> "PersonSquare":
+        """The upright square around a whole frame."""
+        height, width = rgb.shape[:2]
+        return cls(x=width / 2, y=height / 2, side=float(max(width, height)))
+
+    def image_from_crop(self, size: int) -> Float[np.ndarray, "2 3"]:
+        """The affine map from pixels of a crop of `size` x `size` pixels to pixels of the frame."""
+        turn = self.rotation() * (self.side / size)
+        middle = np.array([self.x, self.y])
+        return np.column_stack([turn, middle - turn @ np.full(2, size / 2)])
+
+    def rotation(self) -> Float[np.ndarray, "2 2"]:
+        """From directions in the square to directions in the frame."""
+        cosine, sine = np.cos(self.angle), np.sin(self.angle)
+        return np.array([[cosine, -sine], [sine, cosine]])
+
+    def crop(
+        self, rgb: UInt8[np.ndarray, "height width 3"], size: int
+    ) -> UInt8[np.ndarray, "size size 3"]:
+        """Cut the square out of a frame, `size` x `size` pixels; black outside the frame."""
+        there = self.image_from_crop(size)
+        corners = there @ np.array([[0, size, 0, size], [0, 0, size, size], [1, 1, 1, 1]])
+        # Large squares are halved, thirded, … first: a pixel of the crop shall see all it covers.
+        block = max(1, int(self.side / size))
+        height, width = rgb.shape[:2]
+        low = np.clip(corners.min(axis=1) - 2, 0, None).astype(int) // block * block
+        high = np.minimum((width, height), np.ceil(corners.max(axis=1) + 2).astype(int))
+        blocks = (high - low) // block
+        if (blocks <= 0).any():
+            return np.zeros((size, size, 3), np.uint8)
+        end = low + blocks * block
+        part = rgb[low[1] : end[1], low[0] : end[0]]
+        if block > 1:
+            part = cv2.resize(part, tuple(blocks.tolist()), interpolation=cv2.INTER_AREA)
+        there[:, 2] -= low
+        there /= block
+        there[:, 2] += 0.5 * there[:, :2].sum(axis=1) - 0.5  # to OpenCV's pixels, middles at 0
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        return cv2.warpAffine(part, there, (size, size), flags=flags)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PersonDetection:
+    """One person that the detector found.
+
+    Attributes:
+        square: Where the whole person is.
+        box: Left, upper, right and lower border of the head and shoulders, pixels.
+        score: Probability that it is a person.
+    """
+
+    square: PersonSquare
+    box: Float[np.ndarray, "4"]
+    score: float
+
+
+class BlazePoseDetector:
+    """Finds persons in a frame."""
+
+    def __init__(self) -> None:
+        """Loads the network."""
+        self._network = OnnxNetwork(WEIGHTS / "blazepose_detector.onnx")
+        self._anchors = anchors(self._network.picture_size)
+
+    def __call__(
+        self, rgb: UInt8[np.ndarray, "height width 3"], area: PersonSquare | None = None
+    ) -> list[PersonDetection]:
+        """Find the persons, the most certain first.
+
+        Args:
+            rgb: The frame.
+            area: Upright square in which to look; the whole frame if it is not given.
+        """
+        area = area or PersonSquare.of_frame(rgb)
+        size = self._network.picture_size
+        output = self._network.run(area.crop(rgb, size), -1.0, 1.0)
+        scores = sigmoid(output["scores"][:, 0])
+        candidates = np.flatnonzero(scores >= MIN_SCORE)
+        candidates = candidates[np.argsort(-scores[candidates], kind="stable")]
+        image_from_crop = area.image_from_crop(size)
+        found: list[PersonDetection] = []
+        for index in candidates:
+            middle, extent, hips, above_head, *_ = (
+                output["boxes"][index].reshape(-1, 2).astype(np.float64)
+            )
+            anchor = self._anchors[index] * size
+            corners = [anchor + middle - extent / 2, anchor + middle + extent / 2]
+            points = np.array([*corners, anchor + hips, anchor + above_head])
+            points = points @ image_from_crop[:, :2].T + image_from_crop[:, 2]
+            detection = PersonDetection(
+                square=PersonSquare.around(points[2], points[3]),
+                box=points[:2].reshape(-1),
+                score=float(scores[index]),
+            )
+            if not any(is_same_person(detection, other) for other in found):
+                found.append(detection)
+        return found
+
+    def find_all(
+        self, rgb: UInt8[np.ndarray, "height width 3"], *, in_parts: bool = False
+    ) -> list[PersonDetection]:
+        """Find the persons in a frame, small ones as well.
+
+        Args:
+            rgb: The frame.
+            in_parts: Whether to look into each part of the frame even if a person was found: of
+                two the network often sees only one.
+        """
+        whole = PersonSquare.of_frame(rgb)
+        found = self(rgb, whole)
+        if in_parts or not found:
+            whole = replace(whole, side=float(min(rgb.shape[:2])))
+            for part in parts_of_frame(rgb):
+                for detection in self(rgb, part):
+                    if not any(is_same_person(detection, other) for other in found):
+                        found.append(detection)
+        return [
+            self._look_closer(rgb, each) if each.square.side < SMALL_PERSON * whole.side else each
+            for each in found
+        ]
+
+    def _look_closer(
+        self, rgb: UInt8[np.ndarray, "height width 3"], detection: PersonDetection
+    ) -> PersonDetection:
+        """The same person, found in a smaller area."""
+        square = detection.square
+        closer = self(rgb, replace(square, angle=0.0))
+        return min(
+            closer,
+            key=lambda each: np.hypot(each.square.x - square.x, each.square.y - square.y),
+            default=detection,
+        )
+
+
+def parts_of_frame(rgb: UInt8[np.ndarray, "height width 3"]) -> list[PersonSquare]:
+    """Three squares that cover a frame, as high or as wide as it is."""
+    height, width = rgb.shape[:2]
+    side = float(min(width, height))
+    places = np.linspace(side / 2, max(width, height) - side / 2, 3)
+    if width > height:
+        return [PersonSquare(x=float(place), y=side / 2, side=side) for place in places]
+    return [PersonSquare(x=side / 2, y=float(place), side=side) for place in places]
+
+
+def anchors(picture_size: int) -> Float[np.ndarray, "anchors 2"]:
+    """Places of the anchors, as shares of the picture's width and height."""
+    grids = []
+    for distance, count in ANCHOR_GRIDS:
+        cells = picture_size // distance
+        rows, columns = np.mgrid[:cells, :cells] + 0.5
+        grids.append(np.repeat(np.column_stack([columns.ravel(), rows.ravel()]) / cells, count, 0))
+    return np.concatenate(grids)
+
+
+def is_same_person(a: PersonDetection, b: PersonDetection) -> bool:
+    """Whether two detections are of one person."""
+    apart = np.hypot(a.square.x - b.square.x, a.square.y - b.square.y)
+    if apart < SAME_PERSON_DISTANCE * min(a.square.side, b.square.side):
+        return True
+    return overlap(a.box, b.box) > MAX_OVERLAP
+
+
+def overlap(a: Float[np.ndarray, "4"], b: Float[np.ndarray, "4"]) -> float:
+    """Intersection over union of two boxes."""
+    width, height = np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2])
+    shared = max(0.0, float(width)) * max(0.0, float(height))
+    total = sum(float(np.prod(box[2:] - box[:2])) for box in (a, b)) - shared
+    return shared / total if total > 0 else 0.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FoundLandmarks:
+    """What the landmark network finds in one square.
+
+    Attributes:
+        keypoints: The person.
+        square: Where the person is, as the key points say: the square for the next frame.
+    """
+
+    keypoints: PersonKeypoints
+    square: PersonSquare
+
+
+class BlazePoseLandmarks:
+    """Finds one person's key points and mask in a square around that person."""
+
+    def __init__(self) -> None:
+        """Loads the network."""
+        self._network = OnnxNetwork(WEIGHTS / "blazepose_landmarks_full.onnx")
+
+    def __call__(
+        self, rgb: UInt8[np.ndarray, "height width 3"], square: PersonSquare
+    ) -> FoundLandmarks:
+        """Find the person in a square of a frame."""
+        size = self._network.picture_size
+        output = self._network.run(square.crop(rgb, size), 0.0, 1.0)
+        # Of each point x, y, depth, and logits of being visible and of being in the picture. After
+        # the 33 key points come the two that give the next square.
+        points = output["landmarks"].reshape(-1, 5).astype(np.float64)
+        crop_px = refine(points[:, :2], output["heatmaps"], size)
+        image_from_crop = square.image_from_crop(size)
+        image_px = crop_px @ image_from_crop[:, :2].T + image_from_crop[:, 2]
+        world_m = output["world"].reshape(-1, 3)[:KEYPOINT_COUNT].astype(np.float64)
+        world_m[:, :2] = world_m[:, :2] @ square.rotation().T
+        mask = np.rint(255 * sigmoid(output["mask"][0])).astype(np.uint8)
+        keypoints = PersonKeypoints(
+            image_px=image_px[:KEYPOINT_COUNT],
+            world_m=world_m,
+            visibility=sigmoid(points[:KEYPOINT_COUNT, 3]),
+            presence=float(output["presence"][0]),
+            mask=CroppedMask(values=mask, image_from_crop=image_from_crop),
+        )
+        hips, above_head = image_px[KEYPOINT_COUNT : KEYPOINT_COUNT + 2]
+        return FoundLandmarks(keypoints=keypoints, square=PersonSquare.around(hips, above_head))
+
+
+def refine(
+    crop_px: Float[np.ndarray, "points 2"],
+    heatmaps: Float32[np.ndarray, "points rows columns"],
+    size: int,
+) -> Float[np.ndarray, "points 2"]:
+    """Move points to the centroid of their heat maps nearby.
+
+    Args:
+        crop_px: Points in the crop, pixels.
+        heatmaps: Logits of where each point is.
+        size: Width and height of the crop, pixels.
+    """
+    cells = heatmaps.shape[1]
+    cell_px = size / cells
+    refined = crop_px.copy()
+    middle = np.floor(crop_px / cell_px).astype(int)
+    for index, (column, row) in enumerate(middle.tolist()):
+        if not (0 <= column < cells and 0 <= row < cells):
+            continue
+        left, top = max(0, column - HEATMAP_REACH), max(0, row - HEATMAP_REACH)
+        heat = sigmoid(
+            heatmaps[
+                index, top : row + HEATMAP_REACH + 1, left : column + HEATMAP_REACH + 1
+            ].astype(np.float64)
+        )
+        if heat.max() < MIN_HEAT:
+            continue
+        columns = left + np.arange(heat.shape[1])
+        rows = top + np.arange(heat.shape[0])
+        centroid = np.array([heat.sum(axis=0) @ columns, heat.sum(axis=1) @ rows])
+        refined[index] = centroid / heat.sum() * cell_px
+    return refined
