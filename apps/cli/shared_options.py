@@ -37,7 +37,7 @@ class CaptureArguments:
     video."""
     person: Annotated[str | None, arg(metavar="ID", help_behavior_hint="")] = None
     """Person ID in the pose file (default: the longest track); without poses, which person to
-    track: 1 is the leftmost (default: the one in front)."""
+    track: 1 is the leftmost (default: the largest)."""
     masks: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Masks, one per frame, 255 where the person is: a folder of images, a video, an .npz, or COCO
     run-length codes. Default: tracked with the poses, or estimated from images and given poses
