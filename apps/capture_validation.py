@@ -13,7 +13,8 @@ from apps.cli.shared_options import capture_name, format_frame_range, option_wor
 from capture.camera import same_aspect_ratio
 from capture.camera_device import camera_address
 from capture.input_error import InputError
-from preprocess.alignment.capture_geometry import CaptureGeometry
+from preprocess.alignment.capture_evidence import edge_contrast, sample_video
+from preprocess.alignment.capture_geometry import CaptureGeometry, sanity_warnings
 from preprocess.alignment.correction_search import (
     GOOD_IOU,
     MIN_IOU_GAIN,
@@ -29,11 +30,10 @@ from preprocess.alignment.edge_objective import (
     EdgeObjective,
     sample_images,
 )
-from preprocess.alignment.image_alignment import edge_contrast, sample_video
-from preprocess.alignment.sanity_checks import sanity_warnings
 from preprocess.alignment.silhouette_objective import (
     SAMPLED_FRAMES,
     SilhouetteObjective,
+    mask_warnings,
     mean_score,
     sample_masks,
 )
@@ -202,10 +202,10 @@ def check_opened_capture(
     if evidence is not None:
         diagnosis = find_corrections(hypothesis, evidence, count, _sample_film(recording, evidence))
         agreed = mean_score(evidence.frame_scores(replace(hypothesis, masks_inverted=False)))
-    odd = sanity_warnings(hypothesis, frames, evidence, recording.source.size_px[1])
+    odd = mask_warnings(evidence, recording.source.size_px[1])
     return CaptureValidation(
         recording=recording, hypothesis=hypothesis, sampled_masks=evidence, diagnosis=diagnosis,
-        refusal=refused, anomalies=tuple(odd), mask_iou=agreed,
+        refusal=refused, mask_iou=agreed, anomalies=(*sanity_warnings(hypothesis, frames), *odd),
         edge_ratio=None if masked or refused else _edge_ratio(recording, hypothesis),
     )  # fmt: skip
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from preprocess.alignment.camera_from_masks import fit_factor
 from preprocess.alignment.capture_evidence import CaptureEvidence
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.correction_search import (
@@ -18,7 +17,7 @@ from preprocess.alignment.correction_search import (
     MIN_FITTED_CHANGE,
     MIN_FITTED_IOU_GAIN,
 )
-from preprocess.alignment.corrections import scale_focal_length
+from preprocess.alignment.corrections import fit_factor, scale_focal_length
 from preprocess.alignment.mask_alignment import (
     ALIGNMENT_SAMPLES,
     BodyPlacement,

@@ -6,16 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from preprocess.alignment.camera_from_masks import (
-    fit_extrinsics,
-    fit_factor,
-    fit_principal_point,
-)
-from preprocess.alignment.capture_geometry import CaptureGeometry
+from preprocess.alignment.capture_geometry import CaptureGeometry, find_jumps
 from preprocess.alignment.correction_catalog import body_corrections, video_corrections
 from preprocess.alignment.corrections import (  # fmt: skip
     Correction,
     divide_distances,
+    fit_extrinsics,
+    fit_factor,
+    fit_principal_point,
     scale_focal_length,
     stretch_width,
     undo_pose_delay,
@@ -32,7 +30,6 @@ from preprocess.alignment.greedy_search import (
     greedy_search,
     is_significant,
 )
-from preprocess.alignment.sanity_checks import find_jumps
 from preprocess.alignment.silhouette_objective import (
     SilhouetteObjective,
     mean_score,

@@ -1,13 +1,25 @@
-"""A mistake in a capture as the change that undoes it; the makers of corrections with a size."""
+"""A mistake in a capture as the change that undoes it: those with a size, and their fit to masks.
+
+Fitted to masks are one factor (focal length, size), a principal point, or a camera's whole pose.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
+from scipy.spatial.transform import Rotation
 
 from preprocess.alignment.capture_geometry import CaptureGeometry
+from preprocess.alignment.silhouette_objective import (
+    MaskSample,
+    SilhouetteObjective,
+    mean_score,
+    mean_with_missing,
+)
+from preprocess.body.kinematics import rigid_transform
 
 CAUSES = (
     "mask_polarity", "second_person", "world_frame", "opengl_axes", "root_rotation", "frame_offset",
@@ -17,6 +29,25 @@ CAUSES = (
 """Names of the mistakes in commands and files; of equal candidates the first cause is named."""
 
 GeometryChange = Callable[[CaptureGeometry], CaptureGeometry]
+CAMERA_SAMPLES = 6
+"""Frames to which a camera is fitted."""
+MAX_CENTER_OFFSET = 0.45
+"""Largest shift of the principal point, as a fraction of the image's sides."""
+YAW_STARTS = 24
+"""Directions around the person from which the search for a camera starts."""
+LEVEL_CAMERAS = {
+    "y": np.diag([1.0, -1.0, -1.0]),
+    "z": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+}
+"""Rotations of level OpenCV cameras, by the axis that is up in the world."""
+REFINED_STARTS = 2
+"""Best starts that are refined."""
+CAMERA_EVALUATIONS = 200
+"""Evaluations of one refinement."""
+FIRST_TURN_RAD = 0.15
+"""First step of the rotation, radians."""
+FIRST_SHIFT_M = 0.15
+"""First step of the translation, metres."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -199,3 +230,161 @@ def _with_intrinsics(
     intrinsics[:, [0, 1], [0, 1]] *= focal_scale
     intrinsics[:, :2, 2] += np.array(shift_px)
     return replace(geometry, intrinsics=intrinsics)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _CameraProblem:
+    """Posed bodies in the world and their masks, for one static camera."""
+
+    geometry: CaptureGeometry
+    objective: SilhouetteObjective
+
+    @cached_property
+    def bodies(self) -> list[tuple[Float32[np.ndarray, "points 3"], MaskSample]]:
+        """The skin in each sample that has a pose, and the sample."""
+        rows = [self.geometry.row_for_frame(sample.index) for sample in self.objective.samples]
+        return [
+            (self.objective.posed_points(self.geometry.motion, row), sample)
+            for row, sample in zip(rows, self.objective.samples, strict=True)
+            if row is not None
+        ]
+
+    def mean_iou(self, extrinsic: Float[np.ndarray, "4 4"]) -> float:
+        """Mean IoU of bodies and masks seen from this camera."""
+        geometry = replace(self.geometry, extrinsics=extrinsic[None])
+        return mean_score(self.objective.frame_scores(geometry))
+
+    def extrinsic_for(self, rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4 4"]:
+        """The camera of a given rotation that puts the bodies where the masks are."""
+        middle = np.mean([p.mean(axis=0) for p, _ in self.bodies], axis=0)
+        extrinsic = rigid_transform(rotation, -rotation @ middle + (0.0, 0.0, 4.0))
+        for _ in range(4):
+            camera = replace(self.geometry, extrinsics=extrinsic[None]).camera_at(
+                0, self.objective.size_px
+            )
+            drawn = np.median(
+                [_point_bounds(camera.project(p[::8])) for p, _ in self.bodies], axis=0
+            )
+            wanted = np.median([_mask_bounds(each.alpha) for _, each in self.bodies], axis=0)
+            depth = float(np.mean([(p @ rotation[2]).mean() for p, _ in self.bodies]))
+            far = (depth + extrinsic[2, 3]) * (drawn[3] - drawn[1]) / (wanted[3] - wanted[1])
+            off = 0.5 * (wanted[:2] + wanted[2:] - drawn[:2] - drawn[2:])
+            extrinsic[:2, 3] += off * far / np.array(camera.focal_px)
+            extrinsic[2, 3] = far - depth
+        return extrinsic
+
+
+def fit_factor(
+    make: Callable[[float], Correction],
+    geometry: CaptureGeometry,
+    objective: SilhouetteObjective,
+    *,
+    near_one: bool = False,
+) -> Correction:
+    """Fit the one factor of a correction: a coarse grid, then a bounded scalar search.
+
+    Args:
+        make: Makes the correction of a factor (`scale_focal_length`, `divide_distances`).
+        geometry: The capture that the correction is applied to.
+        objective: Masks of a few frames.
+        near_one: Skips the grid: the factor is within 20 % of 1.
+    """
+    from scipy.optimize import minimize_scalar  # 0.1 s that a capture in order does not need
+
+    logs = np.zeros(1) if near_one else np.linspace(-0.8, 0.8, 9)
+
+    def loss(log: float) -> float:
+        return -mean_with_missing(objective.frame_scores(make(float(np.exp(log))).apply(geometry)))
+
+    center = float(logs[int(np.argmin([loss(log) for log in logs]))])
+    bounds = (center - 0.2, center + 0.2)
+    found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"maxiter": 10})
+    return make(float(np.exp(found.x)))
+
+
+def fit_principal_point(
+    geometry: CaptureGeometry, objective: SilhouetteObjective
+) -> Correction | None:
+    """Fit the principal point that puts the bodies where the masks are.
+
+    None if no mask has a pose, or the shift is too large to be a crop.
+    """
+    problem = _CameraProblem(geometry=geometry, objective=objective.subset(CAMERA_SAMPLES))
+    if not problem.bodies:
+        return None
+    small = np.array(objective.size_px) / np.array(geometry.size_px)
+    wanted = np.stack([_mask_bounds(sample.alpha) for _, sample in problem.bodies])
+    drawn = np.stack(
+        [
+            _point_bounds(
+                geometry.camera_at(sample.camera_row, objective.size_px).project(points[::8])
+            )
+            for points, sample in problem.bodies
+        ]
+    )
+    away = np.median(wanted - drawn, axis=0)
+    right, down = 0.5 * (away[:2] + away[2:]) / small
+    near = bool((np.abs([right, down]) < MAX_CENTER_OFFSET * np.array(geometry.size_px)).all())
+    return shift_principal_point(float(right), float(down)) if near else None
+
+
+def fit_extrinsics(geometry: CaptureGeometry, objective: SilhouetteObjective) -> Correction | None:
+    """Fit the pose of a static camera; None if there are several cameras, or no mask has a pose.
+
+    Starts from level cameras on all sides, in worlds with y or z up; the best are refined freely.
+    """
+    problem = _CameraProblem(geometry=geometry, objective=objective.subset(CAMERA_SAMPLES))
+    if len(geometry.extrinsics) > 1 or not problem.bodies:
+        return None
+    yaws = [2.0 * np.pi * k / YAW_STARTS for k in range(YAW_STARTS)]
+    starts = [
+        problem.extrinsic_for(level @ _yaw_rotation(level, yaw))
+        for level in LEVEL_CAMERAS.values()
+        for yaw in yaws
+    ]
+    starts.sort(key=problem.mean_iou, reverse=True)
+    extrinsic = max(
+        (_refine_extrinsics(problem, start) for start in starts[:REFINED_STARTS]),
+        key=problem.mean_iou,
+    )
+    return Correction(
+        cause="world_frame",
+        description="the poses are in world coordinates and no file gives the camera's position; "
+        "one that fits was found from the masks",
+        apply=lambda c: replace(c, extrinsics=extrinsic[None]),
+    )
+
+
+def _yaw_rotation(level: Float[np.ndarray, "3 3"], angle: float) -> Float[np.ndarray, "3 3"]:
+    """Rotation of the world about its up axis."""
+    return Rotation.from_rotvec(-angle * level[1]).as_matrix()
+
+
+def _refine_extrinsics(
+    problem: _CameraProblem, start: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, "4 4"]:
+    """Move the camera and turn it about the bodies' center (Nelder-Mead on the mean IoU)."""
+    from scipy.optimize import minimize  # 0.1 s that a capture in order does not need
+
+    middle = np.mean([p.mean(axis=0) for p, _ in problem.bodies], axis=0) @ start[:3, :3].T
+
+    def moved(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
+        turn = Rotation.from_rotvec(x[:3]).as_matrix()
+        return rigid_transform(turn @ start[:3, :3], start[:3, 3] + middle - turn @ middle + x[3:])
+
+    size = np.diag([FIRST_TURN_RAD] * 3 + [FIRST_SHIFT_M] * 3)
+    found = minimize(
+        lambda x: -problem.mean_iou(moved(x)), np.zeros(6), method="Nelder-Mead",
+        options={"maxfev": CAMERA_EVALUATIONS, "initial_simplex": np.vstack([np.zeros(6), size])},
+    )  # fmt: skip
+    return moved(found.x)
+
+
+def _point_bounds(pixels: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "4"]:
+    return np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
+
+
+def _mask_bounds(alpha: Float32[np.ndarray, "height width"]) -> Float[np.ndarray, "4"]:
+    rows, columns = np.nonzero(alpha > 0.5)
+    low, high = (columns.min(), rows.min()), (columns.max() + 1, rows.max() + 1)
+    return np.array([*low, *high], dtype=np.float64)

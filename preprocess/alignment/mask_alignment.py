@@ -19,12 +19,12 @@ from jaxtyping import Float, Float32, Shaped
 
 from capture.camera import Camera
 from capture.source import Frame
-from preprocess.alignment.capture_geometry import CaptureGeometry
-from preprocess.alignment.image_alignment import (
+from preprocess.alignment.capture_evidence import (
     ImageSample,
     estimate_silhouettes,
     thumbnail_size_px,
 )
+from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.silhouette_objective import MaskSample, SilhouetteObjective, mean_score
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.body_surface import (

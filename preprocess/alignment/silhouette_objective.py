@@ -1,6 +1,6 @@
 """The silhouette objective: IoU of posed bodies with the small masks of a few frames."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -29,6 +29,8 @@ MIN_BOX_FILL = 0.95
 """Fraction of its bounding box that no person's outline fills."""
 MIN_COVERED_FRACTION = 0.1
 """Fraction of a mask's connected part that the body must cover to be of the same person."""
+MIN_PERSON_PX = 60
+"""Median height of the person below which there is little detail, px."""
 MAX_CACHED_POSES = 256
 """Posed skins in the cache: 25 MB."""
 
@@ -288,3 +290,46 @@ def _resize_alpha(
         cv2.resize(alpha, size_px, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR),
         dtype=np.float32,
     )
+
+
+def mask_warnings(objective: SilhouetteObjective | None, height_px: int) -> Iterator[str]:
+    """Describe what is implausible in some frames' masks, for people; nothing without masks.
+
+    Args:
+        objective: The masks, if there are any.
+        height_px: Height of the images.
+    """
+    if objective is not None:
+        yield from _unusable_mask_warnings(objective)
+        yield from _framing_warnings(objective, height_px)
+
+
+def _unusable_mask_warnings(objective: SilhouetteObjective) -> Iterator[str]:
+    """Masks that cannot be used, or are boxes."""
+    looked = len(objective.rejections) + len(objective.samples)
+    if objective.rejections:
+        first = objective.rejections[0].rstrip(".")
+        yield (
+            f"{len(objective.rejections)} of {looked} sampled masks cannot be used, and "
+            f"their frames are left out ({first})."
+        )
+    if objective.are_boxes:
+        yield (
+            "The masks are boxes, not outlines: all that is in them will be learnt as the person. "
+            "Leave them out (--masks segmenter:blazepose), or give a segmenter's."
+        )
+
+
+def _framing_warnings(objective: SilhouetteObjective, height_px: int) -> Iterator[str]:
+    """Persons who are cut off by the image's border, or small."""
+    alphas = [sample.alpha > 0.5 for sample in objective.samples]
+    touching = sum(a[0].any() or a[:, 0].any() or a[:, -1].any() or a[-1].any() for a in alphas)
+    if touching > 0.2 * len(alphas):
+        yield (
+            f"In {touching} of {len(alphas)} frames the person touches the image's border; what is "
+            "outside cannot be learnt."
+        )
+    heights = [np.ptp(np.flatnonzero(a.any(axis=1))) + 1 for a in alphas]
+    tall = float(np.median(heights)) / alphas[0].shape[0] * height_px
+    if tall < MIN_PERSON_PX:
+        yield f"The person is {tall:.0f} px high; little detail can be learnt from that."

@@ -1,15 +1,47 @@
-"""The poses of a clip as rotation matrices, all frames at once."""
+"""The poses of a clip as rotation matrices, and what is known of them before any picture.
+
+All frames are computed at once. Poses are near those given, or merely human.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, final
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.kinematics import axis_angles_from_matrices, rigid_transform, rotation_matrices
+from preprocess.fitting.normal_equations import ChainEquations
+
+SIGMA_ROOT_RAD = 0.12
+"""Prior standard deviation of the root's rotation, radians."""
+SIGMA_SIDE_M = 0.05
+"""Prior standard deviation of the root's position across the view, metres."""
+SIGMA_DEPTH_M = 0.25
+"""Prior standard deviation of the root's distance, metres."""
+JOINT_SIGMAS_RAD = (
+    (0.10, (1, 2)), (0.10, (4, 5)), (0.08, (7, 8)), (0.01, (10, 11)), (0.04, (3, 6, 9)),
+    (0.07, (12, 15)), (0.05, (13, 14)), (0.12, (16, 17)), (0.12, (18, 19)), (0.08, (20, 21)),
+    (0.01, (22, 23)),
+)  # fmt: skip
+"""Prior standard deviation of joints' rotations, radians: of hips, knees, ankles, toes, spine, neck
+and head, collars, shoulders, elbows, wrists and hands."""
+CHANGE_PER_FRAME = 0.15
+"""Standard deviation of a correction's change from a frame to the next, in prior standard
+deviations; over n frames it grows with the root of n."""
+SHARED_PRECISION = 0.1
+"""Precision of the correction that all frames share, relative to that of a frame's own: a tracker
+errs alike in all frames, and a turn that they share blurs nothing."""
+SIGMA_GUESSED_RAD = 0.08
+"""Standard deviation of the given rotations of toes and hands, which trackers guess, radians."""
+GUESSED_JOINTS = (10, 11, 22, 23)
+"""Toes and hands."""
+GIVEN_AXES = {1: "xyz", 4: "x", 7: "xz", 16: "xyz", 18: "xy"}
+"""Axes of the left joints (hip, knee, ankle, shoulder, elbow) about which people turn so freely
+that given poses say more than `LEFT_PRIORS`. Knees and elbows do not bend sideways."""
 
 
 class PosedJoints(NamedTuple):
@@ -110,3 +142,184 @@ def rotation_vectors(
     """Axis-angles of exact rotation matrices, radians."""
     flat = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_rotvec()
     return flat.reshape(matrices.shape[:-1])
+
+
+def _pose_sigma() -> Float[np.ndarray, "75"]:
+    sigma = np.zeros((25, 3))
+    sigma[0] = SIGMA_ROOT_RAD
+    for value, joints in JOINT_SIGMAS_RAD:
+        sigma[list(joints)] = value
+    sigma[24] = SIGMA_SIDE_M, SIGMA_SIDE_M, SIGMA_DEPTH_M
+    return sigma.ravel()
+
+
+POSE_SIGMA = _pose_sigma()
+"""Prior standard deviation of a frame's correction: root and joint rotations, root position. These
+are the units of a frame's parameters in the equations."""
+
+MIRRORED_AXES = (1.0, -1.0, -1.0)
+"""An axis-angle of a left joint times this is that of the right one."""
+LEFT_PRIORS = {
+    1: ((0.0, 0.0, 0.0), (0.70, 0.35, 0.30)), 4: ((0.25, 0.0, 0.0), (0.70, 0.12, 0.08)),
+    7: ((0.0, 0.0, 0.0), (0.20, 0.13, 0.10)), 10: ((0.0, 0.0, 0.0), (0.10, 0.03, 0.03)),
+    13: ((0.0, 0.0, 0.0), (0.05, 0.12, 0.12)), 16: ((0.0, -0.2, -0.8), (0.50, 0.60, 0.70)),
+    18: ((0.0, -0.35, 0.0), (0.40, 0.70, 0.08)), 20: ((0.0, 0.0, 0.0), (0.25, 0.20, 0.25)),
+    22: ((0.0, 0.0, 0.0), (0.02, 0.02, 0.02)),
+}  # fmt: skip
+"""Mean and standard deviation of the left joints' axis-angles, radians: hip, knee, ankle, toes,
+collar, shoulder, elbow, wrist, hand."""
+MIDDLE_PRIORS = {3: 0.08, 6: 0.07, 9: 0.07, 12: 0.20, 15: 0.20}
+"""Standard deviation of the axis-angles of spine, neck and head, radians."""
+SIGMA_FREE = 30.0
+"""Standard deviation of what is not known at all, radians or metres."""
+STEADY_S = 0.17
+"""Standard deviation of the time over which a motion is nearly steady, seconds."""
+CHANGES_PER_SECOND = (
+    (0.04, (0,)), (0.015, (3, 6, 9, 13, 14)), (0.03, (12, 15)), (0.07, (1, 2, 4, 5)),
+    (0.05, (7, 8, 20, 21)), (0.005, (10, 11, 22, 23)), (0.11, (16, 17, 18, 19)),
+)  # fmt: skip
+"""Standard deviation of how far a joint strays from a steady motion in a second, radians."""
+CHANGE_M = (0.013, 0.013, 0.013)
+"""Standard deviation of how far the root strays from a steady motion in a second, metres."""
+CUT_TURN_RAD = 0.25
+"""Rotation of the root from frame to frame that photographs show, but no film; at it neighbors
+tell a quarter about each other."""
+FAST_CHANGE = 6.0
+"""Standard deviations of a change between frames at which it counts a quarter (Geman-McClure):
+people move fast at times."""
+FIRST_FAST_CHANGE = 100.0
+"""`FAST_CHANGE` in the first iteration, halved from one to the next: a frame that a tracker got
+wrong is drawn to its neighbors before it may count as a fast motion (graduated non-convexity)."""
+
+
+@final
+class GivenPosePrior:
+    """The poses are human, and near given ones, which err alike in all frames or in neighbors."""
+
+    def __init__(
+        self,
+        given: ClipPoses,
+        camera_rotations: Float[np.ndarray, "frames 3 3"],
+        frame_numbers: Float[np.ndarray, "frames"],
+    ) -> None:
+        """Takes the given poses of the frames, and the frames' numbers."""
+        self._given, self._cameras = given, camera_rotations
+        links = 1.0 / (CHANGE_PER_FRAME**2 * np.maximum(np.diff(frame_numbers), 1.0))
+        self._links = links[:, None] * _GIVEN_PRECISION
+
+    def add_to(self, equations: ChainEquations, poses: ClipPoses) -> None:
+        """Adds it to the equations of a step from the present poses, in units of `POSE_SIGMA`."""
+        apart = poses.steps_from(self._given, self._cameras) / POSE_SIGMA
+        apart -= (1.0 - SHARED_PRECISION) * apart.mean(axis=0)
+        equations.add_chain(apart, _GIVEN_PRECISION, self._links)
+        _add_human(equations, poses, _SIGMA_BESIDE_GIVEN)
+
+
+@final
+class HumanPosePrior:
+    """Joints turn as people's do: about few axes, and steadily most of the time."""
+
+    def __init__(
+        self,
+        camera_rotations: Float[np.ndarray, "frames 3 3"],
+        times_s: Float[np.ndarray, "frames"],
+        *,
+        settled: bool = False,
+    ) -> None:
+        """Takes what the poses are compared by.
+
+        Args:
+            camera_rotations: Camera from world of each frame.
+            times_s: Times of the frames.
+            settled: Whether the poses were fitted before: no frame is far off its neighbors.
+        """
+        self._cameras = camera_rotations
+        change = np.zeros((25, 3))
+        for value, joints in CHANGES_PER_SECOND:
+            change[list(joints)] = value
+        change[24] = CHANGE_M
+        gaps = np.maximum(np.diff(times_s), 1e-3)
+        self._change = change.ravel() * np.sqrt(gaps)[:, None]
+        self._steady_frames = STEADY_S / float(np.median(gaps)) if len(gaps) else 1.0
+        self._fast_change = FAST_CHANGE if settled else FIRST_FAST_CHANGE
+
+    def add_to(self, equations: ChainEquations, poses: ClipPoses) -> None:
+        """Adds it to the equations of a step from the present poses, in units of `POSE_SIGMA`."""
+        _add_human(equations, poses, _SIGMA)
+        each = np.arange(72, 75)
+        equations.blocks[:, each, each] += (POSE_SIGMA[72:] / SIGMA_FREE) ** 2
+        self._add_links(equations, poses)
+        self._fast_change = max(FAST_CHANGE, 0.5 * self._fast_change)
+
+    def _add_links(self, equations: ChainEquations, poses: ClipPoses) -> None:
+        before = ClipPoses(rotations=poses.rotations[:-1], translations=poses.translations[:-1])
+        after = ClipPoses(rotations=poses.rotations[1:], translations=poses.translations[1:])
+        apart = after.steps_from(before, self._cameras[:-1])
+        turned = np.linalg.norm(apart[:, :3], axis=1)
+        apart -= gaussian_filter1d(apart, self._steady_frames, axis=0, mode="nearest")
+        size = ((apart / self._change) ** 2).reshape(-1, 25, 3).mean(axis=2)
+        usual = np.repeat(1.0 / (1.0 + size / self._fast_change**2) ** 2, 3, axis=1)
+        usual *= 1.0 / (1.0 + (turned / CUT_TURN_RAD) ** 2)[:, None] ** 2
+        equations.add_links(apart / POSE_SIGMA, usual * (POSE_SIGMA / self._change) ** 2)
+
+
+def _add_human(
+    equations: ChainEquations, poses: ClipPoses, sigma: Float[np.ndarray, "24 3"]
+) -> None:
+    """Adds priors of the joints' axis-angles around their means."""
+    vectors = rotation_vectors(poses.rotations)
+    by_step = _inverse_right_jacobian(vectors)
+    heavy = by_step / sigma[..., None] ** 2
+    blocks = by_step.swapaxes(-1, -2) @ heavy
+    right = -(heavy.swapaxes(-1, -2) @ (vectors - _MEAN)[..., None])[..., 0]
+    units = POSE_SIGMA[:72].reshape(24, 3)
+    blocks *= units[:, :, None] * units[:, None]
+    for joint in range(24):
+        part = slice(3 * joint, 3 * joint + 3)
+        equations.blocks[:, part, part] += blocks[:, joint]
+    equations.right[:, :72] += (right * units).reshape(-1, 72)
+
+
+def _human_priors() -> tuple[Float[np.ndarray, "24 3"], Float[np.ndarray, "24 3"]]:
+    mean, sigma = np.zeros((24, 3)), np.full((24, 3), SIGMA_FREE)
+    for left, (middle, spread) in LEFT_PRIORS.items():
+        mean[left], mean[left + 1] = middle, np.array(middle) * MIRRORED_AXES
+        sigma[left] = sigma[left + 1] = spread
+    for joint, spread in MIDDLE_PRIORS.items():
+        sigma[joint] = spread
+    return mean, sigma
+
+
+def _sigma_beside_given() -> Float[np.ndarray, "24 3"]:
+    """Standard deviations beside given poses, which alone count about `GIVEN_AXES`."""
+    sigma = _SIGMA.copy()
+    for left, axes in GIVEN_AXES.items():
+        for axis in axes:
+            sigma[left : left + 2, "xyz".index(axis)] = SIGMA_FREE
+    return sigma
+
+
+def _given_precision() -> Float[np.ndarray, "75"]:
+    """Precision of the given poses in units of `POSE_SIGMA`."""
+    precision = np.ones((25, 3))
+    guessed = list(GUESSED_JOINTS)
+    precision[guessed] = (POSE_SIGMA.reshape(25, 3)[guessed] / SIGMA_GUESSED_RAD) ** 2
+    return precision.ravel()
+
+
+_MEAN, _SIGMA = _human_priors()
+_SIGMA_BESIDE_GIVEN, _GIVEN_PRECISION = _sigma_beside_given(), _given_precision()
+
+
+def _inverse_right_jacobian(
+    vectors: Float[np.ndarray, "*batch 3"],
+) -> Float[np.ndarray, "*batch 3 3"]:
+    """Derivative of the axis-angle of R(v) R(step) by the step, at 0."""
+    angle = np.linalg.norm(vectors, axis=-1)
+    safe = np.clip(angle, 1e-3, 3.0)
+    factor = 1.0 / safe**2 - (1.0 + np.cos(safe)) / (2.0 * safe * np.sin(safe))
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1)
+    cross = cross.reshape(*vectors.shape[:-1], 3, 3)
+    return np.eye(3) + 0.5 * cross + factor[..., None, None] * (cross @ cross)

@@ -7,7 +7,7 @@ import pytest
 
 from baselines.systems.pose_alignment import align_pose
 from preprocess.fitting.clip_fitting import correct_pose
-from preprocess.fitting.pose_priors import POSE_SIGMA
+from preprocess.fitting.clip_poses import POSE_SIGMA
 from studio.actor import Actor
 
 

@@ -12,9 +12,13 @@ from capture.camera import Camera
 from capture.source import Frame
 from capture.source_opening import open_source
 from preprocess.alignment.capture_alignment import NO_PERSON_FOUND, align_body
-from preprocess.alignment.capture_evidence import CaptureEvidence
+from preprocess.alignment.capture_evidence import (
+    CaptureEvidence,
+    ImageSample,
+    edge_contrast,
+    estimate_silhouettes,
+)
 from preprocess.alignment.capture_geometry import CaptureGeometry
-from preprocess.alignment.image_alignment import ImageSample, edge_contrast, estimate_silhouettes
 from preprocess.alignment.mask_alignment import LiveAlignment, move_pelvis, place_body_on_masks
 from preprocess.body.body_pose import Motion
 from preprocess.body.body_surface import MeshSilhouette, SkinPoints

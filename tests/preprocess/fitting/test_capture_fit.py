@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from preprocess.fitting.capture_fit import CaptureFit, load_capture_fit
+from preprocess.fitting.clip_fitting import CaptureFit, load_capture_fit
 
 
 @pytest.fixture

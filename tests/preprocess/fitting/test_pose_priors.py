@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from preprocess.fitting.clip_poses import ClipPoses
+from preprocess.fitting.clip_poses import POSE_SIGMA, ClipPoses, GivenPosePrior, HumanPosePrior
 from preprocess.fitting.normal_equations import ChainEquations
-from preprocess.fitting.pose_priors import POSE_SIGMA, GivenPosePrior, HumanPosePrior
 
 
 def settle(poses: ClipPoses, iterations: int = 8) -> ClipPoses:
