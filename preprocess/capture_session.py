@@ -20,8 +20,8 @@ from preprocess.cameras.camera_file import CameraTrack
 from preprocess.capture_paths import CapturePaths, find_parts
 from preprocess.fitting.clip_fitting import CaptureFit
 from preprocess.live_inputs import LiveInputs
-from preprocess.masks.given_mask_refinement import GivenMaskRefiner
 from preprocess.masks.mask_files import Masks
+from preprocess.masks.mask_refinement import GivenMaskRefiner
 from preprocess.observation import DroppedFrame, Observation, observation_builder
 from preprocess.plugins import Segmenter, segmenter_name
 from preprocess.tracked_stream import LiveTracking

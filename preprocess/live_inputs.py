@@ -19,8 +19,8 @@ from preprocess.alignment.mask_alignment import LiveAlignment
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.capture_paths import CapturePaths, MaskOrigin, choose_mask_origin
-from preprocess.masks.given_mask_refinement import GivenMaskRefiner
 from preprocess.masks.mask_files import Masks, read_mask
+from preprocess.masks.mask_refinement import GivenMaskRefiner
 from preprocess.observation import (
     DroppedFrame,
     Observation,

@@ -15,8 +15,8 @@ from capture.source import Frame, FrameSource
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.frame_association import associate_by_name, associate_by_order, associate_by_time
-from preprocess.masks.given_mask_refinement import GivenMaskRefiner
 from preprocess.masks.mask_files import Masks
+from preprocess.masks.mask_refinement import GivenMaskRefiner
 from preprocess.plugins import Segmenter
 
 

@@ -40,8 +40,8 @@ from preprocess.capture_paths import (
 )
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.live_inputs import LiveInputs
-from preprocess.masks.given_mask_refinement import GivenMaskRefiner
 from preprocess.masks.mask_files import Masks, open_masks, open_tracker_masks
+from preprocess.masks.mask_refinement import GivenMaskRefiner
 from preprocess.plugins import Segmenter, make_segmenter, segmenter_name
 from preprocess.poses.motion_builder import place_in_camera_world
 from preprocess.poses.plausibility import (

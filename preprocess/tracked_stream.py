@@ -32,7 +32,7 @@ from preprocess.fitting.tracked_frames import (
     fit_first_frames,
     reduced_size_px,
 )
-from preprocess.masks.given_mask_refinement import GivenMaskRefiner
+from preprocess.masks.mask_refinement import GivenMaskRefiner
 from preprocess.observation import (
     DroppedFrame,
     Observation,

@@ -24,6 +24,12 @@ REDUCTION = 3
 """Reduction of the image from which colors are learnt."""
 COLOR_SPREAD = 9.0
 """Standard deviation, in levels, that is added to each color's own."""
+UNSEEN_BACKGROUND = 0.00025
+"""Least density of a color where the background is known (`color_density`)."""
+SHADOW_GAIN = 0.6, 1.05
+"""Range of the factors by which the person's shadow and reflected light change the background."""
+SHADOW_PROBABILITY = 0.1
+"""Probability that a background pixel is shaded or lit by the person."""
 ANYWHERE = 0.1
 """Weight of the colors of the whole person, or background, beside those nearby."""
 UNSEEN = 0.02
@@ -221,6 +227,30 @@ class PlateColors(NamedTuple):
         textured = texture > np.float32(3.0 * MIN_TEXTURE**2) * share
         alike = off < np.float32(MAX_UNLIKE_FRACTION) * texture
         return self.known & (share > MIN_KNOWN_FRACTION) & textured & alike
+
+
+def plate_density(
+    colors: Float32[np.ndarray, "3 pixels"],
+    mean: Float32[np.ndarray, "3 pixels"],
+    variance: Pixels,
+) -> Pixels:
+    """Density of colors where the background is known, as it is or in the person's shadow.
+
+    A shadow has the background's color, only darker (Horprasert et al. 1999, a statistical approach
+    for background subtraction and shadow detection).
+    """
+    dot = colors[0] * mean[0] + colors[1] * mean[1] + colors[2] * mean[2]
+    length = np.maximum(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2, np.float32(1.0))
+    gain = np.clip(dot / length, np.float32(SHADOW_GAIN[0]), np.float32(SHADOW_GAIN[1]))
+    plain, shaded = np.zeros((2, len(dot)), np.float32)
+    for color, expected in zip(colors, mean, strict=True):
+        plain += (color - expected) ** 2
+        shaded += (color - gain * expected) ** 2
+    return (
+        np.float32(1.0 - SHADOW_PROBABILITY) * color_density(plain, variance)
+        + np.float32(SHADOW_PROBABILITY) * color_density(shaded, variance)
+        + np.float32(UNSEEN_BACKGROUND)
+    )
 
 
 @final

@@ -1,4 +1,4 @@
-"""Sharp masks from a tracker's soft ones: what the network saw, joined with the frame's colors.
+"""Sharp masks: a tracker's soft ones, and given ones whose borders miss the edges in the picture.
 
 The network's mask is coarse: a pixel of its square is several of the frame, fingers and the gap
 between arm and trunk are lost. It is right at large, though, so only a band around its border is
@@ -8,6 +8,11 @@ where a static camera has seen it, under the background itself (`BackgroundPlate
 its texture is in plain sight, there is no person. A guided filter makes neighbors of like color
 agree and carries the result to full size; before a known background, the border is then moved to
 where the colors change (`refine_border`).
+
+Given masks are right where the picture changes along their border: color is a mixture of person and
+background by alpha, so that the picture's gradient follows that of alpha. They are refined in the
+same way and the two borders compared; only if the picture changes clearly more along the refined
+one is it used. Exact masks stay as they are.
 """
 
 from typing import NamedTuple, final
@@ -20,10 +25,16 @@ from preprocess.masks.color_models import (
     BackgroundPlate,
     DarkFilmBrightener,
     PlateColors,
-    color_density,
     local_densities,
+    plate_density,
 )
-from preprocess.masks.matting import apply_coefficients, guided_coefficients, refine_border
+from preprocess.masks.matting import (
+    apply_coefficients,
+    enlarge_alpha,
+    guided_coefficients,
+    move_border,
+    steepen,
+)
 from preprocess.tracking.keypoints import CroppedMask
 
 WORKING_SCALE = 2.0
@@ -43,12 +54,6 @@ SURE_BACKGROUND, SURE_BACKGROUND_DISTANCE = 0.1, 2.5
 
 LOCAL_SIGMA = 3.0
 """Gaussian σ of the neighborhood from which colors are learnt, in the network's pixels."""
-UNSEEN_BACKGROUND = 0.00025
-"""Least density of a color where the background is known (`color_density`)."""
-SHADOW_GAIN = 0.6, 1.05
-"""Range of the factors by which the person's shadow and reflected light change the background."""
-SHADOW_PROBABILITY = 0.1
-"""Probability that a background pixel is shaded or lit by the person."""
 
 LOCAL_WEIGHT, PLATE_WEIGHT, HISTOGRAM_WEIGHT = 0.5, 1.0, 0.75
 """Weights of the three log likelihood ratios."""
@@ -61,14 +66,6 @@ FILTER_RADIUS_PX = 3
 """Radius of the guided filter's windows in the working image, px."""
 FILTER_TOLERANCE = 5.0
 """Standard deviation of colors, in levels, that the guided filter does not follow."""
-CONTRAST = 2.0
-"""Steepening of the filtered mask around 1/2."""
-SURE_ALPHA = 0.8
-"""Alpha above which a pixel teaches the person's color beside the border."""
-NEARBY_PX = 3
-"""Edge of the window in which it does, in twice the working image's pixels."""
-NEARBY_SPREAD = 14.0
-"""Standard deviation of a color that the window's mean misses, in levels."""
 PERSON_FREE_ALPHA = 0.05
 """Alpha below which a pixel enters the background plate."""
 
@@ -76,6 +73,15 @@ Plane = Float32[np.ndarray, "height width"]
 Channels = Float32[np.ndarray, "3 height width"]
 PixelMask = Bool[np.ndarray, "height width"]
 Pixels = Float32[np.ndarray, "pixels"]
+COMPARED_FRAMES = 10
+"""Frames whose borders are compared; what they say holds for all others."""
+MIN_EDGE_RATIO = 1.15
+"""Ratio of the edge strengths along refined and given borders from which masks are refined; noise
+in the pictures alone makes it up to 1.12."""
+SQUARE_PX = 256
+"""Width and height of the square that holds the person, as in a tracker's masks."""
+SQUARE_MARGIN = 1.25
+"""Its width as a multiple of the person's longer side."""
 
 
 class _Band(NamedTuple):
@@ -166,8 +172,8 @@ class MaskRefiner:
             there = np.s_[
                 top * times : (top + height) * times, left * times : (left + width) * times
             ]
-            moved = _move_border(band.image, _steepen(filtered), plate)
-            found[there] = _enlarge(rgb[there], fitted, times, moved)
+            moved = move_border(band.image, steepen(filtered), plate)
+            found[there] = enlarge_alpha(rgb[there], fitted, times, moved)
         self._plate.update(image, far)
         return found
 
@@ -182,7 +188,7 @@ class MaskRefiner:
         ratio = np.float32(LOCAL_WEIGHT) * np.log(front / back)
         known = plate.known[at]
         rows, columns = band.rows[known], band.columns[known]
-        behind = _plate_density(
+        behind = plate_density(
             band.colors[:, known], plate.mean[:, rows, columns], plate.variance[rows, columns]
         )
         ratio[known] = np.float32(PLATE_WEIGHT) * np.log(front[known] / behind)
@@ -262,78 +268,111 @@ def _without_islands(alpha: Plane, inside: PixelMask) -> Plane:
     return alpha * kept[labels]
 
 
-def _plate_density(
-    colors: Float32[np.ndarray, "3 pixels"],
-    mean: Float32[np.ndarray, "3 pixels"],
-    variance: Pixels,
-) -> Pixels:
-    """Density of colors where the background is known, as it is or in the person's shadow.
-
-    A shadow has the background's color, only darker (Horprasert et al. 1999, a statistical approach
-    for background subtraction and shadow detection).
-    """
-    dot = colors[0] * mean[0] + colors[1] * mean[1] + colors[2] * mean[2]
-    length = np.maximum(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2, np.float32(1.0))
-    gain = np.clip(dot / length, np.float32(SHADOW_GAIN[0]), np.float32(SHADOW_GAIN[1]))
-    plain, shaded = np.zeros((2, len(dot)), np.float32)
-    for color, expected in zip(colors, mean, strict=True):
-        plain += (color - expected) ** 2
-        shaded += (color - gain * expected) ** 2
-    return (
-        np.float32(1.0 - SHADOW_PROBABILITY) * color_density(plain, variance)
-        + np.float32(SHADOW_PROBABILITY) * color_density(shaded, variance)
-        + np.float32(UNSEEN_BACKGROUND)
-    )
-
-
 def _color_bins(colors: Float32[np.ndarray, "3 *pixels"]) -> Int[np.ndarray, "*pixels"]:
     """Number of each color's bin of 16 x 16 x 16."""
     red, green, blue = colors.astype(np.int32) >> 4
     return (red << 8) | (green << 4) | blue
 
 
-def _steepen(alpha: Plane) -> Plane:
-    """Steepen a mask around 1/2."""
-    steep = np.float32(CONTRAST) * alpha + np.float32(0.5 - 0.5 * CONTRAST)
-    return np.clip(steep, np.float32(0.0), np.float32(1.0))
+@final
+class GivenMaskRefiner:
+    """Refines the masks of a recording or a stream, frame by frame in order, if that is needed."""
+
+    def __init__(self) -> None:
+        """Nothing is known yet."""
+        self._refiner: MaskRefiner | None = None
+        self._size_px = (0, 0)
+        self._ratios: list[float] = []
+
+    @property
+    def is_needed(self) -> bool:
+        """Whether masks are refined, by the frames that were seen; at first they are not."""
+        return bool(self._ratios) and float(np.mean(self._ratios)) >= MIN_EDGE_RATIO
+
+    @property
+    def note(self) -> str | None:
+        """What a user should know of it; None if the masks stay as they are."""
+        if not self.is_needed:
+            return None
+        return (
+            "The borders of the given masks miss the edges in the pictures and were refined (edges "
+            f"are {np.mean(self._ratios):.1f} times as strong along the refined ones). "
+            "--no-refine-masks uses the masks as they are."
+        )
+
+    @property
+    def keeps_given_masks(self) -> bool:
+        """Whether enough frames have shown that the given masks need no refinement."""
+        return len(self._ratios) >= COMPARED_FRAMES and not self.is_needed
+
+    def __call__(
+        self,
+        rgb: UInt8[np.ndarray, "rows columns 3"],
+        alpha: Float32[np.ndarray, "rows columns"],
+        size_px: tuple[int, int],
+    ) -> Float32[np.ndarray, "height width"]:
+        """Refine the mask of the next frame.
+
+        Args:
+            rgb: The frame.
+            alpha: Its given mask, of the same size.
+            size_px: Width and height of the result.
+
+        Returns:
+            The refined mask, or the given one if that is as good.
+        """
+        found = alpha
+        if not self.keeps_given_masks and (alpha > 0.5).any():
+            refined = self._refine(rgb, alpha)
+            if len(self._ratios) < COMPARED_FRAMES:
+                given = edge_strength(rgb, alpha)
+                self._ratios.append(edge_strength(rgb, refined) / max(given, 1e-6))
+            found = refined if self.is_needed else alpha
+        if size_px == (rgb.shape[1], rgb.shape[0]):
+            return found
+        return np.asarray(cv2.resize(found, size_px, interpolation=cv2.INTER_AREA), np.float32)
+
+    def _refine(
+        self, rgb: UInt8[np.ndarray, "rows columns 3"], alpha: Float32[np.ndarray, "rows columns"]
+    ) -> Float32[np.ndarray, "rows columns"]:
+        size_px = rgb.shape[1], rgb.shape[0]
+        if self._refiner is None or size_px != self._size_px:
+            self._refiner, self._size_px = MaskRefiner(size_px), size_px
+        return self._refiner(rgb, _crop(alpha))
 
 
-def _move_border(image: Channels, alpha: Plane, plate: PlateColors) -> Plane:
-    """How much more person a pixel is, by its color between the person's and the background's."""
-    sure = cv2.erode((alpha > SURE_ALPHA).astype(np.uint8), np.ones((3, 3), np.uint8))
-    size_px, window = alpha.shape[::-1], (NEARBY_PX, NEARBY_PX)
-    half_px = (size_px[0] + 1) // 2, (size_px[1] + 1) // 2
-    weight, *planes = (
-        cv2.resize(each, half_px, interpolation=cv2.INTER_AREA)
-        for each in (sure.astype(np.float32), *image)
-    )
-    inverse = np.float32(1.0) / np.maximum(cv2.blur(weight, window), np.float32(1e-6))
-    front = [cv2.blur(plane * weight, window) * inverse for plane in planes]
-    total = planes[0] ** 2 + planes[1] ** 2 + planes[2] ** 2
-    spread = cv2.blur(total * weight, window) * inverse
-    spread -= front[0] ** 2 + front[1] ** 2 + front[2] ** 2
-    spread = np.sqrt(np.maximum(spread, np.float32(0.0)) / np.float32(3.0) + NEARBY_SPREAD**2)
-    spread[inverse > 1e5] = np.inf
-    person = cv2.resize(cv2.merge(front), size_px)
-    behind = np.where(plate.known, np.sqrt(plate.variance), np.float32(np.inf))
-    colors, before = (np.moveaxis(each, 0, 2) for each in (image, plate.mean))
-    known = cv2.resize(spread.astype(np.float32), size_px, interpolation=cv2.INTER_NEAREST)
-    return refine_border(colors, alpha, (before, behind), (person, known)) - alpha
+def edge_strength(
+    rgb: UInt8[np.ndarray, "height width 3"], alpha: Float32[np.ndarray, "height width"]
+) -> float:
+    """How much a picture changes along a mask's border.
+
+    Returns:
+        Change of color across the border per pixel, levels; mean over the border, weighted by
+        the gradient of alpha.
+    """
+    border, slopes = _gradient(alpha), [_gradient(channel) for channel in cv2.split(rgb)]
+    steepness = np.hypot(*border)
+    across = [(border[0] * x + border[1] * y) / np.maximum(steepness, 1e-6) for x, y in slopes]
+    change = np.sqrt(sum(each**2 for each in across))
+    return float((change * steepness).sum() / max(float(steepness.sum()), 1e-6))
 
 
-def _enlarge(
-    rgb: UInt8[np.ndarray, "rows columns 3"],
-    coefficients: Float32[np.ndarray, "4 height width"],
-    times: int,
-    moved: Plane,
-) -> Float32[np.ndarray, "rows columns"]:
-    """The mask at full size: the filter's coefficients, enlarged and applied, and moved."""
-    size_px = rgb.shape[1], rgb.shape[0]
+def _gradient(plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Change per pixel to the right and down (Scharr)."""
+    x, y = (cv2.Scharr(plane, cv2.CV_32F, *axis, scale=1.0 / 32.0) for axis in ((1, 0), (0, 1)))
+    return x, y
 
-    def full(plane: Plane) -> Float32[np.ndarray, "rows columns"]:
-        return plane if times == 1 else cv2.resize(plane, size_px)
 
-    alpha = full(coefficients[3])
-    for channel, slope in zip(cv2.split(np.ascontiguousarray(rgb)), coefficients, strict=False):
-        alpha = alpha + cv2.multiply(channel, full(slope), dtype=cv2.CV_32F)
-    return np.clip(_steepen(alpha) + full(moved), np.float32(0.0), np.float32(1.0))
+def _crop(alpha: Float32[np.ndarray, "height width"]) -> CroppedMask:
+    """The square around the person, as a tracker would cut it out."""
+    rows, columns = np.nonzero(alpha > 0.5)
+    low = np.array([columns.min(), rows.min()], np.float64)
+    high = np.array([columns.max(), rows.max()], np.float64) + 1.0
+    scale = SQUARE_MARGIN * float((high - low).max()) / SQUARE_PX
+    corner = 0.5 * (low + high) - 0.5 * SQUARE_PX * scale
+    image_from_crop = np.column_stack([scale * np.eye(2), corner])
+    there = image_from_crop.copy()
+    there[:, 2] += 0.5 * scale - 0.5  # to OpenCV's pixels, whose middles are at 0
+    way = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    values = cv2.warpAffine(255.0 * alpha, there, (SQUARE_PX, SQUARE_PX), flags=way)
+    return CroppedMask(values=np.rint(values).astype(np.uint8), image_from_crop=image_from_crop)

@@ -9,9 +9,10 @@ those of the guided filter with a color guide (He et al. 2013, Guided image filt
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Shaped
+from jaxtyping import Float32, Shaped, UInt8
 
 from preprocess.body.body_surface import signed_distance_px
+from preprocess.masks.color_models import PlateColors
 
 BORDER_SIGMA_PX = 0.35
 """Standard deviation of a mask's border error, px."""
@@ -34,6 +35,16 @@ LIKELIHOOD_FLOOR = 1e-4
 """Likelihood of a color that fits neither model, relative to a perfect fit."""
 LIKELIHOOD_EXPONENT = 0.6
 """Exponent of the color likelihood: errors of neighboring pixels are correlated."""
+CONTRAST = 2.0
+"""Steepening of the filtered mask around 1/2."""
+SURE_ALPHA = 0.8
+"""Alpha above which a pixel teaches the person's color beside the border."""
+NEARBY_PX = 3
+"""Edge of the window in which it does, in twice the working image's pixels."""
+NEARBY_SPREAD = 14.0
+"""Standard deviation of a color that the window's mean misses, in levels."""
+
+Plane = Float32[np.ndarray, "height width"]
 
 
 def refine_border(
@@ -180,3 +191,52 @@ def apply_coefficients(
     for color, slope in zip(guide, coefficients, strict=False):
         found += cv2.multiply(color, slope)
     return found
+
+
+def steepen(alpha: Plane) -> Plane:
+    """Steepen a mask around 1/2."""
+    steep = np.float32(CONTRAST) * alpha + np.float32(0.5 - 0.5 * CONTRAST)
+    return np.clip(steep, np.float32(0.0), np.float32(1.0))
+
+
+def move_border(
+    image: Float32[np.ndarray, "3 height width"], alpha: Plane, plate: PlateColors
+) -> Plane:
+    """How much more person a pixel is, by its color between the person's and the background's."""
+    sure = cv2.erode((alpha > SURE_ALPHA).astype(np.uint8), np.ones((3, 3), np.uint8))
+    size_px, window = alpha.shape[::-1], (NEARBY_PX, NEARBY_PX)
+    half_px = (size_px[0] + 1) // 2, (size_px[1] + 1) // 2
+    weight, *planes = (
+        cv2.resize(each, half_px, interpolation=cv2.INTER_AREA)
+        for each in (sure.astype(np.float32), *image)
+    )
+    inverse = np.float32(1.0) / np.maximum(cv2.blur(weight, window), np.float32(1e-6))
+    front = [cv2.blur(plane * weight, window) * inverse for plane in planes]
+    total = planes[0] ** 2 + planes[1] ** 2 + planes[2] ** 2
+    spread = cv2.blur(total * weight, window) * inverse
+    spread -= front[0] ** 2 + front[1] ** 2 + front[2] ** 2
+    spread = np.sqrt(np.maximum(spread, np.float32(0.0)) / np.float32(3.0) + NEARBY_SPREAD**2)
+    spread[inverse > 1e5] = np.inf
+    person = cv2.resize(cv2.merge(front), size_px)
+    behind = np.where(plate.known, np.sqrt(plate.variance), np.float32(np.inf))
+    colors, before = (np.moveaxis(each, 0, 2) for each in (image, plate.mean))
+    known = cv2.resize(spread.astype(np.float32), size_px, interpolation=cv2.INTER_NEAREST)
+    return refine_border(colors, alpha, (before, behind), (person, known)) - alpha
+
+
+def enlarge_alpha(
+    rgb: UInt8[np.ndarray, "rows columns 3"],
+    coefficients: Float32[np.ndarray, "4 height width"],
+    times: int,
+    moved: Plane,
+) -> Float32[np.ndarray, "rows columns"]:
+    """The mask at full size: the filter's coefficients, enlarged and applied, and moved."""
+    size_px = rgb.shape[1], rgb.shape[0]
+
+    def full(plane: Plane) -> Float32[np.ndarray, "rows columns"]:
+        return plane if times == 1 else cv2.resize(plane, size_px)
+
+    alpha = full(coefficients[3])
+    for channel, slope in zip(cv2.split(np.ascontiguousarray(rgb)), coefficients, strict=False):
+        alpha = alpha + cv2.multiply(channel, full(slope), dtype=cv2.CV_32F)
+    return np.clip(steepen(alpha) + full(moved), np.float32(0.0), np.float32(1.0))
