@@ -16,9 +16,7 @@ from capture.input_error import InputError
 from preprocess.alignment.capture_evidence import edge_contrast, sample_video
 from preprocess.alignment.capture_geometry import CaptureGeometry, sanity_warnings
 from preprocess.alignment.correction_search import (
-    GOOD_IOU,
     MIN_IOU_GAIN,
-    USABLE_IOU,
     CorrectionResult,
     find_corrections,
     needs_video_correction,
@@ -31,7 +29,9 @@ from preprocess.alignment.edge_objective import (
     sample_images,
 )
 from preprocess.alignment.silhouette_objective import (
+    GOOD_IOU,
     SAMPLED_FRAMES,
+    USABLE_IOU,
     SilhouetteObjective,
     mask_warnings,
     mean_score,

@@ -37,7 +37,7 @@ from apps.tracking.person_tracking import (
 from capture.atomic_files import write_text_atomically
 from capture.camera_device import camera_address
 from capture.input_error import InputError
-from preprocess.alignment.correction_search import GOOD_IOU, USABLE_IOU
+from preprocess.alignment.silhouette_objective import GOOD_IOU, USABLE_IOU
 from preprocess.capture_session import CaptureInputs
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")

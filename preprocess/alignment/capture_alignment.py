@@ -12,11 +12,7 @@ import numpy as np
 
 from preprocess.alignment.capture_evidence import CaptureEvidence
 from preprocess.alignment.capture_geometry import CaptureGeometry
-from preprocess.alignment.correction_search import (
-    GOOD_IOU,
-    MIN_FITTED_CHANGE,
-    MIN_FITTED_IOU_GAIN,
-)
+from preprocess.alignment.correction_search import MIN_FITTED_CHANGE, MIN_FITTED_IOU_GAIN
 from preprocess.alignment.corrections import fit_factor, scale_focal_length
 from preprocess.alignment.mask_alignment import (
     ALIGNMENT_SAMPLES,
@@ -25,7 +21,7 @@ from preprocess.alignment.mask_alignment import (
     place_body_on_masks,
     rescale_motion,
 )
-from preprocess.alignment.silhouette_objective import SilhouetteObjective, mean_score
+from preprocess.alignment.silhouette_objective import GOOD_IOU, SilhouetteObjective, mean_score
 from preprocess.body.body_pose import Motion
 from preprocess.body.body_surface import SkinPoints
 from preprocess.body.parametric_body import BodyModel, ShapedBody

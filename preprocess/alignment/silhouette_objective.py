@@ -21,6 +21,10 @@ from preprocess.body.body_surface import (
 from preprocess.masks.mask_files import Masks
 from preprocess.observation import alpha_channel_mask
 
+GOOD_IOU = 0.7
+"""Mean IoU of body and masks from which a capture is good."""
+USABLE_IOU = 0.5
+"""Mean IoU below which a capture cannot be trained on."""
 SAMPLED_FRAMES = 16
 """Number of frames that are sampled."""
 COARSE_MASK_PX = 256.0
