@@ -1,48 +1,46 @@
-"""Find, open and align the parts of a capture, and describe what was assumed on the way."""
+"""Find, open and align the parts of a capture, and describe what was assumed on the way.
+
+Of a stream that comes without poses, the person is tracked while its frames come.
+"""
 
 import shlex
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 from capture.camera_device import camera_address
 from capture.input_error import InputError
-from capture.source import FrameSource, PacingClock, TransposedSource
+from capture.source import FrameSource, PacingClock, RealtimePlayback, TransposedSource
 from capture.source_opening import open_live_source, open_source
 from capture.video import VideoFile
 from preprocess.alignment.capture_alignment import (
     BodyAlignment,
-    align_body,
-    align_to_person,
     estimate_focal_length,
-    is_same_person,
-    needs_placement,
+    fit_live_person,
+    fit_person,
     place_motion,
 )
 from preprocess.alignment.capture_evidence import CaptureEvidence
-from preprocess.alignment.mask_alignment import (
-    LiveAlignment,
-    body_height_m,
-    rescale_motion,
-    scale_to_height,
-)
 from preprocess.body.body_pose import Motion
 from preprocess.body.parametric_body import ShapedBody, load_body_model, read_shaped_body
 from preprocess.body.proportion_space import shape_for_motion
 from preprocess.cameras.camera_file import CameraTrack, assume_static_camera
-from preprocess.cameras.camera_orientation import read_upright_cameras
+from preprocess.cameras.camera_orientation import assume_camera, read_upright_cameras
 from preprocess.capture_paths import (
     CapturePaths,
     MaskOrigin,
     choose_mask_origin,
     find_capture_paths,
     find_live_capture_paths,
+    find_own_masks,
+    find_stream_cameras,
 )
 from preprocess.capture_session import Capture, CaptureInputs
-from preprocess.live_inputs import LiveInputs
+from preprocess.live_inputs import LiveInputs, LiveMasks, check_mask_folder
 from preprocess.masks.mask_files import Masks, open_masks, open_tracker_masks
 from preprocess.masks.mask_refinement import GivenMaskRefiner
-from preprocess.plugins import Segmenter, make_segmenter, segmenter_name
+from preprocess.observation import alpha_channel_mask, associate_masks
+from preprocess.plugins import PersonTracker, Segmenter, make_segmenter, segmenter_name
 from preprocess.poses.motion_builder import place_in_camera_world
 from preprocess.poses.plausibility import (
     lost_pose_warnings,
@@ -50,6 +48,8 @@ from preprocess.poses.plausibility import (
     require_plausible,
 )
 from preprocess.poses.pose_format_registry import read_poses
+from preprocess.tracked_stream import LiveTracking, MaskReader, TrackedStream
+from preprocess.tracking.video_tracking import MaskRefinement
 
 
 def describe_capture(
@@ -105,85 +105,6 @@ def describe_capture(
     elif fit.description:
         yield fit.description
     yield from lost_pose_warnings(motion)
-
-
-HEIGHT_TOLERANCE_CM = 1.5
-"""Largest difference between a stated height and the avatar's own, centimetres."""
-
-LIVE_FIT_NOTE = "Distance and place are fitted to the {} as they come."
-"""Note about a live source whose poses are fitted to masks or images."""
-
-
-def fit_person(
-    motion: Motion,
-    shaped: ShapedBody,
-    evidence: CaptureEvidence,
-    *,
-    avatar_body: Path | None,
-    height_m: float | None,
-) -> BodyAlignment:
-    """The body, and the poses for it.
-
-    Args:
-        motion: In the cameras' world, for the body `shaped`.
-        shaped: As the poses' tracker had it in mind.
-        evidence: Frames, masks and cameras.
-        avatar_body: File of a finished avatar's person, if these poses are added to one.
-        height_m: Stated height of the person, metres.
-
-    Raises:
-        InputError: If a stated height cannot be had.
-    """
-    if avatar_body is not None:
-        person = read_shaped_body(avatar_body, shaped.body)
-        _check_height(person, height_m)
-        return align_to_person(motion, shaped, person, evidence)
-    fit = align_body(motion, shaped, evidence)
-    if height_m is None:
-        return fit
-    cameras = evidence.cameras
-    if cameras.is_moving:
-        raise InputError(
-            f"--height-cm contradicts {cameras.source}, whose cameras move through a world of a "
-            "size of its own. Leave one of them out."
-        )
-    taller = scale_to_height(fit.shaped, height_m)
-    moved = rescale_motion(evidence.geometry(fit.motion), fit.shaped, taller)
-    return replace(fit, shaped=taller, motion=moved)
-
-
-def fit_live_person(
-    motion: Motion, shaped: ShapedBody, *, avatar_body: Path | None, has_masks: bool
-) -> tuple[BodyAlignment, LiveAlignment | None]:
-    """Choose the body of a live source, whose masks are yet to come.
-
-    Args:
-        motion: What has come of the poses.
-        shaped: As their tracker had it in mind.
-        avatar_body: See `fit_person`.
-        has_masks: Whether there will be masks that are not estimated.
-
-    Returns:
-        The body, and what fits the poses to it while they come, if that is needed.
-    """
-    person = shaped if avatar_body is None else read_shaped_body(avatar_body, shaped.body)
-    foreign = needs_placement(motion, shaped)
-    if not foreign and is_same_person(person, shaped):
-        return BodyAlignment(shaped=person, motion=motion), None
-    words = LIVE_FIT_NOTE.format("masks" if has_masks else "pictures")
-    fit = BodyAlignment(shaped=person, motion=motion, description=words)
-    return fit, LiveAlignment(person, motion.body_model, masked=has_masks)
-
-
-def _check_height(person: ShapedBody, height_m: float | None) -> None:
-    """Raises if a stated height is not the avatar's."""
-    height_cm = 100.0 * body_height_m(person)
-    if height_m is not None and abs(100.0 * height_m - height_cm) > HEIGHT_TOLERANCE_CM:
-        raise InputError(
-            f"--height-cm is {100.0 * height_m:.0f}, but the avatar in --out is {height_cm:.0f} cm "
-            "tall, which was settled by its first video. Leave it out, or train it from the start "
-            "(--overwrite)."
-        )
 
 
 def open_capture(
@@ -343,3 +264,94 @@ def _read_or_assume_cameras(
     if paths.cameras is not None:
         return read_upright_cameras(paths.cameras, source)
     return assume_static_camera(motion, source.size_px)
+
+
+def open_tracked_stream(
+    wanted: CaptureInputs,
+    tracker: PersonTracker,
+    make_refinement: Callable[[tuple[int, int]], MaskRefinement],
+    poses: Path,
+    *,
+    avatar_body: Path | None = None,
+) -> Capture:
+    """Open a live source, or a recording that is played at its own speed, and find the person.
+
+    Masks that are named, lie beside the video or are the pictures' alpha channel are learnt from;
+    only without any are the tracker's.
+
+    Args:
+        wanted: What the user named; without poses.
+        tracker: Follows the person.
+        make_refinement: From the frames' width and height to what makes masks from the tracker's.
+        poses: File to which the poses will be written in the end.
+        avatar_body: File of a finished avatar's person, who is filmed again.
+
+    Raises:
+        InputError: If it cannot be read, or no person is found in it.
+    """
+    if wanted.cameras == "solve" or wanted.height_m is not None:
+        raise InputError(
+            "--cameras solve and --height-cm need the poses of the whole recording. Run ia-track "
+            "first, and give its poses; or leave out --realtime."
+        )
+    pace = PacingClock()
+    source = _open_stream_source(wanted, pace)
+    choice, given = _open_stream_masks(wanted, source, pace)
+    stream = TrackedStream(source)
+    tracking = LiveTracking(stream, tracker, make_refinement(stream.size_px), given)
+    shaped = load_body_model(wanted.body).with_shape()
+    if avatar_body is not None:
+        shaped = read_shaped_body(avatar_body, shaped.body)
+    found = tracking.start(
+        shaped,
+        assume_camera(wanted.video, wanted.cameras, stream),
+        fixed_body=avatar_body is not None,
+        stated_focal=find_stream_cameras(wanted.video, wanted.cameras) is not None,
+    )
+    segment, notes = None, ()
+    if not choice.is_fallback:
+        fit = BodyAlignment(shaped=found.shaped, motion=found.motion)
+        notes = tuple(describe_capture(fit, None, found.cameras, choice))
+        if choice.segmenter is not None:
+            segment = make_segmenter(choice.segmenter, found.shaped)
+    return Capture(
+        paths=CapturePaths(video=wanted.video, poses=poses, masks=choice.path, cameras=None),
+        source=stream,
+        motion=found.motion,
+        masks=None,
+        cameras=found.cameras,
+        shaped=found.shaped,
+        size_px=None,
+        notes=notes,
+        live=tracking, segment=segment, mask_refiner=make_mask_refiner(wanted),
+    )  # fmt: skip
+
+
+def _open_stream_masks(
+    wanted: CaptureInputs, source: FrameSource, pace: PacingClock
+) -> tuple[MaskOrigin, MaskReader | None]:
+    """Which masks are used, and what reads them; a fallback means the tracker's.
+
+    Raises:
+        InputError: If masks that were named cannot be used.
+    """
+    camera = camera_address(wanted.video)
+    choice = choose_mask_origin(
+        wanted.masks, find_own_masks(wanted.video), has_alpha=source.has_alpha
+    )
+    source.has_alpha = choice.uses_alpha_channel
+    if choice.path is None:
+        return choice, alpha_channel_mask if choice.uses_alpha_channel else None
+    if wanted.live or camera is not None:
+        check_mask_folder(wanted.masks)
+        return choice, LiveMasks(choice.path, pace, invert=wanted.invert_masks).wait_for_mask
+    stored = open_masks(choice.path, invert=wanted.invert_masks)
+    row = associate_masks(stored, source)
+    return choice, lambda frame, size_px: stored.alpha(row(frame.index), size_px)
+
+
+def _open_stream_source(wanted: CaptureInputs, pace: PacingClock) -> FrameSource:
+    camera = camera_address(wanted.video)
+    if wanted.live or camera is not None:
+        return open_live_source(wanted.video, camera, wanted.frames, pace, idle_s=wanted.idle_s)
+    return RealtimePlayback(open_source(wanted.video, frames=wanted.frames), pace)

@@ -67,7 +67,7 @@ def make_segmenter(name: str, shaped: ShapedBody) -> Segmenter:
         InputError: If no package registers that name, or its segmenter cannot be loaded.
     """
     if name == DEFAULT_SEGMENTER:
-        from preprocess.tracking.blazepose_segmenter import BlazePoseSegmenter
+        from preprocess.tracking.blazepose import BlazePoseSegmenter
 
         return BlazePoseSegmenter(shaped)
     option = f"--masks {SEGMENTER_PREFIX}{name}"
@@ -89,7 +89,7 @@ def make_tracker(name: str = DEFAULT_TRACKER, person: int | None = None) -> Pers
         InputError: If no package registers that name, or its tracker cannot be loaded.
     """
     if name == DEFAULT_TRACKER:
-        from preprocess.tracking.blazepose_tracker import BlazePoseTracker
+        from preprocess.tracking.blazepose import BlazePoseTracker
 
         return BlazePoseTracker(person=person)
     return _make_registered(

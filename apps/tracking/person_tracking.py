@@ -29,8 +29,7 @@ from preprocess.fitting.capture_fitting import fit_capture, fitted_motion
 from preprocess.masks.mask_files import open_masks
 from preprocess.masks.mask_refinement import MaskRefiner
 from preprocess.observation import associate_cameras, associate_masks
-from preprocess.open_capture import open_capture
-from preprocess.open_stream import open_tracked_stream
+from preprocess.open_capture import open_capture, open_tracked_stream
 from preprocess.plugins import DEFAULT_TRACKER, PersonTracker, make_tracker, segmenter_name
 from preprocess.poses.pose_file import read_motion, write_motion
 from preprocess.tracking.keypoints import KeypointTrack

@@ -7,9 +7,11 @@ that are estimated. Where a file does not state the body model of its poses, the
 """
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
+from capture.input_error import InputError
 from preprocess.alignment.capture_evidence import CaptureEvidence
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.correction_search import MIN_FITTED_CHANGE, MIN_FITTED_IOU_GAIN
@@ -17,14 +19,16 @@ from preprocess.alignment.corrections import fit_factor, scale_focal_length
 from preprocess.alignment.mask_alignment import (
     ALIGNMENT_SAMPLES,
     BodyPlacement,
+    LiveAlignment,
     body_height_m,
     place_body_on_masks,
     rescale_motion,
+    scale_to_height,
 )
 from preprocess.alignment.silhouette_objective import GOOD_IOU, SilhouetteObjective, mean_score
 from preprocess.body.body_pose import Motion
 from preprocess.body.body_surface import SkinPoints
-from preprocess.body.parametric_body import BodyModel, ShapedBody
+from preprocess.body.parametric_body import BodyModel, ShapedBody, read_shaped_body
 from preprocess.body.proportion_space import shape_for_motion
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.poses.motion_builder import place_in_camera_world
@@ -33,6 +37,10 @@ FOCAL_SAMPLES = 6
 """Frames to whose masks a focal length is fitted."""
 MIN_FOCAL_IOU = 0.6
 """Mean IoU of body and masks from which a fitted focal length is taken."""
+HEIGHT_TOLERANCE_CM = 1.5
+"""Largest difference between a stated height and the avatar's own, centimetres."""
+LIVE_FIT_NOTE = "Distance and place are fitted to the {} as they come."
+"""Note about a live source whose poses are fitted to masks or images."""
 
 
 def estimate_focal_length(
@@ -261,3 +269,75 @@ def _smpl_fits_masks(own: PosedPerson, smpl: PosedPerson, evidence: CaptureEvide
     if after < before + MIN_SMPL_IOU_GAIN:
         return None
     return f"whose mean IoU with the masks is {after:.2f}, not {before:.2f}"
+
+
+def fit_person(
+    motion: Motion,
+    shaped: ShapedBody,
+    evidence: CaptureEvidence,
+    *,
+    avatar_body: Path | None,
+    height_m: float | None,
+) -> BodyAlignment:
+    """The body, and the poses for it.
+
+    Args:
+        motion: In the cameras' world, for the body `shaped`.
+        shaped: As the poses' tracker had it in mind.
+        evidence: Frames, masks and cameras.
+        avatar_body: File of a finished avatar's person, if these poses are added to one.
+        height_m: Stated height of the person, metres.
+
+    Raises:
+        InputError: If a stated height cannot be had.
+    """
+    if avatar_body is not None:
+        person = read_shaped_body(avatar_body, shaped.body)
+        _check_height(person, height_m)
+        return align_to_person(motion, shaped, person, evidence)
+    fit = align_body(motion, shaped, evidence)
+    if height_m is None:
+        return fit
+    cameras = evidence.cameras
+    if cameras.is_moving:
+        raise InputError(
+            f"--height-cm contradicts {cameras.source}, whose cameras move through a world of a "
+            "size of its own. Leave one of them out."
+        )
+    taller = scale_to_height(fit.shaped, height_m)
+    moved = rescale_motion(evidence.geometry(fit.motion), fit.shaped, taller)
+    return replace(fit, shaped=taller, motion=moved)
+
+
+def fit_live_person(
+    motion: Motion, shaped: ShapedBody, *, avatar_body: Path | None, has_masks: bool
+) -> tuple[BodyAlignment, LiveAlignment | None]:
+    """Choose the body of a live source, whose masks are yet to come.
+
+    Args:
+        motion: What has come of the poses.
+        shaped: As their tracker had it in mind.
+        avatar_body: See `fit_person`.
+        has_masks: Whether there will be masks that are not estimated.
+
+    Returns:
+        The body, and what fits the poses to it while they come, if that is needed.
+    """
+    person = shaped if avatar_body is None else read_shaped_body(avatar_body, shaped.body)
+    foreign = needs_placement(motion, shaped)
+    if not foreign and is_same_person(person, shaped):
+        return BodyAlignment(shaped=person, motion=motion), None
+    words = LIVE_FIT_NOTE.format("masks" if has_masks else "pictures")
+    fit = BodyAlignment(shaped=person, motion=motion, description=words)
+    return fit, LiveAlignment(person, motion.body_model, masked=has_masks)
+
+
+def _check_height(person: ShapedBody, height_m: float | None) -> None:
+    """Raises if a stated height is not the avatar's."""
+    height_cm = 100.0 * body_height_m(person)
+    if height_m is not None and abs(100.0 * height_m - height_cm) > HEIGHT_TOLERANCE_CM:
+        raise InputError(
+            f"--height-cm is {100.0 * height_m:.0f}, but the avatar in --out is {height_cm:.0f} cm "
+            "tall, which was settled by its first video. Leave it out, or train it from the start "
+            "(--overwrite)."
+        )

@@ -5,8 +5,7 @@ import pytest
 from capture.input_error import InputError
 from preprocess import plugins
 from preprocess.plugins import PersonTracker, make_segmenter, make_tracker, segmenter_name
-from preprocess.tracking.blazepose_segmenter import BlazePoseSegmenter
-from preprocess.tracking.blazepose_tracker import BlazePoseTracker
+from preprocess.tracking.blazepose import BlazePoseSegmenter, BlazePoseTracker
 
 
 class FakeEntryPoint:

@@ -17,7 +17,7 @@ from preprocess.cameras.camera_orientation import assume_camera
 from preprocess.capture_session import CaptureInputs
 from preprocess.fitting.tracked_frames import LAG_FRAMES, EarlierPoses
 from preprocess.observation import DroppedFrame, Observation
-from preprocess.open_stream import open_tracked_stream
+from preprocess.open_capture import open_tracked_stream
 from preprocess.tracked_stream import NOT_FOUND, LiveTracking, TrackedStream
 from preprocess.tracking.keypoints import CroppedMask, PersonKeypoints
 

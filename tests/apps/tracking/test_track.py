@@ -18,7 +18,7 @@ from preprocess.capture_session import CaptureInputs
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
 from preprocess.poses.pose_file import read_motion
-from preprocess.tracking.blazepose_tracker import BlazePoseTracker
+from preprocess.tracking.blazepose import BlazePoseTracker
 
 
 @pytest.fixture(scope="module")

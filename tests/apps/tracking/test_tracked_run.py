@@ -23,7 +23,7 @@ from preprocess.capture_session import CaptureInputs
 from preprocess.fitting import tracked_frames
 from preprocess.masks.mask_refinement import MaskRefiner
 from preprocess.poses.pose_file import read_motion
-from preprocess.tracking.blazepose_tracker import BlazePoseTracker
+from preprocess.tracking.blazepose import BlazePoseTracker
 from tests.apps.conftest import Outcome
 
 

@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from preprocess.masks.given_mask_refinement import GivenMaskRefiner
-from preprocess.masks.mask_refinement import MaskRefiner
+from preprocess.masks.mask_refinement import GivenMaskRefiner, MaskRefiner
 from preprocess.tracking.keypoints import CroppedMask
 
 SIZE_PX = 160, 240

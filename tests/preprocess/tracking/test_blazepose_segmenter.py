@@ -10,7 +10,7 @@ from capture.input_error import InputError
 from capture.source import Frame
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.body_surface import soft_iou
-from preprocess.tracking.blazepose_segmenter import (
+from preprocess.tracking.blazepose import (
     MAX_CLOTHING_M,
     BlazePoseSegmenter,
     _limit_to_body,

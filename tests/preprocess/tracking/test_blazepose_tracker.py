@@ -1,4 +1,4 @@
-"""Tests of `preprocess/tracking/blazepose_*.py`: the real networks on the studio's actors."""
+"""Tests of `preprocess/tracking/blazepose.py`: the real networks on the studio's actors."""
 
 from dataclasses import dataclass, replace
 
@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from preprocess.tracking.blazepose import BlazePoseTracker, LastPlace
 from preprocess.tracking.blazepose_networks import (
     BlazePoseDetector,
     PersonDetection,
@@ -15,7 +16,6 @@ from preprocess.tracking.blazepose_networks import (
     parts_of_frame,
     refine,
 )
-from preprocess.tracking.blazepose_tracker import BlazePoseTracker, LastPlace
 from preprocess.tracking.video_tracking import ProblemFinder, TrackingProblem
 from studio import actor_motions
 from studio.actor import Actor
