@@ -24,22 +24,18 @@ REDUCTION = 3
 """Reduction of the image from which colors are learnt."""
 COLOR_SPREAD = 9.0
 """Standard deviation, in levels, that is added to each color's own."""
-UNSEEN_BACKGROUND = 0.00025
-"""Least density of a color where the background is known (`color_density`)."""
-SHADOW_GAIN = 0.6, 1.05
-"""Range of the factors by which the person's shadow and reflected light change the background."""
-SHADOW_PROBABILITY = 0.1
-"""Probability that a background pixel is shaded or lit by the person."""
 ANYWHERE = 0.1
 """Weight of the colors of the whole person, or background, beside those nearby."""
 UNSEEN = 0.02
 """Density of a color that neither has, relative to `REFERENCE_SPREAD`."""
 REFERENCE_SPREAD = 16.0
 """Standard deviation, in levels, at whose peak a density is 1."""
-
-ONE = np.float32(1.0)
-Pixels = Float32[np.ndarray, "pixels"]
-Numbers = Int[np.ndarray, "pixels"]
+UNSEEN_BACKGROUND = 0.00025
+"""Least density of a color where the background is known (`color_density`)."""
+SHADOW_GAIN = 0.6, 1.05
+"""Range of the factors by which the person's shadow and reflected light change the background."""
+SHADOW_PROBABILITY = 0.1
+"""Probability that a background pixel is shaded or lit by the person."""
 MEMORY_FRAMES = 30.0
 """Length of the running mean, frames."""
 MIN_SEEN_FRAMES = 2.0
@@ -68,6 +64,9 @@ MAX_UNLIKE_FRACTION = 0.2
 MIN_KNOWN_FRACTION = 0.7
 """Least fraction of a window that must be known."""
 
+ONE = np.float32(1.0)
+Pixels = Float32[np.ndarray, "pixels"]
+Numbers = Int[np.ndarray, "pixels"]
 PixelMask = Bool[np.ndarray, "height width"]
 DARK_LEVEL, BRIGHT_LEVEL = 80.0, 180.0
 """Level of the brightest pixels (2 %) below which a film is brightened, and the level after it."""
