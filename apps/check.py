@@ -28,7 +28,7 @@ from apps.cli.shared_options import (
 )
 from apps.contact_sheet import write_contact_sheet
 from apps.corrected_capture import check_new_or_empty, write_corrected_capture
-from apps.tracking.person_tracking import (
+from apps.run.person_tracking import (
     grade_capture,
     needs_tracking,
     print_grade,

@@ -17,10 +17,9 @@ from apps.cli.command_line import (
     run_command,
 )
 from apps.cli.console import Console
-from apps.run.camera_solving import start_camera_solving
 from apps.run.ingest_arguments import PROGRAM, VIEW_PORT, IngestArguments
+from apps.run.missing_inputs import read_tracking_report, start_camera_solving, track_missing_poses
 from apps.run.run_folder import RunFolder
-from apps.tracking.tracked_run import read_tracking_report, track_missing_poses
 from capture.atomic_files import write_text_atomically
 from capture.input_error import InputError
 from preprocess.capture_session import Capture

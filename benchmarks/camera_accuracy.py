@@ -21,7 +21,7 @@ from rich.console import Console as RichConsole
 from scipy.spatial.transform import Rotation
 
 from apps.cli.console import Console
-from apps.run.camera_solving import apply_camera_solution
+from apps.run.missing_inputs import apply_camera_solution
 from apps.run.solver_process import SolveJob, SolverProcess
 from benchmarks.hardware import Hardware
 from capture.camera import Camera

@@ -15,7 +15,7 @@ from typing import Any, final
 
 import cv2
 
-from apps.tracking.person_tracking import fit_tracked_video
+from apps.run.person_tracking import fit_tracked_video
 from capture.source_opening import open_source
 from preprocess.capture_session import CaptureInputs
 from preprocess.masks.mask_refinement import MaskRefiner

@@ -13,8 +13,8 @@ from jaxtyping import Float32
 
 from apps.evaluation.frame_scoring import BACKGROUNDS, PremultipliedImage
 from apps.run.ingest_arguments import IngestArguments, trainable_longer_side_px
+from apps.run.missing_inputs import read_tracked_poses
 from apps.run.run_folder import RunFolder
-from apps.tracking.tracked_run import read_tracked_poses
 from capture.image_folder import any_has_cutout_alpha, list_images, read_image
 from capture.input_error import InputError
 from capture.source import FrameSource

@@ -10,9 +10,9 @@ from typing import Annotated, Any, Literal
 from tyro.conf import Positional, arg
 
 from apps.cli.shared_options import CaptureArguments, Flag, capture_name, check_output_file
+from apps.run.person_tracking import needs_stream_tracking, open_stream
 from apps.run.run_folder import RunFolder, is_run_report
 from apps.run.solver_process import SolveJob
-from apps.tracking.person_tracking import needs_stream_tracking, open_stream
 from avatar.config import HELD_OUT_STRIDE, NOMINAL_STEPS_PER_S
 from capture.camera_device import camera_address
 from capture.input_error import InputError

@@ -14,10 +14,10 @@ from apps.cli.console import Console, format_duration
 from apps.cli.hardware import usable_cores
 from apps.run.final_scoring import SCORING_LIMIT_S, EarlierVideos
 from apps.run.ingest_arguments import PROGRAM, IngestArguments
+from apps.run.missing_inputs import remove_unused_tracking
 from apps.run.run_folder import RunFolder
 from apps.run.run_timing import expected_held_out, post_training_seconds
 from apps.run.training_session import TrainingSession
-from apps.tracking.tracked_run import remove_unused_tracking
 from avatar.backends import backend_for
 from avatar.config import HELD_OUT_STRIDE, TrainConfig
 from avatar.evaluation.held_out import MAX_HELD_OUT

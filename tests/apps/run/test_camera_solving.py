@@ -19,7 +19,7 @@ from rich.console import Console as RichConsole
 from apps.cli.command_line import CommandExit
 from apps.cli.console import Console
 from apps.run import solver_process
-from apps.run.camera_solving import CameraSolving, apply_camera_solution
+from apps.run.missing_inputs import CameraSolving, apply_camera_solution
 from apps.run.run_folder import RunFolder
 from apps.run.solver_process import SolveJob, SolverProcess, StageProgress, make_person_mask
 from capture.input_error import InputError

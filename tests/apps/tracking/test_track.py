@@ -10,7 +10,7 @@ import pytest
 
 from apps import check, track
 from apps.cli.console import Console
-from apps.tracking import person_tracking
+from apps.run import person_tracking
 from capture.source_opening import open_source
 from preprocess.body.parametric_body import load_body_model
 from preprocess.body.proportion_space import shape_for_motion

@@ -12,9 +12,9 @@ from PIL import Image
 from apps import ingest
 from apps.cli.console import Console
 from apps.evaluation.evaluation_frames import held_out_frames
+from apps.run import missing_inputs, person_tracking
+from apps.run.person_tracking import open_stream
 from apps.run.run_folder import RunFolder
-from apps.tracking import person_tracking, tracked_run
-from apps.tracking.person_tracking import open_stream
 from avatar.training import train
 from avatar.training.trainer import Trainer
 from capture.input_error import InputError
@@ -71,7 +71,7 @@ def test_a_video_alone_is_tracked_and_learnt(ingest_video, monkeypatch):
     assert read_motion(out / "tracking" / "poses.npz").proportions is not None
     assert "Good enough for an avatar" in (out / "report.html").read_text()
     # a resumed run reads the poses that it has
-    monkeypatch.setattr(tracked_run, "track_person", None)
+    monkeypatch.setattr(missing_inputs, "track_person", None)
     again, _ = ingest_video("--resume", steps=12)
     assert again.code == 0, again.err
     frames = held_out_frames(RunFolder(path=out), None)

@@ -1,1 +1,0 @@
-"""Tracking of the person in a video, for ia-track and ia-ingest."""
