@@ -14,11 +14,11 @@ from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.body_surface import vertex_normals
 from preprocess.body.kinematics import slerp
+from studio import painted_surfaces
 from studio.actor import Actor
 from studio.input_errors import smooth_noise
 from studio.lighting import LAMP_RGB, RenderedFrame, composite_over, lamp_visibility
 from studio.outfit import SHIRT, TROUSERS
-from studio.room import painted_backdrop
 
 WAVES = 4
 SHIRT_M, TROUSERS_M = 0.010, 0.006
@@ -181,7 +181,7 @@ class PhoneScene:
 
     def _behind(self, pose: BodyPose) -> UInt8[np.ndarray, "height width 3"]:
         feet = self.actor.shaped.with_pose(pose).joints()[[10, 11]]
-        return painted_backdrop.add_foot_shadows(self.background, feet, self.camera)
+        return painted_surfaces.add_foot_shadows(self.background, feet, self.camera)
 
 
 def expose(

@@ -23,8 +23,9 @@ from preprocess.body.parametric_body import ShapedBody, load_body_model
 from preprocess.cameras.camera_file import CameraTrack, write_cameras
 from preprocess.poses.pose_file import write_motion
 from preprocess.poses.pose_format_registry import read_poses
-from studio import actor_motions, studio_cameras
+from studio import actor_motions, painted_surfaces, studio_cameras
 from studio.actor import Actor
+from studio.furnished_room import FurnishedRoom
 from studio.input_errors import (
     SegmenterErrors,
     add_mask_noise,
@@ -36,8 +37,6 @@ from studio.input_errors import (
 from studio.lighting import RenderedFrame, composite_over
 from studio.outfit import SUBJECT_PROPORTIONS
 from studio.phone_pictures import MovingCloth, PhoneScene, RoomLight, drifting_exposure, expose
-from studio.room import painted_backdrop
-from studio.room.furnished_room import FurnishedRoom
 from studio.shoot_config import ShootConfig as ShootConfig
 from studio.studio_cameras import portrait_camera, static_camera
 
@@ -87,7 +86,7 @@ def _write_phone_capture(folder: Path, config: ShootConfig, progress: ShootProgr
     """
     actor = Actor.of(config.subject, config.seed, SUBJECT_PROPORTIONS[config.subject])
     camera = portrait_camera(actor, config.size, dances=config.motion == "dance")
-    backdrop = painted_backdrop.paint_backdrop(
+    backdrop = painted_surfaces.paint_backdrop(
         "plain" if config.background == "plain" else "clutter",
         camera,
         np.random.default_rng([config.seed, 4]),
@@ -254,7 +253,7 @@ class StudioScene:
     ) -> UInt8[np.ndarray, "height width 3"]:
         if isinstance(self.background, FurnishedRoom):
             return self.background.render(camera, feet, self.first_frame_number + number)
-        return painted_backdrop.add_foot_shadows(self.background, feet, camera)
+        return painted_surfaces.add_foot_shadows(self.background, feet, camera)
 
 
 def film_capture(
@@ -337,7 +336,7 @@ def _build_scenes(
     if kind == "room" or kind == "tiles":
         behind = FurnishedRoom.furnished(kind, config.size, config.seed)
     else:
-        behind = painted_backdrop.paint_backdrop(
+        behind = painted_surfaces.paint_backdrop(
             kind, apart, np.random.default_rng([config.seed, 4])
         )
     filmed = StudioScene(actor=actor, cameras=cameras, background=behind)

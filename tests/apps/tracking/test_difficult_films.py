@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from apps import track
+from studio import painted_surfaces
 from studio.actor import Actor
 from studio.actor_motions import turning_motion
 from studio.lighting import composite_over
-from studio.room import painted_backdrop
 from studio.studio_cameras import static_camera
 
 FPS = 15.0
@@ -111,7 +111,7 @@ def walk_past_the_plant_and_back():
     """The actor slides out of the picture past a plant, is away for ten frames, and returns."""
     actor = Actor.of(1, 0)
     camera = static_camera(actor, 270)
-    behind = painted_backdrop.paint_backdrop("clutter", camera, np.random.default_rng([0, 4]))
+    behind = painted_surfaces.paint_backdrop("clutter", camera, np.random.default_rng([0, 4]))
     motion = turning_motion(actor, frames=2, fps=FPS, turns=0.02, seed=0)
     drawn = [actor.render_rgb_alpha(motion[row], camera) for row in range(2)]
     out = list(range(20, 160, 20))

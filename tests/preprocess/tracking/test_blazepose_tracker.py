@@ -17,9 +17,8 @@ from preprocess.tracking.blazepose_networks import (
     refine,
 )
 from preprocess.tracking.video_tracking import ProblemFinder, TrackingProblem
-from studio import actor_motions
+from studio import actor_motions, painted_surfaces
 from studio.actor import Actor
-from studio.room import painted_backdrop
 from studio.studio_cameras import portrait_camera
 
 SIZE = (270, 480)
@@ -198,7 +197,7 @@ def test_each_of_two_persons_in_a_wide_picture_can_be_followed(striped, plain, p
     """In this room the detector sees only the one on the right, of the whole picture."""
     camera = portrait_camera(Actor.of(1), SIZE[0])
     camera = replace(camera, size_px=(700, 480), center_px=(350.0, camera.center_px[1]))
-    picture = painted_backdrop.paint_backdrop("clutter", camera, np.random.default_rng([0, 4]))
+    picture = painted_surfaces.paint_backdrop("clutter", camera, np.random.default_rng([0, 4]))
     striped.paste(picture, 0)
     plain.paste(picture, 430)
     found = BlazePoseTracker(person=person)(picture)

@@ -13,8 +13,8 @@ from preprocess.open_capture import open_capture
 from preprocess.poses.pose_file import read_motion
 from studio import actor_motions, studio_cameras
 from studio.actor import Actor
-from studio.room.furnished_room import SENSOR_NOISE, FurnishedRoom
-from studio.room.room_textures import dead_leaves, repeat_motif
+from studio.furnished_room import SENSOR_NOISE, FurnishedRoom
+from studio.painted_surfaces import dead_leaves, repeat_motif
 from studio.shoot import ShootConfig, film_capture
 
 WALK = ShootConfig(frames=6, size=128, motion="walkaround")

@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32, Int64, UInt8
 
 from capture.camera import Camera
-from studio.room.room_raycast import RoomView, TexturedBoxes, raycast_boxes
-from studio.room.room_textures import (
+from studio.painted_surfaces import (
     TexturePainter,
     books,
     dead_leaves,
@@ -19,6 +18,7 @@ from studio.room.room_textures import (
     repeat_motif,
     wood,
 )
+from studio.room_raycast import RoomView, TexturedBoxes, raycast_boxes
 
 RoomStyle = Literal["room", "tiles"]
 

@@ -1,1 +1,0 @@
-"""Backgrounds of the studio: painted backdrops and a furnished room."""
