@@ -33,7 +33,7 @@ from apps.run.run_folder import RunFolder, claim_folder
 from capture.atomic_files import OutputFileList, atomic_file, write_text_atomically
 from capture.camera_device import camera_address
 from capture.input_error import InputError
-from capture.video_encoder import video_encoder
+from capture.video import video_encoder
 from preprocess.body.body_surface import SkinPoints, splat_silhouette
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.observation import Observation, shrink_to_longer_side

@@ -17,7 +17,7 @@ from capture.atomic_files import atomic_folder, check_replaceable_folder
 from capture.camera import Camera
 from capture.image_folder import write_png
 from capture.input_error import InputError
-from capture.video_encoder import lossless_video, video_encoder
+from capture.video import lossless_video, video_encoder
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.parametric_body import ShapedBody, load_body_model
 from preprocess.cameras.camera_file import CameraTrack, write_cameras

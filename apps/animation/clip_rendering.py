@@ -27,7 +27,7 @@ from capture.atomic_files import atomic_file, atomic_folder
 from capture.camera import Camera
 from capture.image_folder import read_image, write_png
 from capture.input_error import InputError
-from capture.video_encoder import ClipEncoder, video_encoder
+from capture.video import ClipEncoder, video_encoder
 from export.player import Player
 from preprocess.body.body_pose import BodyPose, Motion
 

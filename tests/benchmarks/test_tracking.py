@@ -32,7 +32,7 @@ from benchmarks.tracking_scores import (
 from capture.camera import Camera
 from capture.image_folder import write_png
 from capture.source_opening import open_source
-from capture.video_encoder import lossless_video
+from capture.video import lossless_video
 from preprocess.body.body_pose import Motion
 from preprocess.body.body_surface import MeshSilhouette
 from preprocess.cameras.camera_file import CameraTrack, write_cameras

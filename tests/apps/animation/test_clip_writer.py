@@ -13,7 +13,7 @@ from apps.animation.clip_rendering import (
     choose_encoder,
     write_clip,
 )
-from capture import video_encoder
+from capture import video as video_module
 from capture.input_error import InputError
 
 needs_av = pytest.mark.skipif(
@@ -28,7 +28,7 @@ def library(request, monkeypatch):
         if importlib.util.find_spec("av") is None:
             pytest.skip("the extra [video] is not installed")
     else:
-        monkeypatch.setattr(video_encoder, "_pyav_has", lambda codec: False)
+        monkeypatch.setattr(video_module, "_pyav_has", lambda codec: False)
     return request.param
 
 
@@ -115,12 +115,12 @@ def test_a_webm_keeps_soft_alpha(tmp_path):
 
 
 def test_without_the_extra_the_fallback_codec_is_named(monkeypatch, tmp_path):
-    monkeypatch.setattr(video_encoder, "_pyav_has", lambda codec: False)
+    monkeypatch.setattr(video_module, "_pyav_has", lambda codec: False)
     white = background_compositor("white")
     assert "VP8" in choose_encoder(tmp_path / "a.webm", white).description
-    monkeypatch.setattr(video_encoder, "_opencv_has", lambda code: False)
+    monkeypatch.setattr(video_module, "_opencv_has", lambda code: False)
     assert "browsers do not play it" in choose_encoder(tmp_path / "a.mp4", white).description
-    monkeypatch.setattr(video_encoder, "_opencv_has", lambda code: code == "avc1")
+    monkeypatch.setattr(video_module, "_opencv_has", lambda code: code == "avc1")
     assert "H.264" in choose_encoder(tmp_path / "a.mp4", white).description
     with pytest.raises(InputError, match=r"\[video\]"):
         choose_encoder(tmp_path / "a.webm", None)

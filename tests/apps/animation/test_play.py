@@ -17,7 +17,7 @@ from PIL import Image
 from apps import ingest, play
 from apps.animation.driving_motion import FollowingCamera, demo_motion
 from apps.animation.player_checks import package_warnings
-from capture import video_encoder
+from capture import video as video_module
 from capture.atomic_files import LIST_NAME as LIST
 from export import player_page
 from export.package.package_file import read_package, write_package
@@ -81,7 +81,7 @@ def test_frames_replace_frames_but_nothing_else(call_play, package, novel, tmp_p
 @pytest.fixture
 def without_av(monkeypatch):
     """As where the extra [video] is not installed."""
-    monkeypatch.setattr(video_encoder, "_pyav_has", lambda codec: False)
+    monkeypatch.setattr(video_module, "_pyav_has", lambda codec: False)
 
 
 @pytest.mark.parametrize("suffix", [".webm", ".mp4"])
