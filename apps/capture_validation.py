@@ -11,8 +11,8 @@ from jaxtyping import Float32
 from apps.cli.console import Console
 from apps.cli.shared_options import capture_name, format_frame_range, option_words, unused_path
 from capture.camera import same_aspect_ratio
-from capture.camera_device import camera_address
 from capture.input_error import InputError
+from capture.live_sources import camera_address
 from preprocess.alignment.capture_evidence import edge_contrast, sample_video
 from preprocess.alignment.capture_geometry import CaptureGeometry, sanity_warnings
 from preprocess.alignment.correction_search import (

@@ -35,8 +35,8 @@ from apps.run.person_tracking import (
     track_person,
 )
 from capture.atomic_files import write_text_atomically
-from capture.camera_device import camera_address
 from capture.input_error import InputError
+from capture.live_sources import camera_address
 from preprocess.alignment.silhouette_objective import GOOD_IOU, USABLE_IOU
 from preprocess.capture_session import CaptureInputs
 

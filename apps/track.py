@@ -31,8 +31,8 @@ from apps.cli.shared_options import (
 from apps.run.person_tracking import masks_to_use, print_grade, track_person
 from apps.run.run_folder import RunFolder, claim_folder
 from capture.atomic_files import OutputFileList, atomic_file, write_text_atomically
-from capture.camera_device import camera_address
 from capture.input_error import InputError
+from capture.live_sources import camera_address
 from capture.video import video_encoder
 from preprocess.body.body_surface import SkinPoints, splat_silhouette
 from preprocess.capture_session import Capture, CaptureInputs

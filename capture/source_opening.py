@@ -2,12 +2,11 @@
 
 from pathlib import Path
 
-from capture.camera_device import CameraDevice
 from capture.image_folder import IMAGE_SUFFIXES, ImageFolder, list_images
 from capture.input_error import InputError
+from capture.live_sources import CameraDevice, WatchedImageFolder
 from capture.source import FrameSelection, FrameSource, PacingClock
 from capture.video import VIDEO_SUFFIXES, VideoFile
-from capture.watched_image_folder import WatchedImageFolder
 
 HEIC_SUFFIXES = frozenset({".heic", ".heif"})
 """File endings of phone images that OpenCV does not read."""

@@ -4,8 +4,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from capture.camera_device import camera_address
 from capture.input_error import InputError
+from capture.live_sources import camera_address
 from preprocess.plugins import DEFAULT_SEGMENTER, segmenter_name
 
 POSE_FILE_NAMES = [

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from capture.camera import Camera
-from capture.camera_device import camera_address
 from capture.input_error import InputError
+from capture.live_sources import IDLE_TIMEOUT_S, camera_address
 from capture.source import Frame, FrameSource, PacingClock, RealtimePlayback
-from capture.watched_image_folder import IDLE_TIMEOUT_S
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.mask_alignment import BodyPlacement, LiveAlignment
 from preprocess.body.body_pose import BodyPose, Motion

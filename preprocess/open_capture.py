@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from capture.camera_device import camera_address
 from capture.input_error import InputError
+from capture.live_sources import camera_address
 from capture.source import FrameSource, PacingClock, RealtimePlayback, TransposedSource
 from capture.source_opening import open_live_source, open_source
 from capture.video import VideoFile

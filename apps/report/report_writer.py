@@ -37,7 +37,7 @@ from avatar.evaluation.image_metrics import (
     overall_verdict,
 )
 from capture.atomic_files import write_text_atomically
-from capture.camera_device import camera_address
+from capture.live_sources import camera_address
 from capture.process_metrics import peak_memory_mb
 from export.player import Player
 from preprocess.body.body_pose import Motion

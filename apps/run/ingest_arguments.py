@@ -14,9 +14,8 @@ from apps.run.person_tracking import needs_stream_tracking, open_stream
 from apps.run.run_folder import RunFolder, is_run_report
 from apps.run.solver_process import SolveJob
 from avatar.config import HELD_OUT_STRIDE, NOMINAL_STEPS_PER_S
-from capture.camera_device import camera_address
 from capture.input_error import InputError
-from capture.watched_image_folder import IDLE_TIMEOUT_S
+from capture.live_sources import IDLE_TIMEOUT_S, camera_address
 from preprocess.alignment.mask_alignment import MAX_HEIGHT_CM, MIN_HEIGHT_CM
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.fitting.clip_fitting import load_capture_fit

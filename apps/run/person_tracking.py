@@ -13,8 +13,8 @@ import numpy as np
 
 from apps.cli.console import Console
 from capture.atomic_files import OutputFileList, atomic_file, atomic_folder
-from capture.camera_device import camera_address
 from capture.input_error import InputError
+from capture.live_sources import camera_address
 from capture.source import FrameSource
 from capture.source_opening import open_source
 from preprocess.alignment.capture_geometry import CaptureGeometry

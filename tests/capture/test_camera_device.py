@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from capture import camera_device
-from capture.camera_device import MAX_QUEUED_FRAMES, CameraDevice, camera_address
+from capture import live_sources
 from capture.input_error import InputError
+from capture.live_sources import MAX_QUEUED_FRAMES, CameraDevice, camera_address
 from capture.source import FrameSelection, PacingClock
 
 
@@ -74,7 +74,7 @@ def test_a_file_comes_like_a_camera_at_its_own_pace(write_video):
 
 
 def test_a_late_reader_gets_the_newest_frames_and_a_drop_count(monkeypatch):
-    monkeypatch.setattr(camera_device, "_open_device", lambda address: Quick(500))
+    monkeypatch.setattr(live_sources, "_open_device", lambda address: Quick(500))
     source = CameraDevice("0", FrameSelection(), PacingClock())
     frames = source.frames()
     first = next(frames)
@@ -91,7 +91,7 @@ def test_a_late_reader_gets_the_newest_frames_and_a_drop_count(monkeypatch):
 
 
 def test_an_unplugged_camera_ends_the_stream_and_says_so(monkeypatch):
-    monkeypatch.setattr(camera_device, "_open_device", lambda address: Quick(5))
+    monkeypatch.setattr(live_sources, "_open_device", lambda address: Quick(5))
     source = CameraDevice("0", FrameSelection(), PacingClock())
     assert [frame.index for frame in source.frames()] == [0, 1, 2, 3, 4]
     (warning,) = source.warnings
@@ -100,7 +100,7 @@ def test_an_unplugged_camera_ends_the_stream_and_says_so(monkeypatch):
 
 
 def test_a_selection_ends_a_camera_too(monkeypatch):
-    monkeypatch.setattr(camera_device, "_open_device", lambda address: Quick(12))
+    monkeypatch.setattr(live_sources, "_open_device", lambda address: Quick(12))
     source = CameraDevice("0", FrameSelection(start=2, stop=9, step=3), PacingClock())
     assert [frame.index for frame in source.frames()] == [2, 5, 8]
     source.close()
@@ -114,7 +114,7 @@ def test_closing_wakes_who_waits_and_lets_the_camera_go(monkeypatch):
             return super().grab()
 
     device, pace = Slow(1000), PacingClock()
-    monkeypatch.setattr(camera_device, "_open_device", lambda address: device)
+    monkeypatch.setattr(live_sources, "_open_device", lambda address: device)
     source = CameraDevice("0", FrameSelection(), pace)
     frames = source.frames()
     next(frames)
@@ -134,7 +134,7 @@ def test_a_camera_that_is_not_there_is_refused_with_those_that_are(capfd):
 
 def test_a_camera_that_gives_no_picture_is_busy(monkeypatch):
     device = Quick(0)
-    monkeypatch.setattr(camera_device, "_open_device", lambda address: device)
+    monkeypatch.setattr(live_sources, "_open_device", lambda address: device)
     with pytest.raises(OSError, match="no picture") as caught:
         CameraDevice("0", FrameSelection(), PacingClock())
     assert caught.value.errno == errno.EBUSY
@@ -152,10 +152,10 @@ def test_a_device_that_is_there_and_cannot_be_opened_is_busy(monkeypatch):
     monkeypatch.setattr(cv2, "VideoCapture", lambda address: Closed())
     monkeypatch.setattr(Path, "exists", lambda path: True)
     monkeypatch.setattr(Path, "is_char_device", lambda path: True)
-    monkeypatch.setattr(camera_device.os, "access", lambda path, mode: True)
+    monkeypatch.setattr(live_sources.os, "access", lambda path, mode: True)
     with pytest.raises(OSError, match="another program") as caught:
         CameraDevice("0", FrameSelection(), PacingClock())
     assert caught.value.errno == errno.EBUSY
-    monkeypatch.setattr(camera_device.os, "access", lambda path, mode: False)
+    monkeypatch.setattr(live_sources.os, "access", lambda path, mode: False)
     with pytest.raises(PermissionError):
         CameraDevice("0", FrameSelection(), PacingClock())

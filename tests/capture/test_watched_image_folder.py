@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
-from capture import watched_image_folder
+from capture import live_sources
 from capture.input_error import InputError
+from capture.live_sources import WatchedImageFolder
 from capture.source import FrameSelection, PacingClock
-from capture.watched_image_folder import WatchedImageFolder
 
 
 def picture(index):
@@ -104,7 +104,7 @@ def test_a_half_written_picture_is_waited_for(tmp_path):
 
 
 def test_a_picture_that_stays_damaged_is_left_out_and_told(tmp_path, monkeypatch):
-    monkeypatch.setattr(watched_image_folder, "DAMAGED_AFTER_S", 0.1)
+    monkeypatch.setattr(live_sources, "DAMAGED_AFTER_S", 0.1)
     for index in range(3):
         write(tmp_path, index, content=(lambda data: data[:30]) if index == 1 else None)
     source = watch(tmp_path, idle_s=0.1)
@@ -122,10 +122,10 @@ def test_who_comes_late_gets_an_even_choice_with_the_newest(tmp_path):
     for index in range(1, 51):
         write(tmp_path, index)
     rest = [frame.index for frame in frames]
-    assert len(rest) == watched_image_folder.MAX_PENDING
+    assert len(rest) == live_sources.MAX_PENDING
     assert (rest[0], rest[-1]) == (1, 50)
     assert set(np.diff(rest)) == {7}
-    assert source.dropped == 50 - watched_image_folder.MAX_PENDING
+    assert source.dropped == 50 - live_sources.MAX_PENDING
 
 
 def test_what_was_there_before_is_not_lost(tmp_path):

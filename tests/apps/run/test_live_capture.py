@@ -12,7 +12,7 @@ import pytest
 from apps import ingest
 from avatar.training import train
 from avatar.training.train import warm_up
-from capture import camera_device
+from capture import live_sources
 from capture.source_opening import open_source
 
 FRAMES = 14
@@ -112,7 +112,7 @@ def test_a_camera_that_another_program_uses(call_ingest, film, tmp_path, monkeyp
     def busy(address):
         raise OSError(errno.EBUSY, "another program may be using it", "/dev/video0")
 
-    monkeypatch.setattr(camera_device, "_open_device", busy)
+    monkeypatch.setattr(live_sources, "_open_device", busy)
     outcome = call_ingest("camera:0", "--poses", film / "poses.npz", "--out", tmp_path / "run")
     assert outcome.code == 3
     assert "busy" in outcome.complaint()
