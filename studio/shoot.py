@@ -23,7 +23,7 @@ from preprocess.body.parametric_body import ShapedBody, load_body_model
 from preprocess.cameras.camera_file import CameraTrack, write_cameras
 from preprocess.poses.pose_file import write_motion
 from preprocess.poses.pose_format_registry import read_poses
-from studio import actor_motions, painted_surfaces, studio_cameras
+from studio import painted_surfaces, staging
 from studio.actor import Actor
 from studio.furnished_room import FurnishedRoom
 from studio.input_errors import (
@@ -38,7 +38,7 @@ from studio.lighting import RenderedFrame, composite_over
 from studio.outfit import SUBJECT_PROPORTIONS
 from studio.phone_pictures import MovingCloth, PhoneScene, RoomLight, drifting_exposure, expose
 from studio.shoot_config import ShootConfig as ShootConfig
-from studio.studio_cameras import portrait_camera, static_camera
+from studio.staging import portrait_camera, static_camera
 
 ShootProgress = Callable[[int, int], None]
 """Called after each picture with how many are done and how many there will be."""
@@ -100,7 +100,7 @@ def _write_phone_capture(folder: Path, config: ShootConfig, progress: ShootProgr
         fps=config.fps,
     )
     truth = _choose_motion(actor, config)
-    novel = actor_motions.novel_poses(actor)
+    novel = staging.novel_poses(actor)
     total = len(truth) + len(novel)
     _film(folder, scene, truth, config, lambda done: progress(done, total))
     stills = draw_ahead(lambda row: scene.still(novel[row]), len(novel))
@@ -111,19 +111,19 @@ def _write_phone_capture(folder: Path, config: ShootConfig, progress: ShootProgr
     _write_body(folder / "truth" / "body.npz", actor.shaped)
     write_motion(folder / "truth" / "poses.npz", truth)
     _write_track(folder / "truth" / "cameras.npz", camera)
-    write_motion(folder / "dance.npz", actor_motions.unfilmed_dance(actor))
+    write_motion(folder / "dance.npz", staging.unfilmed_dance(actor))
     _write_inputs(folder, scene, truth, config)
 
 
 def _choose_motion(actor: Actor, config: ShootConfig) -> Motion:
     if config.track is not None:
         track = read_poses(config.track)
-        return actor_motions.tracked_motion(actor, track, frames=config.frames, fps=config.fps)
+        return staging.tracked_motion(actor, track, frames=config.frames, fps=config.fps)
     turns = WALK_TURNS if config.camera_moves else TURNS
     acts = {
-        "turn": actor_motions.turning_motion,
-        "dance": actor_motions.dancing_motion,
-        "walkaround": actor_motions.gesturing_motion,
+        "turn": staging.turning_motion,
+        "dance": staging.dancing_motion,
+        "walkaround": staging.gesturing_motion,
     }
     if config.like_a_phone:
         turns = PHONE_TURNS
@@ -293,7 +293,7 @@ def _write_capture(folder: Path, config: ShootConfig, progress: ShootProgress) -
     actor = Actor.of(config.subject, config.seed)
     truth = _choose_motion(actor, config)
     stages = _build_scenes(actor, truth, config)
-    novel = actor_motions.novel_poses(actor)
+    novel = staging.novel_poses(actor)
     total = len(truth) + len(novel)
     _write_video(folder, stages[0], truth, config, lambda done: progress(done, total))
     _write_preview(folder, config.fps)
@@ -312,7 +312,7 @@ def _write_capture(folder: Path, config: ShootConfig, progress: ShootProgress) -
     )
     write_motion(folder / "poses.npz", given)
     write_motion(folder / "truth" / "poses.npz", truth)
-    write_motion(folder / "dance.npz", actor_motions.unfilmed_dance(actor))
+    write_motion(folder / "dance.npz", staging.unfilmed_dance(actor))
     if config.camera_moves:
         # A phone does not know where it is: the cameras are ground truth, where no command looks.
         _write_track(folder / "truth" / "cameras.npz", *cameras)
@@ -326,10 +326,10 @@ def _build_scenes(
     """Where the film is made, and where the poses that no film holds are pictured."""
     kind = config.effective_background
     if config.camera_moves:
-        tall = studio_cameras.actor_height_m(actor)
+        tall = staging.actor_height_m(actor)
         at = (truth.root_translations + actor.shaped.joints[0])[:, [0, 2]]
-        cameras = studio_cameras.handheld_cameras(at, tall, config.size, config.seed)
-        apart = studio_cameras.standing_camera(tall, config.size)
+        cameras = staging.handheld_cameras(at, tall, config.size, config.seed)
+        apart = staging.standing_camera(tall, config.size)
     else:
         apart = static_camera(actor, config.size)
         cameras = (apart,)

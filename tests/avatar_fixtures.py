@@ -21,9 +21,9 @@ from capture.source import Frame
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.parametric_body import ShapedBody, load_body_model
 from preprocess.observation import Observation
-from studio import actor_motions
+from studio import staging
 from studio.actor import Actor
-from studio.studio_cameras import static_camera
+from studio.staging import static_camera
 
 
 @pytest.fixture(scope="session")
@@ -128,8 +128,8 @@ def clip() -> Clip:
             frame=frame, alpha=alpha.astype(np.float32) / 255.0, pose=pose, camera=camera
         )
 
-    filmed = actor_motions.turning_motion(actor, frames=24, fps=30.0, turns=1.0, seed=0)
-    novel = actor_motions.novel_poses(actor)
+    filmed = staging.turning_motion(actor, frames=24, fps=30.0, turns=1.0, seed=0)
+    novel = staging.novel_poses(actor)
     return Clip(
         observations=[observed(i, filmed[i]) for i in range(len(filmed))],
         novel=observed(100, novel[0]),

@@ -11,7 +11,7 @@ from preprocess.capture_session import CaptureInputs
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
 from preprocess.poses.pose_file import read_motion
-from studio import actor_motions, studio_cameras
+from studio import staging
 from studio.actor import Actor
 from studio.furnished_room import SENSOR_NOISE, FurnishedRoom
 from studio.painted_surfaces import dead_leaves, repeat_motif
@@ -27,7 +27,7 @@ def room():
 
 @pytest.fixture(scope="module")
 def cameras():
-    return studio_cameras.handheld_cameras(np.zeros((9, 2)), 1.8, 192, 3)
+    return staging.handheld_cameras(np.zeros((9, 2)), 1.8, 192, 3)
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +106,7 @@ def test_the_corners_of_the_furniture_are_where_the_cameras_project_them(room, c
 
 
 def test_a_place_of_the_wall_has_one_color_from_everywhere(room):
-    near = studio_cameras.handheld_cameras(np.zeros((60, 2)), 1.8, 384, 1)[28:31:2]
+    near = staging.handheld_cameras(np.zeros((60, 2)), 1.8, 384, 1)[28:31:2]
     first, second = (room.view_from(camera) for camera in near)
     first = type(first)(rgb=first.rgb.copy(), depth=first.depth, face=first.face)
     points = points_seen(near[0], first.depth)
@@ -136,9 +136,9 @@ def test_nothing_in_the_room_repeats_and_all_of_the_tiles_do():
 @pytest.mark.parametrize("subject", [1, 2])
 def test_the_phone_walks_an_arc_and_holds_the_person_in_the_picture(subject):
     actor = Actor.of(subject)
-    motion = actor_motions.gesturing_motion(actor, frames=40, fps=30.0, turns=-0.75, seed=2)
+    motion = staging.gesturing_motion(actor, frames=40, fps=30.0, turns=-0.75, seed=2)
     at = (motion.root_translations + actor.shaped.joints[0])[:, [0, 2]]
-    cameras = studio_cameras.handheld_cameras(at, studio_cameras.actor_height_m(actor), 960, 2)
+    cameras = staging.handheld_cameras(at, staging.actor_height_m(actor), 960, 2)
     eyes = np.stack([camera.center_world for camera in cameras])
     angles = np.rad2deg(np.arctan2(eyes[:, 0], eyes[:, 2]))
     assert np.ptp(angles) > 100.0

@@ -12,14 +12,14 @@ from capture.source_opening import open_source
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.parametric_body import load_body_model
 from preprocess.poses.pose_file import read_motion, write_motion
-from studio import actor_motions
+from studio import staging
 from studio.actor import A_POSE, Actor, build_layers
 from studio.gestures import Arm, Gesture
 from studio.input_errors import add_mask_noise, add_pose_noise
 from studio.outfit import EYE, HAIR, OUTFITS, SHIRT, SHOE, SKIN, TROUSERS
 from studio.procedural_albedo import STRIPE_M, albedo_at
 from studio.shoot import ShootConfig, film_capture
-from studio.studio_cameras import static_camera
+from studio.staging import static_camera
 
 SMALL = ShootConfig(frames=5, size=64, turns=1.0)
 
@@ -80,7 +80,7 @@ def test_the_shirt_stands_off_the_body_by_one_to_four_centimetres():
 
 def test_skinning_is_the_bodys_own(actor):
     """The bare skin's vertices are the body's vertices, in any pose."""
-    pose = actor_motions.novel_poses(actor)[3]
+    pose = staging.novel_poses(actor)[3]
     skin = np.unique(actor.faces[actor.materials == SKIN])
     body = actor.shaped.with_pose(pose).vertices()
     np.testing.assert_allclose(
@@ -126,7 +126,7 @@ def test_stripes_are_four_centimetres_wide():
 
 def test_the_turning_person_fills_78_to_85_percent_of_the_height(actor):
     camera = static_camera(actor, 270)
-    motion = actor_motions.turning_motion(actor, frames=40, fps=30.0, turns=2.0, seed=3)
+    motion = staging.turning_motion(actor, frames=40, fps=30.0, turns=2.0, seed=3)
     for row in range(0, 40, 4):
         _, alpha = actor.render_rgb_alpha(motion[row], camera, supersampling=1)
         rows = np.flatnonzero(alpha.any(axis=1))
@@ -136,9 +136,9 @@ def test_the_turning_person_fills_78_to_85_percent_of_the_height(actor):
 def test_all_of_every_motion_is_in_the_picture(actor):
     camera = static_camera(actor, 100)
     for motion in (
-        actor_motions.dancing_motion(actor, frames=30, fps=30.0, turns=1.0, seed=0),
-        actor_motions.unfilmed_dance(actor, frames=48),
-        actor_motions.novel_poses(actor),
+        staging.dancing_motion(actor, frames=30, fps=30.0, turns=1.0, seed=0),
+        staging.unfilmed_dance(actor, frames=48),
+        staging.novel_poses(actor),
     ):
         for row in range(len(motion)):
             pixels = camera.project(actor.vertices(motion[row]))
@@ -147,20 +147,20 @@ def test_all_of_every_motion_is_in_the_picture(actor):
 
 
 def test_feet_stand_on_the_floor(actor):
-    motion = actor_motions.turning_motion(actor, frames=4, fps=30.0, turns=1.0, seed=0)
+    motion = staging.turning_motion(actor, frames=4, fps=30.0, turns=1.0, seed=0)
     for row in range(4):
         assert abs(actor.sole_height_m(motion[row])) < 1e-9
 
 
 def test_a_track_in_a_cameras_axes_is_filmed_upright_on_the_spot(actor, tmp_path):
-    turned = actor_motions.turning_motion(actor, frames=8, fps=30.0, turns=1.0, seed=0)
+    turned = staging.turning_motion(actor, frames=8, fps=30.0, turns=1.0, seed=0)
     flip = Rotation.from_rotvec([np.pi, 0.0, 0.0])
     track = replace(
         turned,
         root_rotations=(flip * Rotation.from_rotvec(turned.root_rotations)).as_rotvec(),
         root_translations=turned.root_translations + np.array([0.0, 0.0, 5.0]),
     )
-    motion = actor_motions.tracked_motion(actor, track, frames=4, fps=30.0)
+    motion = staging.tracked_motion(actor, track, frames=4, fps=30.0)
     assert len(motion) == 4
     np.testing.assert_allclose(motion.joint_rotations, turned.joint_rotations[[0, 2, 5, 7]])
     for row in range(4):
@@ -181,19 +181,19 @@ def test_a_track_in_a_cameras_axes_is_filmed_upright_on_the_spot(actor, tmp_path
 
 
 def test_the_turn_turns_as_often_as_asked(actor):
-    motion = actor_motions.turning_motion(actor, frames=80, fps=30.0, turns=3.0, seed=0)
+    motion = staging.turning_motion(actor, frames=80, fps=30.0, turns=3.0, seed=0)
     step = Rotation.from_rotvec(motion.root_rotations[1:])
     step = step * Rotation.from_rotvec(motion.root_rotations[:-1]).inv()
     np.testing.assert_allclose(step.as_rotvec()[:, 1].sum(), 6 * np.pi * 79 / 80, rtol=1e-6)
 
 
 def test_novel_poses_are_far_from_all_that_is_filmed(actor):
-    novel = actor_motions.novel_poses(actor)
+    novel = staging.novel_poses(actor)
     assert len(novel) == 12
-    for act in (actor_motions.turning_motion, actor_motions.dancing_motion):
+    for act in (staging.turning_motion, staging.dancing_motion):
         filmed = act(actor, frames=60, fps=30.0, turns=2.0, seed=0)
-        assert actor_motions.nearest_pose_angles(novel, filmed).min() > 0.35
-    assert (actor_motions.nearest_pose_angles(novel, novel) < 1e-6).all()
+        assert staging.nearest_pose_angles(novel, filmed).min() > 0.35
+    assert (staging.nearest_pose_angles(novel, novel) < 1e-6).all()
 
 
 def test_a_mirrored_gesture_moves_the_mirrored_joints():

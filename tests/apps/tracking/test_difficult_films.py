@@ -9,9 +9,8 @@ import pytest
 from apps import track
 from studio import painted_surfaces
 from studio.actor import Actor
-from studio.actor_motions import turning_motion
 from studio.lighting import composite_over
-from studio.studio_cameras import static_camera
+from studio.staging import static_camera, turning_motion
 
 FPS = 15.0
 

@@ -35,9 +35,9 @@ from avatar.training.trainer import Trainer, cosine_decay
 from baselines.instant_avatar.scheme_rendering import render_samples
 from capture.source import Frame
 from preprocess.observation import Observation
-from studio import actor_motions
+from studio import staging
 from studio.actor import Actor
-from studio.studio_cameras import static_camera
+from studio.staging import static_camera
 
 CPU = torch.device("cpu")
 BACKENDS = pytest.mark.parametrize(
@@ -174,7 +174,7 @@ class Filmed:
 def filmed(size: int) -> Filmed:
     actor = Actor.of(1, 0)
     rig, camera = Rig.from_shaped_body(actor.shaped), static_camera(actor, size)
-    poses = actor_motions.turning_motion(actor, frames=20, fps=30.0, turns=1.0, seed=0)
+    poses = staging.turning_motion(actor, frames=20, fps=30.0, turns=1.0, seed=0)
     observations = []
     for index in range(len(poses)):
         rgb, alpha = actor.render_over(poses[index], camera)

@@ -16,9 +16,9 @@ from preprocess.tracking.blazepose import (
     _limit_to_body,
 )
 from preprocess.tracking.keypoints import CroppedMask
-from studio import actor_motions
+from studio import staging
 from studio.actor import Actor
-from studio.studio_cameras import portrait_camera
+from studio.staging import portrait_camera
 
 SIZE = (270, 480)
 
@@ -47,7 +47,7 @@ def shots() -> list[Shot]:
     found = []
     for subject in (1, 2):
         actor = Actor.of(subject)
-        pose = actor_motions.turning_motion(actor, frames=8, fps=30.0, turns=1.0, seed=0)[0]
+        pose = staging.turning_motion(actor, frames=8, fps=30.0, turns=1.0, seed=0)[0]
         camera = portrait_camera(actor, SIZE[0])
         rgb, alpha = actor.render_rgb_alpha(pose, camera, supersampling=2)
         found.append(Shot(actor=actor, rgb=rgb, alpha=alpha, pose=pose, camera=camera))

@@ -17,9 +17,9 @@ from preprocess.tracking.blazepose_networks import (
     refine,
 )
 from preprocess.tracking.video_tracking import ProblemFinder, TrackingProblem
-from studio import actor_motions, painted_surfaces
+from studio import painted_surfaces, staging
 from studio.actor import Actor
-from studio.studio_cameras import portrait_camera
+from studio.staging import portrait_camera
 
 SIZE = (270, 480)
 KEYPOINTS = [11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28]
@@ -46,7 +46,7 @@ class Person:
 
 def film(subject):
     actor = Actor.of(subject)
-    pose = actor_motions.turning_motion(actor, frames=8, fps=30.0, turns=1.0, seed=0)[0]
+    pose = staging.turning_motion(actor, frames=8, fps=30.0, turns=1.0, seed=0)[0]
     camera = portrait_camera(actor, SIZE[0])
     assert camera.size_px == SIZE
     rgb, alpha = actor.render_rgb_alpha(pose, camera, supersampling=2)
