@@ -73,7 +73,8 @@ def _commit() -> str:
 
     if git("rev-parse", "--show-toplevel") != str(ROOT):  # an installation may lie in a checkout
         return "unknown"
-    changed = git("status", "--porcelain", "--untracked-files=no")
+    code = ("--", ".", ":!docs")  # benchmarks write their pages into docs/
+    changed = git("status", "--porcelain", "--untracked-files=no", *code)
     return (git("rev-parse", "--short", "HEAD") or "unknown") + ("+" if changed else "")
 
 
