@@ -142,10 +142,13 @@ def compare(arguments: CompareArguments, console: Console) -> int:
     with stop_on_interrupt(console, "the methods that are done are kept") as stop:
         if missing:
             with console.status("opening the capture, compiling kernels"):
-                from baselines.systems.compared_capture import ComparedCapture
-                from benchmarks.stopwatch import limit_threads
+                import numba
+                import torch
 
-                limit_threads(1)
+                from baselines.systems.compared_capture import ComparedCapture
+
+                torch.set_num_threads(1)
+                numba.set_num_threads(1)
                 data = ComparedCapture.open(arguments.capture, arguments.size)
         for name in missing:
             if data is not None and not stop.is_set():
