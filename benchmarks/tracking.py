@@ -36,7 +36,7 @@ from benchmarks.tracking_scores import (
 from capture.source_opening import open_source
 from preprocess.capture_paths import find_own_masks
 
-WEIGHTS = ROOT / "preprocess" / "blazepose" / "weights"
+WEIGHTS = ROOT / "preprocess" / "tracking" / "weights"
 """What tracking adds to the installation."""
 OTHER_PACKAGES = frozenset({
     "jaxtyping", "numpy", "onnxruntime", "opencv-contrib-python-headless", "pillow", "rich",
