@@ -48,7 +48,7 @@ class TrackArguments:
     """Find poses, masks and camera of the person in a video, and grade them.
 
     Neural networks (BlazePose) find key points and a mask in each frame; then one body, its poses
-    and the focal length are fitted to all of them. It needs about 40 ms per frame on one core and
+    and the focal length are fitted to all of them. It needs about 60 ms per frame on one core and
     no graphics card. ia-ingest does the same by itself where no --poses are given; run ia-track to
     look at the poses first, or to use them elsewhere. Try it:
 
