@@ -25,7 +25,7 @@ CORRECTIONS_PER_FRAME = 12
 RAYS_PER_CORRECTION = 4096
 """Rays per correction of a pose: few corrections by many rays end nearer than many by few."""
 PRIOR_PRECISION = 0.25
-"""Precision of the given poses relative to that in training: the avatar no longer gives way."""
+"""Precision of the given poses relative to that in training; the avatar is frozen."""
 COARSE_SHARE = 0.5
 """Share of the corrections that follow the coarse levels of the hash grid alone; then poses are so
 near that the finer ones, which do not change any more, point to the right place, too."""

@@ -58,17 +58,17 @@ TRACKED_ITERATIONS = 3
 POSE_ITERATIONS = 2
 """Iterations over poses alone after those, with `TRACKED_POSE_WEIGHTS`."""
 TRACKED_POSE_WEIGHTS = EvidenceWeights(outline_rows=480.0, keypoints=0.6)
-"""Evidence of poses alone counts more against their priors; proportions would follow clothes."""
+"""Weights while poses alone are fitted: with these, proportions would follow the clothes."""
 PROPORTION_ITERATIONS = 7
 """Iterations that show how well proportions and focal length alone explain the masks."""
 PROPORTION_STEP = 3
-"""Every which frame is enough for that."""
+"""Stride of the frames that are compared for that."""
 MIN_ERROR_DECREASE = 0.01
 """Relative decrease of the error below which the iterations end."""
 MAX_ERROR_RATIO = 0.9
 """Ratio of the errors with and without corrected poses above which the poses are exact."""
 MIN_ROOT_TURN_DEG = 1.0
-"""Mean rotation of the roots below which the poses are exact, degrees; exact ones turn by 0.75."""
+"""Mean rotation of the roots below which poses are exact, degrees (exact ones: 0.6 to 0.75)."""
 MIN_FRAMES = 4
 """Fewest frames with a usable mask for which an alignment is attempted."""
 
@@ -112,7 +112,7 @@ def fit_capture(capture: Capture, *, fit_body: bool = True) -> CaptureFit | None
 
     Args:
         capture: A recording with masks. If its motion holds key points, its poses are a first
-            guess made of these alone, and always give way.
+            guess made of these alone, and are always changed.
         fit_body: Whether proportions may change; not where an avatar's person is given.
 
     Returns:
