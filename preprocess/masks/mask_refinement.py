@@ -3,11 +3,10 @@
 The network's mask is coarse: a pixel of its square is several of the frame, fingers and the gap
 between arm and trunk are lost. It is right at large, though, so only a band around its border is
 decided again, by Bayes' rule: the network's probability is the prior; the likelihoods are those of
-a pixel's color under the colors of person and background nearby, under the histograms of both, and,
-where a static camera has seen it, under the background itself (`BackgroundPlate`). Where
-its texture is in plain sight, there is no person. A guided filter makes neighbors of like color
-agree and carries the result to full size; before a known background, the border is then moved to
-where the colors change (`refine_border`).
+a pixel's color under the histograms of person and background, and, where a static camera has seen
+it, under the background itself (`BackgroundPlate`). Where its texture is in plain sight, there is
+no person. A guided filter makes neighbors of like color agree and carries the result to full size;
+before a known background, the border is then moved to where the colors change (`refine_border`).
 
 Given masks are right where the picture changes along their border: color is a mixture of person and
 background by alpha, so that the picture's gradient follows that of alpha. They are refined in the
@@ -25,7 +24,6 @@ from preprocess.masks.color_models import (
     BackgroundPlate,
     DarkFilmBrightener,
     PlateColors,
-    local_densities,
     plate_density,
 )
 from preprocess.masks.matting import (
@@ -52,15 +50,17 @@ SURE_PERSON, SURE_PERSON_DEPTH = 0.9, 1.5
 SURE_BACKGROUND, SURE_BACKGROUND_DISTANCE = 0.1, 2.5
 """Probability, and distance from the border, of pixels that teach the background's colors."""
 
-LOCAL_SIGMA = 3.0
-"""Gaussian σ of the neighborhood from which colors are learnt, in the network's pixels."""
-
-LOCAL_WEIGHT, PLATE_WEIGHT, HISTOGRAM_WEIGHT = 0.5, 1.0, 0.75
-"""Weights of the three log likelihood ratios."""
-MAX_LOG_RATIO = 8.0
-"""Bound of their sum."""
+HISTOGRAM_WEIGHT = 0.75
+"""Weight of the log ratio of a color's frequencies on the person and around them."""
 HISTOGRAM_MEMORY = 0.9
 """Share of earlier frames in the histograms."""
+MIN_FREQUENCY = 3e-4
+"""Least frequency of a color in a histogram."""
+BIN_DENSITY = 32.0
+"""Density of a color of frequency 1 on the person, to compare with the background plate's: twice
+that of a bin of 16 levels in `color_density`'s unit."""
+MAX_LOG_RATIO = 8.0
+"""Bound of the log likelihood ratio of person and background."""
 
 FILTER_RADIUS_PX = 3
 """Radius of the guided filter's windows in the working image, px."""
@@ -164,7 +164,7 @@ class MaskRefiner:
             (top, left), (height, width) = band.corner, band.prior.shape
             part = np.s_[top : top + height, left : left + width]
             plate = self._plate.within(part)
-            alpha = self._decide(band, plate, square_px / times)
+            alpha = self._decide(band, plate)
             fitted = guided_coefficients(band.image, alpha, FILTER_RADIUS_PX, FILTER_TOLERANCE)
             filtered = apply_coefficients(band.image, fitted)
             person = filtered > PERSON_FREE_ALPHA
@@ -177,22 +177,19 @@ class MaskRefiner:
         self._plate.update(image, far)
         return found
 
-    def _decide(self, band: _Band, plate: PlateColors, unit_px: float) -> Plane:
+    def _decide(self, band: _Band, plate: PlateColors) -> Plane:
         """Probability of person in the band, and 0 or 1 beyond it."""
         shown = plate.in_sight(band.image)
         band = band._replace(person=band.person & ~shown, background=band.background | shown)
         at = band.rows, band.columns
-        front, back = local_densities(
-            band.image, (band.person, band.background), at, LOCAL_SIGMA * unit_px
-        )
-        ratio = np.float32(LOCAL_WEIGHT) * np.log(front / back)
+        front, back = self._color_frequencies(band)
+        ratio = np.float32(HISTOGRAM_WEIGHT) * np.log(front / back)
         known = plate.known[at]
         rows, columns = band.rows[known], band.columns[known]
         behind = plate_density(
             band.colors[:, known], plate.mean[:, rows, columns], plate.variance[rows, columns]
         )
-        ratio[known] = np.float32(PLATE_WEIGHT) * np.log(front[known] / behind)
-        ratio += np.float32(HISTOGRAM_WEIGHT) * self._histogram_ratio(band)
+        ratio[known] += np.log(np.float32(BIN_DENSITY) * front[known] / behind)
         prior = np.clip(band.prior[at], np.float32(0.01), np.float32(0.99))
         odds = prior / (np.float32(1.0) - prior)
         odds *= np.exp(np.clip(ratio, np.float32(-MAX_LOG_RATIO), np.float32(MAX_LOG_RATIO)))
@@ -201,8 +198,8 @@ class MaskRefiner:
         alpha[shown] = 0.0
         return _without_islands(alpha, band.inside)
 
-    def _histogram_ratio(self, band: _Band) -> Pixels:
-        """Log ratio of the colors' frequencies on the person and around them."""
+    def _color_frequencies(self, band: _Band) -> tuple[Pixels, Pixels]:
+        """How frequent the band's colors are on the person, and around them."""
         some = np.s_[::2, ::2]
         bins = _color_bins(band.image[:, ::2, ::2])
         now = np.stack(
@@ -214,8 +211,9 @@ class MaskRefiner:
         kept = np.float32(HISTOGRAM_MEMORY) if self._histograms.any() else np.float32(0.0)
         self._histograms = kept * self._histograms + (np.float32(1.0) - kept) * now
         total = np.maximum(self._histograms.sum(axis=1, keepdims=True), np.float32(1e-3))
-        front, back = self._histograms / total + np.float32(1e-4)
-        return np.log(front / back)[_color_bins(band.colors)]
+        front, back = self._histograms / total + np.float32(MIN_FREQUENCY)
+        bins = _color_bins(band.colors)
+        return front[bins], back[bins]
 
 
 def _find_band(image: Channels, soft: Plane, unit_px: float) -> tuple[_Band | None, PixelMask]:
