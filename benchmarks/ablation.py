@@ -1,20 +1,24 @@
-"""The paper's ablations side by side: losses, empty-space skipping, root finding, refinement.
+"""What each mechanism of training buys, and the paper's own ablations.
 
-    python -m benchmarks.ablation [--quick] [--seconds S] [--json FILE] [--write docs/ablation.md]
+    python -m benchmarks.ablation [--tables mechanisms|paper] [--few CAPTURE] [--keep FOLDER]
+        [--seconds S] [--quick] [--json FILE] [--write docs/ablation.md]
 
-All variants of a table are trained in turns in one process, with one thread, each for the same
-seconds of one core and then again for the same number of steps; they are scored by the exact
-renderer on held-out frames and on poses that were never filmed. There are no thresholds here.
+First, each mechanism is left out in turn on phone-like films, and each few-frame prior on few
+frames of one and on a capture of your own (`benchmarks.mechanisms`). Then the paper's tables on an
+exact sample: losses, empty-space skipping, root finding, refinement; all variants of a table are
+trained in turns in one process, with one thread, each for the same seconds of one core and then
+again for the same number of steps, and scored by the exact renderer on held-out frames and on poses
+that were never filmed. There are no thresholds here.
 """
 
 import json
 import sys
 import tempfile
 import time
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 import tyro
@@ -24,8 +28,9 @@ from avatar.evaluation.held_out import HeldOutFrame
 from avatar.rig import Rig
 from avatar.training.frame_stream import TrainingFrame
 from baselines.instant_avatar.samplers import BaselineScheme
-from benchmarks.ablation_page import AblationPage, written
+from benchmarks.ablation_page import AblationPage, mechanism_lines, written
 from benchmarks.hardware import Hardware
+from benchmarks.mechanisms import CaptureScores, measured_scores
 from benchmarks.paired_training import (
     TrainingBudget,
     Variant,
@@ -40,6 +45,10 @@ from benchmarks.stopwatch import limit_threads
 from benchmarks.training_quality import NOISE, novel_pose_frames, with_true_poses
 from preprocess.capture_session import Capture
 
+PHONE_PX = 270
+"""Longer side of phone-like pictures."""
+FEW = 8
+"""Frames of a capture of few frames, the held-out one included."""
 TIMED_POSES = 3
 """Novel poses that every scheme draws."""
 PAPER = "union grid, Broyden (the paper)"
@@ -100,6 +109,14 @@ REFINEMENT_VARIANTS = [
 class Ablation:
     """Trains every variant, and prints the tables."""
 
+    tables: Literal["all", "mechanisms", "paper"] = "all"
+    """What is measured: the mechanisms, the paper's tables, or both."""
+    subjects: tuple[Literal[1, 2, 3], ...] = (1, 2)
+    """Who is filmed as by a phone."""
+    seeds: tuple[int, ...] = (0,)
+    """Of training, for the mechanisms."""
+    few: Path | None = None
+    """Capture of a few photographs, for the few-frame priors."""
     quick: bool = False
     """Two seconds and twenty steps each: whether it runs, not what comes out."""
     size: int = 128
@@ -108,6 +125,8 @@ class Ablation:
     """Core seconds for each variant."""
     steps: int = 400
     """Steps for each variant, where they are counted."""
+    mechanism_steps: int = 600
+    """Steps without each mechanism."""
     device: str = "cpu"
     """Where to train."""
     json: Path | None = None
@@ -132,15 +151,49 @@ def main() -> None:
     """The benchmark."""
     job = tyro.cli(Ablation, prog="python -m benchmarks.ablation", description=__doc__)
     if job.quick:
-        job = Ablation(**{**vars(job), "seconds": 2.0, "steps": 20})
+        job = replace(job, seconds=2.0, steps=20, mechanism_steps=20)
     hardware = Hardware.here()
     with tempfile.TemporaryDirectory() as temporary:
-        page = run_ablation(job, hardware, job.keep or Path(temporary))
-    print("\n".join(page.lines()))
+        folder = job.keep or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        if job.tables != "paper":
+            show(job, "mechanisms", mechanism_lines(list(run_mechanisms(job, folder))))
+        if job.tables == "mechanisms":
+            return
+        page = run_ablation(job, hardware, folder)
+    show(job, "tables", page.lines())
     if job.json is not None:
         job.json.write_text(json.dumps(asdict(page), indent=1) + "\n")
+
+
+def show(job: Ablation, mark: str, lines: list[str]) -> None:
+    """Prints tables, and writes them between their marks of the page."""
+    print("\n".join(lines))
     if job.write is not None:
-        job.write.write_text(written(page, job.write))
+        job.write.write_text(written(mark, lines, job.write))
+
+
+def run_mechanisms(job: Ablation, folder: Path) -> Iterator[CaptureScores]:
+    """The mechanisms on phone-like films, then the few-frame priors on few frames."""
+    films = [film_by_phone(folder, subject, quick=job.quick) for subject in job.subjects]
+    few = [films[-1], *([job.few] if job.few is not None else [])]
+    for capture, frames in [*((film, None) for film in films), *((each, FEW) for each in few)]:
+        for seed in job.seeds:
+            name = f"{capture.name}-{frames or 'all'}-seed{seed}.json"
+            yield measured_scores(
+                capture, folder / name,
+                size_px=PHONE_PX, steps=job.mechanism_steps, seed=seed, frames=frames,
+                dance=None if frames is None else films[-1] / "dance.npz",
+            )  # fmt: skip
+
+
+def film_by_phone(folder: Path, subject: Literal[1, 2, 3], *, quick: bool) -> Path:
+    """A phone-like film of ten seconds, ten frames a second."""
+    frames = 30 if quick else 100
+    return film_sample(
+        folder / f"phone-{subject}", 2 * round(PHONE_PX * 9 / 32),
+        like_a_phone=True, subject=subject, frames=frames, fps=10,
+    )  # fmt: skip
 
 
 def run_ablation(job: Ablation, hardware: Hardware, folder: Path) -> AblationPage:

@@ -1,15 +1,23 @@
-"""The ablation's tables as Markdown, each beside what the paper's own says."""
+"""The ablation's tables as Markdown; the paper's beside what its own say."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import mean
 
 from benchmarks.measurements import format_value as number
+from benchmarks.mechanisms import (
+    FEW_FRAME_MECHANISMS,
+    MECHANISMS,
+    MORE_STEPS,
+    CaptureScores,
+    Mechanism,
+    MechanismScore,
+)
 from benchmarks.paired_training import VariantOutcome
 from benchmarks.scheme_timing import SchemeTiming
 
-BEGIN, END = "<!-- tables: begin -->", "<!-- tables: end -->"
-COMMAND = "python -m benchmarks.ablation --write docs/ablation.md"
+COMMAND = "python -m benchmarks.ablation --tables {} --write docs/ablation.md"
 SCORES = ("novel PSNR", "in the mask", "SSIM", "held-out PSNR", "in the mask", "SSIM")
 
 
@@ -50,7 +58,7 @@ class AblationPage:
         """The tables, and what must be known to read them."""
         learnt, held, novel, some = self.pictures
         return [
-            f"`{COMMAND}`",
+            f"`{COMMAND.format('paper')}`",
             "",
             *(f"* {line}" for line in self.hardware),
             f"* `ia-sample` at {self.size} px: {learnt} frames learnt, {held} held out, {novel} "
@@ -156,14 +164,66 @@ class AblationPage:
         ]
 
 
-def written(page: AblationPage, path: Path) -> str:
-    """The file's text with its tables replaced and the text around them kept."""
-    before, after = "# The paper's ablations, repeated\n\n", "\n"
+def mechanism_lines(captures: Sequence[CaptureScores]) -> list[str]:
+    """What each mechanism buys: a table of the whole films, and one of the few frames."""
+    lines = [f"`{COMMAND.format('mechanisms')}`", ""]
+    for title, rows in (
+        ("Mechanisms, one by one", MECHANISMS),
+        ("Few-frame priors, one by one", FEW_FRAME_MECHANISMS),
+    ):
+        names = [row.name for row in rows]
+        found = [each for each in captures if [score.name for score in each.scores] == names]
+        if not found:
+            continue
+        lines += [f"## {title} ({found[0].steps} steps)", ""]
+        lines += [
+            f"* {each.capture}, {each.size_px} px, seed {each.seed}: {each.measured}; all of them "
+            f"{_levels(each.scores[0])}, {each.scores[0].step_ms:.1f} core-ms a step"
+            for each in found
+        ]
+        head = ["without", "core-ms saved", *(f"{c.capture}, seed {c.seed}" for c in found)]
+        head += ["mean loss, dB", "its time would buy, dB", "lines"]
+        cells = [_mechanism_cells(row, place, found) for place, row in enumerate(rows)][1:]
+        lines += ["", *_table(head, cells), ""]
+    return lines[:-1]
+
+
+def _mechanism_cells(row: Mechanism, place: int, found: Sequence[CaptureScores]) -> list[str]:
+    """A row: what is lost without a mechanism on each capture (novel and held out), and overall."""
+    full, longer = ([each.scores[i] for each in found] for i in (0, 1))
+    without = [each.scores[place] for each in found]
+    saved = mean(a.step_ms - b.step_ms for a, b in zip(full, without, strict=True))
+    lost = [_loss(a, b) for a, b in zip(full, without, strict=True)]
+    slope = -mean(mean(_loss(a, b)) for a, b in zip(full, longer, strict=True))
+    share = saved / mean(score.step_ms for score in full)
+    texts = [f"{saved:.1f}", *(" / ".join(f"{-each:+.2f}" for each in pair) for pair in lost)]
+    texts.append(f"{mean(mean(pair) for pair in lost):+.2f}")
+    bought = slope * share / (MORE_STEPS - 1.0)
+    texts += ["", ""] if place == 1 else [f"{bought:+.2f}", str(row.lines or "few")]
+    return [row.name, *texts]
+
+
+def _loss(full: MechanismScore, without: MechanismScore) -> list[float]:
+    """What is lost on novel poses, if there are any, and on held-out frames, dB."""
+    pairs = [(full.novel, without.novel), (full.held_out, without.held_out)]
+    return [a - b for a, b in pairs if a is not None and b is not None]
+
+
+def _levels(score: MechanismScore) -> str:
+    novel = "" if score.novel is None else f"{score.novel:.2f} dB novel, "
+    return f"{novel}{score.held_out:.2f} dB held out"
+
+
+def written(mark: str, lines: Sequence[str], path: Path) -> str:
+    """The file's text with the tables of a mark replaced and the text around them kept."""
+    begin, end = f"<!-- {mark}: begin -->", f"<!-- {mark}: end -->"
+    before, after = "# What each mechanism buys\n\n", "\n"
     if path.exists():
         text = path.read_text()
-        if BEGIN in text and END in text:
-            before, after = text.split(BEGIN)[0], text.split(END)[1]
-    return before + "\n".join([BEGIN, *page.lines(), END]) + after
+        before, after = text + "\n", "\n"
+        if begin in text and end in text:
+            before, after = text.split(begin)[0], text.split(end)[1]
+    return before + "\n".join([begin, *lines, end]) + after
 
 
 def _named(rows: Sequence[VariantOutcome], name: str) -> VariantOutcome:

@@ -42,36 +42,43 @@ class ComparedCapture:
     ready_seconds: float
 
     @classmethod
-    def open(cls, folder: Path, size_px: int | None) -> "ComparedCapture":
+    def open(
+        cls, folder: Path, size_px: int | None, *, frames: slice | None = None
+    ) -> "ComparedCapture":
         """Opens a capture as `ia-ingest` does, and the studio's truth in it, if there is one.
+
+        Args:
+            folder: Capture.
+            size_px: Longer side; None for the pictures' own.
+            frames: Frames of the film that are used; all if None.
 
         Raises:
             InputError: If it cannot be used.
         """
-        capture = open_capture(CaptureInputs(video=folder), size_px=size_px)
+        capture = open_capture(CaptureInputs(video=folder, frames=frames), size_px=size_px)
         if capture.motion.proportions is None and (fit := fit_capture(capture)) is not None:
             capture = apply_fit(capture, fit)
         rig = Rig.from_shaped_body(capture.shaped)
         warm_up(Trainer(rig, TrainConfig(), torch.device("cpu")))
-        began, frames, held_out = time.process_time(), [], []
+        began, learnt, held_out = time.process_time(), [], []
         for item in prepare_stream(
             capture.observations(), rig, stride=HELD_OUT_STRIDE, total=capture.source.frame_count
         ):
             if isinstance(item, TrainingFrame):
-                frames.append(item)
+                learnt.append(item)
             elif isinstance(item, HeldOutFrame):
                 held_out.append(item)
         ready_seconds = time.process_time() - began
-        if not frames or not held_out:
+        if not learnt or not held_out:
             raise InputError(
-                f"{folder} has {len(frames)} frames to train on and {len(held_out)} to score; at "
+                f"{folder} has {len(learnt)} frames to train on and {len(held_out)} to score; at "
                 "least one of each is needed."
             )
         novel = novel_observations(folder, capture.shaped, size_px)
         return cls(
             capture=capture,
             rig=rig,
-            frames=frames,
+            frames=learnt,
             held_out=held_out,
             novel=[HeldOutFrame(observation=seen) for seen in novel],
             ready_seconds=ready_seconds,

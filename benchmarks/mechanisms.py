@@ -1,0 +1,421 @@
+"""What each mechanism of training buys: each off in turn, on phone-like films and on few frames.
+
+A row trains without one mechanism for the same number of steps as the others, in turns with them,
+and is scored in poses and exposures fitted by the product, which is how captures with inexact poses
+are scored. The row `a tenth more steps` says what the time that a mechanism takes could buy.
+"""
+
+import importlib
+import inspect
+import json
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+from functools import reduce
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+from unittest import mock
+
+import numpy as np
+import torch
+
+from apps.run.session_start import new_trainer
+from avatar.avatar_model import Avatar
+from avatar.evaluation.held_out import HeldOutFrame, score_frame
+from avatar.evaluation.image_metrics import composite_on_white, psnr
+from avatar.render import render
+from avatar.training.held_out_pose_fitting import fit_test_poses
+from avatar.training.trainer import Trainer, cosine_decay
+from baselines.systems.compared_capture import ComparedCapture
+from benchmarks.hardware import Hardware
+from benchmarks.paired_training import SLICE_S
+from benchmarks.sample_training import open_sample
+from benchmarks.stopwatch import limit_threads
+from export.build import export_avatar
+from export.player import Player, premultiply
+from preprocess.body.body_pose import Motion
+from preprocess.poses.pose_file import read_motion
+
+SCORED_FRAMES = 6
+"""Held-out frames, and novel poses, that each row is scored on, spread evenly."""
+DANCE_POSES = 8
+"""Poses of a dance in which player and renderer are compared."""
+MORE_STEPS = 1.1
+"""Factor of the steps in the row that trains longer."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mechanism:
+    """What a row leaves out.
+
+    Attributes:
+        name: Of the mechanism.
+        off: Changes of `TrainConfig` that turn it off.
+        patched: Constants or functions that turn it off, by their full names.
+        code: Full names of the definitions that it alone needs, or how many lines these have.
+        steps_factor: Factor of the steps.
+    """
+
+    name: str
+    off: Mapping[str, Any] = field(default_factory=dict)
+    patched: Mapping[str, Any] = field(default_factory=dict)
+    code: Sequence[str] = ()
+    steps_factor: float = 1.0
+
+    @property
+    def lines(self) -> int:
+        """Lines of production code that it alone needs, beside its calls and its configuration."""
+        return sum(len(inspect.getsourcelines(_named(name))[0]) for name in self.code)
+
+    @contextmanager
+    def turned_off(self) -> Iterator[None]:
+        """Leaves it out in this block, where it is not turned off by the configuration."""
+        with ExitStack() as stack:
+            for name, value in self.patched.items():
+                stack.enter_context(mock.patch(name, value))
+            yield
+
+
+FULL = Mechanism(name="all of them")
+LONGER = Mechanism(name="all of them, a tenth more steps", steps_factor=MORE_STEPS)
+MECHANISMS = [
+    FULL,
+    LONGER,
+    Mechanism(name="alpha loss", off={"alpha_weight": 0.0}),
+    Mechanism(name="hard surface", off={"hard_surface_weight": 0.0}),
+    Mechanism(
+        name="occupancy-based term",
+        off={"empty_space_weight": 0.0},
+        code=(
+            "avatar.radiance_field.empty_space_gradient",
+            "avatar.occupancy_grid.OccupancyGrid.sample_empty",
+            "avatar.occupancy_grid.OccupancyGrid._empty_cells",
+        ),
+    ),
+    Mechanism(
+        name="total variation",
+        off={"density_tv_weight": 0.0},
+        code=(
+            "avatar.radiance_field.density_tv_gradient",
+            "avatar.radiance_field.sample_tv_pairs",
+        ),
+    ),
+    Mechanism(
+        name="occupancy-based term and total variation",
+        off={"empty_space_weight": 0.0, "density_tv_weight": 0.0},
+    ),
+    Mechanism(
+        name="faint gradients by chance",
+        off={"faint_gradient_share": 0.0},
+        code=("avatar.training.training_step.draw_by_strength",),
+    ),
+    Mechanism(
+        name="coarse samples at first",
+        off={"initial_step_factor": 1.0},
+        code=(
+            "avatar.config.TrainConfig.sample_step_at",
+            "avatar.training.trainer.Trainer._config_at",
+        ),
+    ),
+    Mechanism(
+        name="end of rays at a surface",
+        off={"opaque_margin_m": 10.0},
+    ),
+    Mechanism(
+        name="exposures",
+        off={"estimate_exposures": False},
+        code=("avatar.training.frame_exposure",),
+    ),
+    Mechanism(
+        name="room light",
+        off={"estimate_shading": False},
+        code=("avatar.avatar_model.OrientationShading",),
+    ),
+    Mechanism(
+        name="more rays for the head",
+        patched={"avatar.training.replay_buffer.HEAD_RAY_SHARE": 0.0},
+    ),
+    Mechanism(
+        name="frames drawn by their error",
+        patched={
+            "avatar.training.replay_buffer.ReplayBuffer.update_errors": lambda *_: None,
+        },
+        code=("avatar.training.replay_buffer.ReplayBuffer.update_errors",),
+    ),
+    Mechanism(
+        name="mean of the parameters",
+        patched={"avatar.training.trainer.EMA_HORIZON_STEPS": 1},
+        code=("avatar.training.trainer.update_ema",),
+    ),
+    Mechanism(
+        name="floaters dropped",
+        patched={"avatar.occupancy_grid.MIN_COMPONENT_SHARE": 0.0},
+        code=("avatar.occupancy_grid.find_floaters",),
+    ),
+    Mechanism(
+        name="densities cached by samples",
+        patched={
+            "avatar.kernels.numba_backend.NumbaBackend.scatter_max_density": lambda *_: None,
+        },
+    ),
+    Mechanism(
+        name="neighbours' pose errors",
+        patched={"avatar.training.pose_correction.NEIGHBOR_PRECISION": 0.0},
+        code=(
+            "avatar.training.pose_correction.TemporalPosePrior",
+            "avatar.training.pose_correction.prior_from_neighbors",
+            "avatar.training.pose_correction.neighbor_correlation",
+        ),
+    ),
+    Mechanism(
+        name="pose refinement",
+        off={"refine_poses": False},
+        code=("avatar.training.pose_optimizer", "avatar.training.pose_correction"),
+    ),
+]
+"""What phone-like films are trained without, one by one."""
+FEW_FRAME_MECHANISMS = [
+    FULL,
+    LONGER,
+    Mechanism(
+        name="strong total variation at first",
+        off={"initial_density_tv_factor": 1.0},
+        code=("avatar.config.TrainConfig.density_tv_weight_at",),
+    ),
+    Mechanism(
+        name="double well",
+        off={"double_well_weight": 0.0},
+        code=("avatar.radiance_field.double_well_gradient",),
+    ),
+    Mechanism(
+        name="interior",
+        off={"interior_weight": 0.0},
+        code=(
+            "avatar.radiance_field.interior_gradient",
+            "avatar.occupancy_grid.OccupancyGrid.sample_interior",
+        ),
+    ),
+    Mechanism(
+        name="density slope and color variation",
+        off={"density_slope_weight": 0.0, "color_tv_weight": 0.0},
+        code=(
+            "avatar.radiance_field.density_slope_gradient",
+            "avatar.radiance_field.color_tv_gradient",
+            "avatar.radiance_field.sample_smoothness_pairs",
+        ),
+    ),
+    Mechanism(name="least density of occupied cells", off={"min_occupied_density": 0.0}),
+    Mechanism(
+        name="inner leg",
+        off={"inner_leg_weight": 0.0},
+        code=(
+            "avatar.radiance_field.log_density_l1_gradient",
+            "avatar.occupancy_grid.OccupancyGrid.sample_inner_leg",
+            "avatar.occupancy_grid.OccupancyGrid._inner_leg_cells",
+            "avatar.occupancy_grid.inner_leg_cells",
+            "avatar.occupancy_grid._nearest_leg_seed",
+        ),
+    ),
+]
+"""What captures of a few frames are trained without, one by one."""
+
+
+class MechanismScore(NamedTuple):
+    """What a row came to on one capture with one seed.
+
+    Attributes:
+        name: Of the mechanism that was left out.
+        step_ms: Core milliseconds a step.
+        held_out: PSNR on white of held-out frames in fitted poses, dB.
+        novel: The same of poses never filmed; None where there are none.
+        player: PSNR of the exported player to the renderer in poses never filmed, dB; None where
+            it was not exported.
+    """
+
+    name: str
+    step_ms: float
+    held_out: float
+    novel: float | None
+    player: float | None = None
+
+
+class CaptureScores(NamedTuple):
+    """All rows of one capture with one seed.
+
+    Attributes:
+        capture: Name of the capture.
+        seed: Of training.
+        steps: Of training.
+        size_px: Longer side of the pictures, pixels.
+        measured: Commit and date.
+        scores: A score for each row.
+    """
+
+    capture: str
+    seed: int
+    steps: int
+    size_px: int
+    measured: str
+    scores: list[MechanismScore]
+
+
+@dataclass(kw_only=True)
+class _Run:
+    mechanism: Mechanism
+    trainer: Trainer
+    steps: int
+    spent_s: float = 0.0
+
+    def train_slice(self) -> None:
+        """One turn."""
+        trainer, began = self.trainer, time.process_time()
+        with self.mechanism.turned_off():
+            while trainer.steps < self.steps and time.process_time() - began < SLICE_S:
+                done = trainer.steps / self.steps
+                falling = cosine_decay(done)
+                trainer.step(
+                    rate=falling,
+                    hard_surface_share=min(1.0, 4.0 * done),
+                    detail_share=1.0 - falling,
+                )
+        self.spent_s += time.process_time() - began
+
+
+def measured_scores(
+    folder: Path,
+    kept: Path,
+    *,
+    size_px: int,
+    steps: int,
+    seed: int,
+    frames: int | None = None,
+    dance: Path | None = None,
+) -> CaptureScores:
+    """The scores of every row on a capture; what `kept` holds is not measured again.
+
+    Args:
+        folder: Capture.
+        kept: File of the scores, JSON.
+        size_px: Longer side, pixels.
+        steps: Of training.
+        seed: Of training.
+        frames: How few of its frames are used; then the few-frame priors are left out, one by one.
+            All, and the other mechanisms, if None.
+        dance: File of the poses in which the exported player is compared with the renderer.
+    """
+    if not kept.exists():
+        if frames is None:
+            compared, rows, name = ComparedCapture.open(folder, size_px), MECHANISMS, folder.name
+        else:
+            compared, rows = open_few(folder, size_px, frames), FEW_FRAME_MECHANISMS
+            name = f"{len(compared.frames) + len(compared.held_out)} frames of {folder.name}"
+        measured = Hardware.here().lines()[0]
+        poses = None if dance is None else read_motion(dance)
+        scores = list(score_mechanisms(compared, rows, steps, seed, poses))
+        found = CaptureScores(name, seed, steps, size_px, measured, scores)
+        kept.write_text(json.dumps(found._asdict(), indent=1) + "\n")
+    found = CaptureScores(**json.loads(kept.read_text()))
+    return found._replace(scores=[MechanismScore(*score) for score in found.scores])
+
+
+def score_mechanisms(
+    compared: ComparedCapture,
+    mechanisms: Sequence[Mechanism],
+    steps: int,
+    seed: int,
+    dance: Motion | None = None,
+) -> Iterator[MechanismScore]:
+    """Trains without each mechanism, in turns, and scores each row in fitted poses.
+
+    Args:
+        compared: What is trained and scored on.
+        mechanisms: Rows.
+        steps: Of training.
+        seed: Of training.
+        dance: Poses in which the exported player is compared with the renderer, if it is.
+    """
+    limit_threads(1)
+    runs = [_begin(compared, mechanism, steps, seed) for mechanism in mechanisms]
+    while under_way := [run for run in runs if run.trainer.steps < run.steps]:
+        for run in under_way:
+            run.train_slice()
+    held_out, novel = (_some(frames) for frames in (compared.held_out, compared.novel))
+    for run in runs:
+        score = MechanismScore(
+            run.mechanism.name,
+            1e3 * run.spent_s / run.trainer.steps,
+            _fitted_psnr(run.trainer, held_out),
+            _fitted_psnr(run.trainer, novel) if novel else None,
+            None if dance is None else _player_psnr(run.trainer.avatar, held_out, dance),
+        )
+        print(seed, *score, file=sys.stderr, flush=True)
+        yield score
+
+
+def open_few(folder: Path, size_px: int, count: int) -> ComparedCapture:
+    """A capture of which at most `count` frames are used, spread evenly.
+
+    Args:
+        folder: Capture.
+        size_px: Longer side, pixels.
+        count: Frames, held-out ones included.
+    """
+    total = open_sample(folder).source.frame_count or count
+    return ComparedCapture.open(folder, size_px, frames=slice(None, None, -(-total // count)))
+
+
+def _begin(compared: ComparedCapture, mechanism: Mechanism, steps: int, seed: int) -> _Run:
+    total = round(steps * mechanism.steps_factor)
+    trainer = new_trainer(
+        compared.capture, seconds=60.0, steps=total, seed=seed, refine_poses=True,
+        device=torch.device("cpu"),
+    )  # fmt: skip
+    trainer = Trainer(
+        trainer.avatar.rig, replace(trainer.config, **mechanism.off), torch.device("cpu")
+    )
+    with mechanism.turned_off():
+        for frame in compared.frames:
+            trainer.add_frame(frame)
+    return _Run(mechanism=mechanism, trainer=trainer, steps=total)
+
+
+def _some(frames: list[HeldOutFrame]) -> list[HeldOutFrame]:
+    places = np.linspace(0, len(frames) - 1, min(SCORED_FRAMES, len(frames))).round()
+    return [frames[int(place)] for place in places]
+
+
+def _fitted_psnr(trainer: Trainer, frames: list[HeldOutFrame]) -> float:
+    fitted = fit_test_poses(trainer, frames)
+    return float(np.mean([score_frame(trainer.avatar, frame).psnr for frame in fitted]))
+
+
+def _player_psnr(avatar: Avatar, held_out: Sequence[HeldOutFrame], dance: Motion) -> float:
+    """PSNR of the player to the renderer in poses of a dance, in the place of held-out frames."""
+    views = [(each.observation.pose, each.observation.camera) for each in held_out]
+    rows = np.linspace(0, len(dance) - 1, DANCE_POSES).round().astype(int)
+    with TemporaryDirectory() as folder:
+        package = Path(folder) / "avatar.iavatar"
+        export_avatar(avatar, package, views=views, metrics={})
+        player, found = Player.load(package, tier="hq"), []
+        for place, row in enumerate(rows):
+            pose, camera = views[place % len(views)]
+            pose = replace(pose, joint_rotations=dance[int(row)].joint_rotations)
+            drawn = composite_on_white(premultiply(player.render(pose, camera)))
+            found.append(psnr(drawn, composite_on_white(render(avatar, pose, camera))))
+    return float(np.mean(found))
+
+
+def _named(name: str) -> Any:
+    """A module, class or function by its full name."""
+    words = name.split(".")
+    for split in range(len(words), 0, -1):
+        try:
+            module = importlib.import_module(".".join(words[:split]))
+        except ModuleNotFoundError:
+            continue
+        found = reduce(getattr, words[split:], module)
+        return getattr(found, "func", found)  # of a cached property
+    raise ModuleNotFoundError(name)
