@@ -139,13 +139,6 @@ MECHANISMS = [
         patched={"avatar.training.replay_buffer.HEAD_RAY_SHARE": 0.0},
     ),
     Mechanism(
-        name="frames drawn by their error",
-        patched={
-            "avatar.training.replay_buffer.ReplayBuffer.update_errors": lambda *_: None,
-        },
-        code=("avatar.training.replay_buffer.ReplayBuffer.update_errors",),
-    ),
-    Mechanism(
         name="mean of the parameters",
         patched={"avatar.training.trainer.EMA_HORIZON_STEPS": 1},
         code=("avatar.training.trainer.update_ema",),

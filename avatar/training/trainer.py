@@ -245,7 +245,6 @@ class Trainer:
         field.table_grad.zero_()
         if refines:
             self._correct_poses(falling)
-        self.replay.update_errors(batch.rays.slots.long(), result.loss)
         if config.estimate_exposures:
             self.exposures.observe(batch, result.rendered)
         if config.estimate_shading:
