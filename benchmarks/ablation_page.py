@@ -171,36 +171,48 @@ def mechanism_lines(captures: Sequence[CaptureScores]) -> list[str]:
         ("Mechanisms, one by one", MECHANISMS),
         ("Few-frame priors, one by one", FEW_FRAME_MECHANISMS),
     ):
-        names = [row.name for row in rows]
-        found = [each for each in captures if [score.name for score in each.scores] == names]
+        names = {row.name for row in rows[2:]}
+        found = [each for each in captures if names & {score.name for score in each.scores}]
         if not found:
             continue
-        lines += [f"## {title} ({found[0].steps} steps)", ""]
+        lines += [f"## {title}", ""]
         lines += [
-            f"* {each.capture}, {each.size_px} px, seed {each.seed}: {each.measured}; all of them "
-            f"{_levels(each.scores[0])}, {each.scores[0].step_ms:.1f} core-ms a step"
+            f"* {each.capture}, {each.size_px} px, seed {each.seed}, {each.steps} steps: "
+            f"{each.measured}; with all mechanisms {_levels(each.scores[0])}, "
+            f"{each.scores[0].step_ms:.1f} core-ms a step"
             for each in found
         ]
         head = ["without", "core-ms saved", *(f"{c.capture}, seed {c.seed}" for c in found)]
         head += ["mean loss, dB", "its time would buy, dB", "lines"]
-        cells = [_mechanism_cells(row, place, found) for place, row in enumerate(rows)][1:]
-        lines += ["", *_table(head, cells), ""]
+        lines += ["", *_table(head, _mechanism_cells(rows, found)), ""]
     return lines[:-1]
 
 
-def _mechanism_cells(row: Mechanism, place: int, found: Sequence[CaptureScores]) -> list[str]:
-    """A row: what is lost without a mechanism on each capture (novel and held out), and overall."""
-    full, longer = ([each.scores[i] for each in found] for i in (0, 1))
-    without = [each.scores[place] for each in found]
-    saved = mean(a.step_ms - b.step_ms for a, b in zip(full, without, strict=True))
-    lost = [_loss(a, b) for a, b in zip(full, without, strict=True)]
-    slope = -mean(mean(_loss(a, b)) for a, b in zip(full, longer, strict=True))
-    share = saved / mean(score.step_ms for score in full)
-    texts = [f"{saved:.1f}", *(" / ".join(f"{-each:+.2f}" for each in pair) for pair in lost)]
-    texts.append(f"{mean(mean(pair) for pair in lost):+.2f}")
-    bought = slope * share / (MORE_STEPS - 1.0)
-    texts += ["", ""] if place == 1 else [f"{bought:+.2f}", str(row.lines or "few")]
-    return [row.name, *texts]
+def _mechanism_cells(
+    rows: Sequence[Mechanism], found: Sequence[CaptureScores]
+) -> list[tuple[str, ...]]:
+    """What is lost without each mechanism on each capture (novel / held out), and on average."""
+    full, longer, *_ = rows
+    by_name = [{score.name: score for score in each.scores} for each in found]
+    gains = [
+        -mean(_loss(each[full.name], each[longer.name])) for each in by_name if longer.name in each
+    ]
+    slope = mean(gains) / (MORE_STEPS - 1.0) if gains else 0.0
+    cells = []
+    for row in rows[1:]:
+        pairs = [(each[full.name], each[row.name]) for each in by_name if row.name in each]
+        if not pairs:
+            continue
+        saved = mean(a.step_ms - b.step_ms for a, b in pairs)
+        lost = [
+            _loss_text(each[full.name], each[row.name]) if row.name in each else "-"
+            for each in by_name
+        ]
+        bought = slope * saved / mean(a.step_ms for a, _ in pairs)
+        last = ("", "") if row is longer else (f"{bought:+.2f}", str(row.lines or "few"))
+        overall = mean(mean(_loss(a, b)) for a, b in pairs)
+        cells.append((row.name, f"{saved:.1f}", *lost, f"{overall:+.2f}", *last))
+    return cells
 
 
 def _loss(full: MechanismScore, without: MechanismScore) -> list[float]:
@@ -209,9 +221,18 @@ def _loss(full: MechanismScore, without: MechanismScore) -> list[float]:
     return [a - b for a, b in pairs if a is not None and b is not None]
 
 
+def _loss_text(full: MechanismScore, without: MechanismScore) -> str:
+    """`_loss`, and how much less the player is like the renderer, if it was exported."""
+    losses = _loss(full, without)
+    if full.player is not None and without.player is not None:
+        losses.append(full.player - without.player)
+    return " / ".join(f"{loss:+.2f}" for loss in losses)
+
+
 def _levels(score: MechanismScore) -> str:
     novel = "" if score.novel is None else f"{score.novel:.2f} dB novel, "
-    return f"{novel}{score.held_out:.2f} dB held out"
+    player = "" if score.player is None else f", player to renderer {score.player:.2f} dB"
+    return f"{novel}{score.held_out:.2f} dB held out{player}"
 
 
 def written(mark: str, lines: Sequence[str], path: Path) -> str:

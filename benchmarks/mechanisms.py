@@ -2,7 +2,7 @@
 
 A row trains without one mechanism for the same number of steps as the others, in turns with them,
 and is scored in poses and exposures fitted by the product, which is how captures with inexact poses
-are scored. The row `a tenth more steps` says what the time that a mechanism takes could buy.
+are scored. The row with a tenth more steps says what the time that a mechanism takes could buy.
 """
 
 import importlib
@@ -80,7 +80,7 @@ class Mechanism:
 
 
 FULL = Mechanism(name="all of them")
-LONGER = Mechanism(name="all of them, a tenth more steps", steps_factor=MORE_STEPS)
+LONGER = Mechanism(name="(nothing, a tenth more steps)", steps_factor=MORE_STEPS)
 MECHANISMS = [
     FULL,
     LONGER,
