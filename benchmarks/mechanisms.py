@@ -5,7 +5,6 @@ and is scored in poses and exposures fitted by the product, which is how capture
 are scored. The row with a tenth more steps says what the time that a mechanism takes could buy.
 """
 
-import importlib
 import inspect
 import json
 import sys
@@ -13,8 +12,8 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
-from functools import reduce
 from pathlib import Path
+from pkgutil import resolve_name
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 from unittest import mock
@@ -68,7 +67,9 @@ class Mechanism:
     @property
     def lines(self) -> int:
         """Lines of production code that it alone needs, beside its calls and its configuration."""
-        return sum(len(inspect.getsourcelines(_named(name))[0]) for name in self.code)
+        found = map(resolve_name, self.code)
+        sources = [getattr(each, "func", each) for each in found]  # `func` of a cached property
+        return sum(len(inspect.getsourcelines(each)[0]) for each in sources)
 
     @contextmanager
     def turned_off(self) -> Iterator[None]:
@@ -98,10 +99,7 @@ MECHANISMS = [
     Mechanism(
         name="total variation",
         off={"density_tv_weight": 0.0},
-        code=(
-            "avatar.radiance_field.density_tv_gradient",
-            "avatar.radiance_field.sample_tv_pairs",
-        ),
+        code=("avatar.radiance_field.density_tv_gradient", "avatar.radiance_field.sample_tv_pairs"),
     ),
     Mechanism(
         name="occupancy-based term and total variation",
@@ -120,10 +118,7 @@ MECHANISMS = [
             "avatar.training.trainer.Trainer._config_at",
         ),
     ),
-    Mechanism(
-        name="end of rays at a surface",
-        off={"opaque_margin_m": 10.0},
-    ),
+    Mechanism(name="end of rays at a surface", off={"opaque_margin_m": 10.0}),
     Mechanism(
         name="exposures",
         off={"estimate_exposures": False},
@@ -135,8 +130,7 @@ MECHANISMS = [
         code=("avatar.avatar_model.OrientationShading",),
     ),
     Mechanism(
-        name="more rays for the head",
-        patched={"avatar.training.replay_buffer.HEAD_RAY_SHARE": 0.0},
+        name="more rays for the head", patched={"avatar.training.replay_buffer.HEAD_RAY_SHARE": 0.0}
     ),
     Mechanism(
         name="mean of the parameters",
@@ -150,9 +144,12 @@ MECHANISMS = [
     ),
     Mechanism(
         name="densities cached by samples",
-        patched={
-            "avatar.kernels.numba_backend.NumbaBackend.scatter_max_density": lambda *_: None,
-        },
+        patched={"avatar.kernels.numba_backend.NumbaBackend.scatter_max_density": lambda *_: None},
+        code=(
+            "avatar.kernels.backend_protocol.Backend.scatter_max_density",
+            "avatar.kernels.numba_backend.NumbaBackend.scatter_max_density",
+            "avatar.kernels.torch_reference.scatter_max_density",
+        ),
     ),
     Mechanism(
         name="neighbours' pose errors",
@@ -399,16 +396,3 @@ def _player_psnr(avatar: Avatar, held_out: Sequence[HeldOutFrame], dance: Motion
             drawn = composite_on_white(premultiply(player.render(pose, camera)))
             found.append(psnr(drawn, composite_on_white(render(avatar, pose, camera))))
     return float(np.mean(found))
-
-
-def _named(name: str) -> Any:
-    """A module, class or function by its full name."""
-    words = name.split(".")
-    for split in range(len(words), 0, -1):
-        try:
-            module = importlib.import_module(".".join(words[:split]))
-        except ModuleNotFoundError:
-            continue
-        found = reduce(getattr, words[split:], module)
-        return getattr(found, "func", found)  # of a cached property
-    raise ModuleNotFoundError(name)
