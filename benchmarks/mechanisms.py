@@ -240,7 +240,7 @@ class CaptureScores(NamedTuple):
         seed: Of training.
         steps: Of training.
         size_px: Longer side of the pictures, pixels.
-        measured: Commit and date.
+        measured: Commit, date and machine.
         scores: A score for each row.
     """
 
@@ -302,7 +302,7 @@ def measured_scores(
         else:
             compared, rows = open_few(folder, size_px, frames), FEW_FRAME_MECHANISMS
             name = f"{len(compared.frames) + len(compared.held_out)} frames of {folder.name}"
-        measured = Hardware.here().lines()[0]
+        measured = ", ".join(Hardware.here().lines()[:2])
         poses = None if dance is None else read_motion(dance)
         scores = list(score_mechanisms(compared, rows, steps, seed, poses))
         found = CaptureScores(name, seed, steps, size_px, measured, scores)
