@@ -121,6 +121,7 @@ def _with_neighboring_corrections(
         poses_may_be_exact=False,
         rays_per_frame=RAYS_PER_CORRECTION,
         prior_precision=PRIOR_PRECISION,
+        equation_decay=0.0,
     )
     for frame in frames:
         prepared = prepare_frame(frame.observation, rig)

@@ -155,17 +155,42 @@ MAX_STEP = 0.1
 """Largest change of a parameter in one step, radians or metres."""
 
 
+class NormalEquations(NamedTuple):
+    """Normal equations of a pose from the rays of its last corrections, in prior sigmas.
+
+    Attributes:
+        curvature: Sum of the rays' curvatures.
+        gradient: Sum of their gradients at `correction`.
+        correction: Correction at which they are linearized.
+    """
+
+    curvature: Float32[np.ndarray, "75 75"]
+    gradient: Float32[np.ndarray, "75"]
+    correction: Float32[np.ndarray, "75"]
+
+    def plus(self, earlier: "NormalEquations", decay: float) -> "NormalEquations":
+        """The sum of these and `decay` times earlier ones, which are linearized here, too."""
+        moved = earlier.gradient + earlier.curvature @ (self.correction - earlier.correction)
+        return NormalEquations(
+            self.curvature + decay * earlier.curvature,
+            self.gradient + decay * moved,
+            self.correction,
+        )
+
+
 class GaussNewtonStep(NamedTuple):
     """Step of one pose correction.
 
     Attributes:
         change: Change of the correction: radians, and metres in the last row.
+        equations: The normal equations that it solves, without the prior.
         evidence: Mean of (Σ g)² / Σ g² over the directions that the rays determine: about 1 if
             their gradients g are noise, about the number of rays if all agree.
         unregularized: Correction that the rays alone would converge to, in prior sigmas.
     """
 
     change: Float[np.ndarray, "25 3"]
+    equations: NormalEquations
     evidence: float
     unregularized: Float[np.ndarray, "25 3"]
 
@@ -177,6 +202,8 @@ def gauss_newton_step(
     shared_evidence: float,
     *,
     prior: PosePrior = UNINFORMATIVE_PRIOR,
+    earlier: NormalEquations | None = None,
+    decay: float = 0.0,
 ) -> GaussNewtonStep:
     """The step towards the pose at which the rays fit, in the directions that they determine.
 
@@ -187,6 +214,8 @@ def gauss_newton_step(
         shared_evidence: Mean evidence of all frames, which one tracker produced; infinite if the
             pose is to move in any case.
         prior: Prior of the correction.
+        earlier: Normal equations of the pose's last step; None if there was none.
+        decay: Factor of those, which are added to the rays' own.
     """
     scale = np.full((25, 3), PRIOR_SIGMA_RAD, dtype=np.float32)
     scale[24] = PRIOR_SIGMA_M
@@ -200,18 +229,22 @@ def gauss_newton_step(
         full = FULL_EVIDENCE - MIN_EVIDENCE
         share = min(max((0.5 * (evidence + shared_evidence) - MIN_EVIDENCE) / full, 0.0), 1.0)
 
+    here = (correction / scale).astype(np.float32).reshape(75)
+    equations = NormalEquations(curvature, scaled.sum(axis=0), here)
+    if earlier is not None:
+        equations = equations.plus(earlier, decay)
+
     def asked(believed: PosePrior) -> Float[np.ndarray, "25 3"]:
         stiff = believed.precision * given
         back = stiff * ((correction - believed.mean) / scale).reshape(75)
-        held = curvature + stiff * np.eye(75, dtype=np.float32)
-        found = np.linalg.solve(held, scaled.sum(axis=0) + back)
+        held = equations.curvature + stiff * np.eye(75, dtype=np.float32)
+        found = np.linalg.solve(held, equations.gradient + back)
         return found.reshape(25, 3).astype(np.float64)
 
     change = -share * scale * asked(prior)
     shortened = MAX_STEP / max(float(np.abs(change).max()), MAX_STEP)
-    return GaussNewtonStep(
-        shortened * change, evidence, correction / scale - asked(UNINFORMATIVE_PRIOR)
-    )
+    alone = correction / scale - asked(UNINFORMATIVE_PRIOR)
+    return GaussNewtonStep(shortened * change, equations, evidence, alone)
 
 
 def _agreement(

@@ -3,7 +3,8 @@
 A tracker's jitter of 2° and 1 cm costs 5-8 dB, more than anything else on real people. The field's
 gradient at a sample reaches the pose through the warp's implicit derivative, root included, as one
 wrench per bone (`avatar.kernels.numba_skinning`). A few hundred rays of a frame make one
-Gauss-Newton step (`pose_correction`); exact poses do not move, and are soon probed rarely.
+Gauss-Newton step (`pose_correction`), to which the rays of its last steps are added; exact poses do
+not move, and are soon probed rarely.
 A correction that all frames share is a change of the canonical body rather than an error of a
 frame, so the mean correction is removed continually.
 """
@@ -19,7 +20,12 @@ from torch import Tensor
 
 from avatar.kernels.backend_protocol import SkinningVolume
 from avatar.rig import Rig
-from avatar.training.pose_correction import MIN_EVIDENCE, TemporalPosePrior, gauss_newton_step
+from avatar.training.pose_correction import (
+    MIN_EVIDENCE,
+    NormalEquations,
+    TemporalPosePrior,
+    gauss_newton_step,
+)
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import (
     body_from_rest,
@@ -32,6 +38,9 @@ MAX_RAYS_PER_FRAME = 512
 """Rays per frame that are accumulated until its pose is corrected."""
 MIN_RAYS_SHARE = 0.5
 """Share of these rays from which its pose may be corrected."""
+EQUATION_DECAY = 0.85
+"""Factor of an estimated pose's earlier normal equations at each of its corrections: about seven
+corrections count. The noise of 512 rays alone is as large as the error that is left."""
 MIN_POSE_GRADIENT_CELL_M = 0.025
 """Smallest cells of the hash levels whose gradient reaches the poses, metres. Finer levels point to
 the right place from a few millimetres away only."""
@@ -106,6 +115,7 @@ class PoseOptimizer:
         poses_may_be_exact: bool = True,
         rays_per_frame: int = MAX_RAYS_PER_FRAME,
         prior_precision: float = 1.0,
+        equation_decay: float = EQUATION_DECAY,
     ) -> None:
         """Starts without poses.
 
@@ -118,9 +128,13 @@ class PoseOptimizer:
                 makes whole steps.
             rays_per_frame: Most rays of a frame that one correction of its pose follows.
             prior_precision: Precision of the given poses, relative to that of a tracker's.
+            equation_decay: Factor of a pose's earlier normal equations at each correction, in
+                [0, 1); not used where poses may be exact.
         """
         self.rig = rig
         self._rays_per_frame, self._prior_precision = rays_per_frame, prior_precision
+        self._equation_decay = 0.0 if poses_may_be_exact else equation_decay
+        self._equations: list[NormalEquations | None] = [None] * capacity
         self.poses_may_be_exact = poses_may_be_exact
         self.min_gradient_cell_m = MIN_POSE_GRADIENT_CELL_M
         self.corrections: Float[np.ndarray, "slots 25 3"] = np.zeros((capacity, 25, 3))
@@ -174,7 +188,7 @@ class PoseOptimizer:
         self.corrections[slot] = 0.0
         if correction is not None:
             self.corrections[slot] = correction
-        self._ray_counts[slot] = 0
+        self._ray_counts[slot], self._equations[slot] = 0, None
         self._update_bones(slot)
         self._joints_at_solve[slot] = self._joint_positions(slot)
 
@@ -273,8 +287,9 @@ class PoseOptimizer:
         step = gauss_newton_step(
             self.pose_gradients(slot), loss, self.corrections[slot], evidence,
             prior=prior._replace(precision=self._prior_precision * prior.precision),
+            earlier=self._equations[slot], decay=self._equation_decay,
         )  # fmt: skip
-        self._ray_counts[slot] = 0
+        self._ray_counts[slot], self._equations[slot] = 0, step.equations
         self._temporal_prior.record_estimate(slot, step.unregularized)
         self._evidence = (
             EVIDENCE_EMA_DECAY * self._evidence + (1.0 - EVIDENCE_EMA_DECAY) * step.evidence

@@ -99,3 +99,32 @@ def test_a_pose_that_is_to_move_in_any_case_makes_the_whole_step_without_evidenc
     gated = gauss_newton_step(gradients, loss, NONE, 100.0)
     assert whole.evidence == np.inf
     np.testing.assert_array_equal(whole.change, gated.change)
+
+
+def test_earlier_rays_count_as_if_they_had_been_followed_from_here(slopes, rng):
+    """Equations are linear: their gradients at another correction give those at this one."""
+    off = rng.normal(size=(25, 3)) * SCALE * 0.3
+    there, here = rng.normal(size=(2, 25, 3)) * SCALE * 0.1
+    first, last = slopes[:300], slopes[300:]
+    earlier = gauss_newton_step(*rays_of(first, off + there), there, np.inf).equations
+    step = gauss_newton_step(*rays_of(last, off + here), here, np.inf, earlier=earlier, decay=1.0)
+    together = gauss_newton_step(*rays_of(slopes, off + here), here, np.inf)
+    np.testing.assert_allclose(step.change / SCALE, together.change / SCALE, atol=0.02)
+    np.testing.assert_array_equal(step.equations.correction, together.equations.correction)
+
+
+def test_a_pose_that_remembers_its_rays_is_moved_less_by_their_noise(slopes, rng):
+    """Around the right pose, whose residuals are noise."""
+    wander = dict[float, float]()
+    for decay in (0.0, 0.85):
+        correction, earlier, sizes = NONE, None, list[float]()
+        for _ in range(20):
+            drawn = slopes[rng.choice(len(slopes), 150, replace=False)]
+            residual = np.einsum("rja,ja->r", drawn, correction) + rng.normal(size=150)
+            rays = (residual[:, None, None] * drawn).astype(np.float32)
+            loss = (0.5 * residual**2).astype(np.float32)
+            step = gauss_newton_step(rays, loss, correction, np.inf, earlier=earlier, decay=decay)
+            correction, earlier = correction + step.change, step.equations
+            sizes.append(float(np.linalg.norm(correction / SCALE)))
+        wander[decay] = float(np.mean(sizes[10:]))
+    assert wander[0.85] < 0.6 * wander[0.0]

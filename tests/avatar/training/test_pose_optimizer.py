@@ -352,6 +352,26 @@ def test_a_held_out_pose_follows_more_rays_and_its_given_pose_less(rig, bent_pos
     assert correct(1000, 0.01) > correct(1000, 1.0) > 0.0
 
 
+def test_an_estimated_pose_remembers_its_rays_until_it_is_replaced(rig, bent_pose, generator):
+    wrenches, loss = torch.randn(2, 300, 24, 6, generator=generator) + 3.0, torch.full((300,), 0.1)
+
+    def second_correction(*, exact: bool, replaced: bool):
+        table = PoseOptimizer(rig, 1, CPU, poses_may_be_exact=exact)
+        for row in range(2):
+            if row == 0 or replaced:
+                table.set_pose(0, pose_of(bent_pose))
+            table.corrections[0] = 0.0
+            table._update_bones(0)
+            table.accumulate(torch.zeros(300, dtype=torch.int64), wrenches[row], loss)
+            table.correct_next(rate=1.0)
+        return table.corrections[0]
+
+    kept, replaced = (second_correction(exact=False, replaced=r) for r in (False, True))
+    assert np.abs(kept - replaced).max() > 1e-4
+    kept, replaced = (second_correction(exact=True, replaced=r) for r in (False, True))
+    np.testing.assert_allclose(kept, replaced, atol=1e-6)
+
+
 def test_a_correction_outlives_a_checkpoint(rig, clip, tmp_path):
     trainer = Trainer(rig, TrainConfig(table_size=1 << 12, levels=3, finest_m=0.05), CPU)
     frame = next(prepare_stream(iter(clip.observations), rig, stride=0, total=None))
