@@ -183,11 +183,11 @@ class ClipFitter:
             Root mean square distance of the outlines before the step, px; robustly weighted.
         """
         equations, error = self._linearise(fitted)
-        self._add_priors(equations, fitted)
-        moved, step = equations.solve()
+        steps = self._add_priors(equations, fitted)
+        found, step = equations.solve()
+        moved = (steps @ found[..., None])[..., 0]
         zoom = float(step[-1] * self._sigma_log_focal)
         zoomed = float(np.clip(zoom, -MAX_LOG_FOCAL_STEP, MAX_LOG_FOCAL_STEP))
-        moved *= POSE_SIGMA
         moved[:, 74] -= (zoom - zoomed) * self._depths_m()  # distances go with the focal length
         moved[:, :72] = np.clip(moved[:, :72], -MAX_TURN_STEP_RAD, MAX_TURN_STEP_RAD)
         moved[:, 72:] = np.clip(moved[:, 72:], -MAX_PLACE_STEP_M, MAX_PLACE_STEP_M)
@@ -249,9 +249,15 @@ class ClipFitter:
             seen.weights,
         )
 
-    def _add_priors(self, equations: ChainEquations, fitted: FitParameters) -> None:
-        """Adds the priors of all parameters, and holds those that are not fitted."""
-        self._prior.add_to(equations, self.poses)
+    def _add_priors(
+        self, equations: ChainEquations, fitted: FitParameters
+    ) -> Float[np.ndarray, "frames 75 75"]:
+        """Adds the priors of all parameters, and holds those that are not fitted.
+
+        Returns:
+            The poses' steps by the parameters that the equations then have.
+        """
+        steps = self._prior.add_to(equations, self.poses)
         precision = np.full(len(self.coefficients) + 1, self._priors)
         state = np.concatenate([self.coefficients, [self.log_focal / self._sigma_log_focal]])
         equations.add_shared(precision, state)
@@ -259,6 +265,7 @@ class ClipFitter:
         held[:-1] = 0.0 if fitted.proportions else HELD_PRECISION
         held[-1] = 0.0 if fitted.focal else HELD_PRECISION
         equations.hold(held, 0.0 if fitted.poses else HELD_PRECISION)
+        return steps
 
 
 def _times_s(

@@ -13,7 +13,12 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from preprocess.body.body_pose import BodyPose, Motion
-from preprocess.body.kinematics import axis_angles_from_matrices, rigid_transform, rotation_matrices
+from preprocess.body.kinematics import (
+    PARENTS,
+    axis_angles_from_matrices,
+    rigid_transform,
+    rotation_matrices,
+)
 from preprocess.fitting.normal_equations import ChainEquations
 
 SIGMA_ROOT_RAD = 0.12
@@ -35,13 +40,15 @@ deviations; over n frames it grows with the root of n."""
 SHARED_PRECISION = 0.1
 """Precision of the correction that all frames share, relative to that of a frame's own: a tracker
 errs alike in all frames, and a turn that they share blurs nothing."""
-SIGMA_GUESSED_RAD = 0.08
+SIGMA_GUESSED_RAD = 0.12
 """Standard deviation of the given rotations of toes and hands, which trackers guess, radians."""
 GUESSED_JOINTS = (10, 11, 22, 23)
 """Toes and hands."""
-GIVEN_AXES = {1: "xyz", 4: "x", 7: "xz", 16: "xyz", 18: "xy"}
-"""Axes of the left joints (hip, knee, ankle, shoulder, elbow) about which people turn so freely
-that given poses say more than `LEFT_PRIORS`. Knees and elbows do not bend sideways."""
+TURN_FACTOR = 1.5
+"""Standard deviation of a given rotation relative to the root, in `JOINT_SIGMAS_RAD`."""
+UNUSUAL_TURN_RAD = 0.08
+"""Root mean square of given axis-angles about their mean in `LEFT_PRIORS` and `MIDDLE_PRIORS` at
+which the prior counts a quarter, radians: what trackers err by, or else how this person moves."""
 
 
 class PosedJoints(NamedTuple):
@@ -162,7 +169,7 @@ MIRRORED_AXES = (1.0, -1.0, -1.0)
 LEFT_PRIORS = {
     1: ((0.0, 0.0, 0.0), (0.70, 0.35, 0.30)), 4: ((0.25, 0.0, 0.0), (0.70, 0.12, 0.08)),
     7: ((0.0, 0.0, 0.0), (0.20, 0.13, 0.10)), 10: ((0.0, 0.0, 0.0), (0.10, 0.03, 0.03)),
-    13: ((0.0, 0.0, 0.0), (0.05, 0.12, 0.12)), 16: ((0.0, -0.2, -0.8), (0.50, 0.60, 0.70)),
+    13: ((0.0, 0.0, 0.0), (0.15, 0.15, 0.15)), 16: ((0.0, -0.2, -0.8), (0.50, 0.60, 0.70)),
     18: ((0.0, -0.35, 0.0), (0.40, 0.70, 0.08)), 20: ((0.0, 0.0, 0.0), (0.25, 0.20, 0.25)),
     22: ((0.0, 0.0, 0.0), (0.02, 0.02, 0.02)),
 }  # fmt: skip
@@ -194,7 +201,12 @@ wrong is drawn to its neighbors before it may count as a fast motion (graduated 
 
 @final
 class GivenPosePrior:
-    """The poses are human, and near given ones, which err alike in all frames or in neighbors."""
+    """The poses are near given ones, and human where these nearly are.
+
+    Trackers see where a body part points, and less how it lies to its parent: errors of a part's
+    rotation relative to the root say nothing about its neighbors' errors. They are alike in all
+    frames, or in frames close in time.
+    """
 
     def __init__(
         self,
@@ -206,13 +218,27 @@ class GivenPosePrior:
         self._given, self._cameras = given, camera_rotations
         links = 1.0 / (CHANGE_PER_FRAME**2 * np.maximum(np.diff(frame_numbers), 1.0))
         self._links = links[:, None] * _GIVEN_PRECISION
+        self._given_turns, self._sigma = _turns_from_root(given), _sigma_beside_given(given)
 
-    def add_to(self, equations: ChainEquations, poses: ClipPoses) -> None:
-        """Adds it to the equations of a step from the present poses, in units of `POSE_SIGMA`."""
-        apart = poses.steps_from(self._given, self._cameras) / POSE_SIGMA
+    def add_to(
+        self, equations: ChainEquations, poses: ClipPoses
+    ) -> Float[np.ndarray, "frames 75 75"]:
+        """Adds it to the equations of a step from the present poses, in units of `POSE_SIGMA`.
+
+        Returns:
+            The poses' steps by the parameters that the equations then have: rotations relative to
+            the root, in units of `POSE_SIGMA`.
+        """
+        _add_human(equations, poses, self._sigma)
+        steps = _steps_by_turns(poses) * POSE_SIGMA
+        equations.change_parameters(steps / POSE_SIGMA[:, None])
+        apart = poses.steps_from(self._given, self._cameras)
+        turned = self._given_turns.swapaxes(-1, -2) @ _turns_from_root(poses)
+        apart[:, 3:72] = rotation_vectors(turned[:, 1:]).reshape(-1, 69)
+        apart /= POSE_SIGMA
         apart -= (1.0 - SHARED_PRECISION) * apart.mean(axis=0)
         equations.add_chain(apart, _GIVEN_PRECISION, self._links)
-        _add_human(equations, poses, _SIGMA_BESIDE_GIVEN)
+        return steps
 
 
 @final
@@ -243,13 +269,20 @@ class HumanPosePrior:
         self._steady_frames = STEADY_S / float(np.median(gaps)) if len(gaps) else 1.0
         self._fast_change = FAST_CHANGE if settled else FIRST_FAST_CHANGE
 
-    def add_to(self, equations: ChainEquations, poses: ClipPoses) -> None:
-        """Adds it to the equations of a step from the present poses, in units of `POSE_SIGMA`."""
+    def add_to(
+        self, equations: ChainEquations, poses: ClipPoses
+    ) -> Float[np.ndarray, "frames 75 75"]:
+        """Adds it to the equations of a step from the present poses, in units of `POSE_SIGMA`.
+
+        Returns:
+            The poses' steps by the equations' parameters.
+        """
         _add_human(equations, poses, _SIGMA)
         each = np.arange(72, 75)
         equations.blocks[:, each, each] += (POSE_SIGMA[72:] / SIGMA_FREE) ** 2
         self._add_links(equations, poses)
         self._fast_change = max(FAST_CHANGE, 0.5 * self._fast_change)
+        return np.broadcast_to(np.diag(POSE_SIGMA), equations.blocks.shape)
 
     def _add_links(self, equations: ChainEquations, poses: ClipPoses) -> None:
         before = ClipPoses(rotations=poses.rotations[:-1], translations=poses.translations[:-1])
@@ -290,25 +323,47 @@ def _human_priors() -> tuple[Float[np.ndarray, "24 3"], Float[np.ndarray, "24 3"
     return mean, sigma
 
 
-def _sigma_beside_given() -> Float[np.ndarray, "24 3"]:
-    """Standard deviations beside given poses, which alone count about `GIVEN_AXES`."""
-    sigma = _SIGMA.copy()
-    for left, axes in GIVEN_AXES.items():
-        for axis in axes:
-            sigma[left : left + 2, "xyz".index(axis)] = SIGMA_FREE
-    return sigma
+def _sigma_beside_given(given: ClipPoses) -> Float[np.ndarray, "24 3"]:
+    """Standard deviations of the joints beside given poses, by how far these are from the means.
+
+    A joint that given poses turn far, on one side or the other, is not one that hardly turns.
+    """
+    away = ((rotation_vectors(given.rotations) - _MEAN) ** 2).mean(axis=0)
+    for left in LEFT_PRIORS:
+        away[left : left + 2] = away[left : left + 2].mean(axis=0)
+    return _SIGMA * (1.0 + away / UNUSUAL_TURN_RAD**2)  # Geman-McClure
+
+
+def _turns_from_root(poses: ClipPoses) -> Float[np.ndarray, "frames 24 3 3"]:
+    """Rotation of each joint relative to the root."""
+    turns = poses.rotations.copy()
+    for joint, parent in enumerate(PARENTS):
+        if parent > 0:
+            turns[:, joint] = turns[:, parent] @ turns[:, joint]
+    return turns
+
+
+def _steps_by_turns(poses: ClipPoses) -> Float[np.ndarray, "frames 75 75"]:
+    """Derivative of a step of poses by a step of the rotations relative to the root."""
+    steps = np.tile(np.eye(75), (len(poses.rotations), 1, 1))
+    for joint, parent in enumerate(PARENTS):
+        if parent > 0:
+            turned = poses.rotations[:, joint].swapaxes(-1, -2)
+            steps[:, 3 * joint : 3 * joint + 3, 3 * parent : 3 * parent + 3] = -turned
+    return steps
 
 
 def _given_precision() -> Float[np.ndarray, "75"]:
-    """Precision of the given poses in units of `POSE_SIGMA`."""
-    precision = np.ones((25, 3))
+    """Precision of the given rotations relative to the root, in units of `POSE_SIGMA`."""
+    precision = np.full((25, 3), TURN_FACTOR**-2.0)
+    precision[[0, 24]] = 1.0
     guessed = list(GUESSED_JOINTS)
     precision[guessed] = (POSE_SIGMA.reshape(25, 3)[guessed] / SIGMA_GUESSED_RAD) ** 2
     return precision.ravel()
 
 
 _MEAN, _SIGMA = _human_priors()
-_SIGMA_BESIDE_GIVEN, _GIVEN_PRECISION = _sigma_beside_given(), _given_precision()
+_GIVEN_PRECISION = _given_precision()
 
 
 def _inverse_right_jacobian(

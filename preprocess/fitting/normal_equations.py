@@ -75,6 +75,13 @@ class ChainEquations:
         self.right[:] -= (residuals[:, None] @ heavy)[:, 0]
         self.right_shared[:] -= np.tensordot(residuals, heavy_shared, axes=((0, 1), (0, 1)))
 
+    def change_parameters(self, by: Float[np.ndarray, "frames n n"]) -> None:
+        """Replaces each frame's parameters x by y, where x = `by` y; before there are links."""
+        back = by.swapaxes(-1, -2)
+        self.blocks[:] = back @ self.blocks @ by
+        self.borders[:] = back @ self.borders
+        self.right[:] = (back @ self.right[..., None])[..., 0]
+
     def add_chain(
         self,
         state: Float[np.ndarray, "frames n"],

@@ -46,6 +46,24 @@ def test_the_chain_is_solved_as_the_whole_matrix_is():
     assert np.allclose(found_shared, expected[frames * own :])
 
 
+def test_other_parameters_lead_to_the_same_step():
+    generator = np.random.default_rng(0)
+    by, found = generator.standard_normal((2, 3, 3)), []
+    for changes in (False, True):
+        equations = ChainEquations.empty(2, 3, 1)
+        jacobian, residuals = np.arange(1.0, 13.0).reshape(4, 3) ** 0.5, np.arange(4.0)
+        for frame in range(2):
+            equations.add(frame, jacobian, np.ones((4, 1)), residuals + frame, np.ones(4))
+        equations.blocks[:] += np.eye(3)
+        equations.add_shared(np.ones(1), np.zeros(1))
+        if changes:
+            equations.change_parameters(by)
+        moved, shared = equations.solve()
+        moved = (by @ moved[..., None])[..., 0] if changes else moved
+        found.append(np.append(moved.ravel(), shared))
+    assert np.allclose(*found)
+
+
 def test_what_is_held_does_not_move():
     equations = ChainEquations.empty(2, 3, 2)
     equations.add(0, np.eye(3), np.ones((3, 2)), np.ones(3), np.ones(3))

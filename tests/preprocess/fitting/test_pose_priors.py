@@ -4,7 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from preprocess.fitting.clip_poses import POSE_SIGMA, ClipPoses, GivenPosePrior, HumanPosePrior
+from preprocess.body.kinematics import PARENTS
+from preprocess.fitting.clip_poses import (
+    POSE_SIGMA,
+    ClipPoses,
+    GivenPosePrior,
+    HumanPosePrior,
+    rotation_vectors,
+)
 from preprocess.fitting.normal_equations import ChainEquations
 
 
@@ -49,21 +56,50 @@ def test_a_steady_turn_stays_and_jitter_goes(turning_person):
     assert np.diff(calmed, axis=0).std() < 0.35 * np.diff(before, axis=0).std()
 
 
-def test_given_knees_bend_forwards_only_and_toes_are_straight(turning_person):
-    motion, cameras = turning_person(5), np.tile(np.eye(3), (5, 1, 1))
-    off = motion.joint_rotations.copy()
-    off[:, 3] = 0.5, 0.4, 0.3  # a knee
-    off[:, 15] = 0.2, -0.3, -1.2  # a shoulder
-    off[:, 9] = 0.0, 0.2, 0.0  # toes
-    given = ClipPoses.of(replace(motion, joint_rotations=off), range(5))
-    prior, poses = GivenPosePrior(given, cameras, np.arange(5.0)), given
+def beside_given(given: ClipPoses, hip_turn: float | None = None) -> ClipPoses:
+    """Where the prior beside given poses leads, if something says how a left hip has turned."""
+    count = len(given.translations)
+    cameras, poses = np.tile(np.eye(3), (count, 1, 1)), given
+    prior, by_hip = GivenPosePrior(given, cameras, np.arange(float(count))), np.eye(75)[3:6]
     for _ in range(8):
-        equations = ChainEquations.empty(5, 75, 1)
-        prior.add_to(equations, poses)
+        equations = ChainEquations.empty(count, 75, 1)
+        steps = poses.steps_from(given, cameras)
+        for frame in range(count if hip_turn is not None else 0):
+            off = (steps[frame, 3:6] - (hip_turn, 0.0, 0.0)) / POSE_SIGMA[3:6]
+            equations.add(frame, by_hip, np.zeros((3, 1)), off, np.full(3, 1e6))
+        by = prior.add_to(equations, poses)
         equations.add_shared(np.ones(1), np.zeros(1))
-        poses = poses.moved(equations.solve()[0] * POSE_SIGMA, cameras)
-    joints = poses[2].joint_rotations
-    assert np.abs(joints[3, 1:]).max() < 0.15
-    assert joints[3, 0] > 0.4
-    assert np.allclose(joints[15], off[2, 15], atol=1e-3)
-    assert abs(joints[9, 1]) < 0.05
+        poses = poses.moved((by @ equations.solve()[0][..., None])[..., 0], cameras)
+    return poses
+
+
+def test_given_knees_and_toes_nearly_as_usual_are_straightened(turning_person):
+    motion = turning_person(5)
+    off = motion.joint_rotations.copy()
+    off[:, [3, 4], 1:] = 0.0
+    off[:, 3, 1:] = 0.05, 0.05  # a knee
+    off[:, 15] = 0.2, -0.3, -1.2  # a shoulder
+    off[:, 9] = 0.0, 0.05, 0.0  # toes
+    given = ClipPoses.of(replace(motion, joint_rotations=off), range(5))
+    joints = beside_given(given)[2].joint_rotations
+    assert np.abs(joints[3, 1:]).max() < 0.03
+    assert np.allclose(joints[15], off[2, 15], atol=0.01)
+    assert abs(joints[9, 1]) < 0.03
+
+
+def test_given_knees_that_are_clearly_unusual_stay(turning_person):
+    motion = turning_person(5)
+    off = motion.joint_rotations.copy()
+    off[:, 3] = 0.5, 0.4, 0.3
+    given = ClipPoses.of(replace(motion, joint_rotations=off), range(5))
+    assert np.allclose(beside_given(given)[2].joint_rotations[3], off[2, 3], atol=0.1)
+
+
+def test_a_shin_points_where_it_did_when_the_thigh_turns(turning_person):
+    given = ClipPoses.of(turning_person(5), range(5))
+    rest = np.zeros((24, 3))
+    turned = beside_given(given, hip_turn=0.15)
+    before, after = (each.joints(rest, np.array(PARENTS)).turns for each in (given, turned))
+    apart = np.linalg.norm(rotation_vectors(before.swapaxes(-1, -2) @ after), axis=-1)
+    assert np.allclose(apart[:, 1], 0.15, atol=0.01)
+    assert apart[:, 4].max() < 0.03
