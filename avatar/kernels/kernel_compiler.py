@@ -119,6 +119,24 @@ def load4(typing_context, array, row, column):
 
 
 @operation
+def prefetch(typing_context, array, row, column):
+    """Has the cache fetch `array[row, column]` for a later read; neither is checked."""
+
+    def code(context, builder, signature, arguments):
+        byte, number = ir.IntType(8).as_pointer(), ir.IntType(32)
+        fetch = cgutils.get_or_insert_function(
+            builder.module,
+            ir.FunctionType(ir.VoidType(), [byte, number, number, number]),
+            "llvm.prefetch.p0",
+        )
+        place = builder.bitcast(_row_pointer(context, builder, signature, arguments), byte)
+        builder.call(fetch, [place, *(ir.Constant(number, n) for n in (0, 3, 1))])
+        return context.get_dummy_value()
+
+    return none(array, intp, intp), code
+
+
+@operation
 def store4(typing_context, array, row, column, values):
     """`array[row, column : column + 4] = values`; row and column are not checked."""
 

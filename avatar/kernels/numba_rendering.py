@@ -3,7 +3,7 @@
 import numpy as np
 from numba import prange
 
-from avatar.kernels.kernel_compiler import FAST_MATH, NO_ALLOCATION, compile_kernel
+from avatar.kernels.kernel_compiler import FAST_MATH, NO_ALLOCATION, compile_kernel, prefetch
 from avatar.kernels.torch_reference import (
     ALPHA_DEAD_ZONE,
     COLOR_HUBER_DELTA,
@@ -15,6 +15,8 @@ from avatar.kernels.torch_reference import (
 F32, I32, U32 = np.float32, np.int32, np.uint32
 UNLIMITED_STEPS = 10**9
 """Opaque margin, in samples, from which a ray does not end at a surface (exact rendering)."""
+RAYS_PER_BLOCK = 16
+"""Training rays whose cells are fetched before any of them is marched; they fit the first cache."""
 
 
 @compile_kernel(inline="always")
@@ -78,6 +80,61 @@ def _cached_density(occupied, density, low, cells_per_m, x, y, z, needs_density)
     return density[a, b, c] if needs_density else F32(0)
 
 
+@compile_kernel(inline="always", **FAST_MATH)
+def _enter_grid(origins, directions, ray, low, shape, slot, cell_m):
+    """A ray in the cells of its slot's grid: `g = o + t d` is in cells, t in metres.
+
+    Returns:
+        o; d; dt / dg along each axis; t where the ray enters the grid, and where it leaves.
+    """
+    cells_a_m = F32(1) / cell_m
+    ox = (origins[ray, 0] - low[slot, 0]) * cells_a_m
+    oy = (origins[ray, 1] - low[slot, 1]) * cells_a_m
+    oz = (origins[ray, 2] - low[slot, 2]) * cells_a_m
+    dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
+    ix, iy, iz = cell_m / nonzero(dx), cell_m / nonzero(dy), cell_m / nonzero(dz)
+    ax, ay, az = -ox * ix, -oy * iy, -oz * iz
+    bx, by, bz = (
+        (F32(shape[slot, 0]) - ox) * ix,
+        (F32(shape[slot, 1]) - oy) * iy,
+        (F32(shape[slot, 2]) - oz) * iz,
+    )
+    enter = max(max(min(ax, bx), min(ay, by)), max(min(az, bz), F32(0)))
+    leave = min(min(max(ax, bx), max(ay, by)), max(az, bz))
+    return (
+        ox, oy, oz, dx * cells_a_m, dy * cells_a_m, dz * cells_a_m, ix, iy, iz, enter, leave
+    )  # fmt: skip
+
+
+@compile_kernel(inline="always", **FAST_MATH)
+def _fetch_cells(
+    origins, directions, ray, slots, low, shape, cell_m, cell_index, cell_roots, roots
+):
+    """Fetches the cells along a ray, a cell's edge apart; with `roots`, the roots of these cells.
+
+    Marching waits for memory otherwise: rays of many frames share no cells, and which root is read
+    depends on the cell.
+    """
+    slot = U32(slots[ray])
+    ox, oy, oz, dx, dy, dz, _, _, _, t, leave = _enter_grid(
+        origins, directions, ray, low, shape, slot, cell_m
+    )
+    nx, ny, nz = shape[slot, 0], shape[slot, 1], shape[slot, 2]
+    slot_roots = cell_roots[slot]
+    while t < leave:
+        i, j = _cell_index(ox + t * dx, nx), _cell_index(oy + t * dy, ny)
+        flat = (i * U32(ny) + j) * U32(nz) + _cell_index(oz + t * dz, nz)
+        if not roots:
+            prefetch(cell_index, slot, flat)
+        else:
+            packed = cell_index[slot, flat]
+            if packed > 0:
+                row, rows = packed >> 3, (packed & 3) * (3 if packed & 4 else 1)
+                prefetch(slot_roots, row, 0)
+                prefetch(slot_roots, row + rows - 1, 11)
+        t += cell_m
+
+
 @compile_kernel(parallel=True, **NO_ALLOCATION)
 def march(
     origins, directions, slots, jitter, sample_step_m,
@@ -93,69 +150,70 @@ def march(
     """
     most = U32(points.shape[1])
     ends = opaque_margin_steps < UNLIMITED_STEPS
-    cells_a_m, steps_a_m = F32(1) / cell_m, F32(1) / sample_step_m
-    for ray in prange(origins.shape[0]):
-        slot = U32(slots[ray])
-        nx, ny, nz = cell_shape[slot, 0], cell_shape[slot, 1], cell_shape[slot, 2]
-        # positions on the ray are in cells, t is in metres: g = o + t d, and ix = dt / dg_x
-        ox = (origins[ray, 0] - cell_low[slot, 0]) * cells_a_m
-        oy = (origins[ray, 1] - cell_low[slot, 1]) * cells_a_m
-        oz = (origins[ray, 2] - cell_low[slot, 2]) * cells_a_m
-        dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
-        ix, iy, iz = cell_m / nonzero(dx), cell_m / nonzero(dy), cell_m / nonzero(dz)
-        dx, dy, dz = dx * cells_a_m, dy * cells_a_m, dz * cells_a_m
-        ax, ay, az = -ox * ix, -oy * iy, -oz * iz
-        bx, by, bz = (F32(nx) - ox) * ix, (F32(ny) - oy) * iy, (F32(nz) - oz) * iz
-        enter = max(max(min(ax, bx), min(ay, by)), max(min(az, bz), F32(0)))
-        leave = min(min(max(ax, bx), max(ay, by)), max(az, bz))
-        wx = F32(1) if ix > 0 else F32(0)  # the far wall of a cell
-        wy = F32(1) if iy > 0 else F32(0)
-        wz = F32(1) if iz > 0 else F32(0)
-        optical, left, kept, step = F32(0), opaque_margin_steps, U32(0), F32(0)
-        while kept < most:
-            t = enter + (step + jitter[ray]) * sample_step_m
-            if t >= leave:
-                break
-            gx, gy, gz = ox + t * dx, oy + t * dy, oz + t * dz
-            i, j, k = _cell_index(gx, nx), _cell_index(gy, ny), _cell_index(gz, nz)
-            packed = cell_index[slot, (i * U32(ny) + j) * U32(nz) + k]
-            if packed <= 0:
-                way_x, way_y = (F32(i) + wx - gx) * ix, (F32(j) + wy - gy) * iy
-                way = min(min(way_x, way_y), (F32(k) + wz - gz) * iz)
-                if packed < -1:  # empty within -packed - 1 more cells in every direction
-                    more = F32(-packed - 1)
-                    way = min(way_x + more * abs(ix), way_y + more * abs(iy))
-                    way = min(way, (F32(k) + wz - gz) * iz + more * abs(iz))
-                step += max(F32(1), np.ceil(way * steps_a_m))
-                continue
-            ex = (gx - (F32(i) + F32(0.5))) * cell_m
-            ey = (gy - (F32(j) + F32(0.5))) * cell_m
-            ez = (gz - (F32(k) + F32(0.5))) * cell_m
-            best, chosen = F32(-1), U32(0)
-            px, py, pz = F32(0), F32(0), F32(0)
-            row, bent = U32(packed >> 3), packed & 4
-            asked = ends or packed & 3 > 1
-            for _ in range(packed & 3):
-                x, y, z = canonical_point(cell_roots, slot, row, bent, ex, ey, ez)
-                here = _cached_density(occupied, density, low, cells_per_m, x, y, z, asked)
-                if here > best:
-                    best, chosen = here, row
-                    px, py, pz = x, y, z
-                row += U32(3) if bent else U32(1)
-            if best >= F32(0):
-                points[ray, kept, 0] = px
-                points[ray, kept, 1] = py
-                points[ray, kept, 2] = pz
-                rows[ray, kept] = chosen
-                kept += U32(1)
-                optical += best * sample_step_m
-                if optical > F32(OPAQUE_DEPTH):
-                    left -= 1
-                    if left < 0:
-                        break
-            step += F32(1)
-        counts[ray] = kept
-        next_steps[ray] = I32(step)
+    steps_a_m = F32(1) / sample_step_m
+    for block in prange((origins.shape[0] + RAYS_PER_BLOCK - 1) // RAYS_PER_BLOCK):
+        first = block * RAYS_PER_BLOCK
+        last = min(first + RAYS_PER_BLOCK, origins.shape[0])
+        for fetch in range(2 if ends else 0):
+            for ray in range(first, last):
+                _fetch_cells(
+                    origins, directions, ray, slots, cell_low, cell_shape, cell_m,
+                    cell_index, cell_roots, fetch == 1,
+                )  # fmt: skip
+        for ray in range(first, last):
+            slot = U32(slots[ray])
+            nx, ny, nz = cell_shape[slot, 0], cell_shape[slot, 1], cell_shape[slot, 2]
+            ox, oy, oz, dx, dy, dz, ix, iy, iz, enter, leave = _enter_grid(
+                origins, directions, ray, cell_low, cell_shape, slot, cell_m
+            )
+            wx = F32(1) if ix > 0 else F32(0)  # the far wall of a cell
+            wy = F32(1) if iy > 0 else F32(0)
+            wz = F32(1) if iz > 0 else F32(0)
+            optical, left, kept, step = F32(0), opaque_margin_steps, U32(0), F32(0)
+            while kept < most:
+                t = enter + (step + jitter[ray]) * sample_step_m
+                if t >= leave:
+                    break
+                gx, gy, gz = ox + t * dx, oy + t * dy, oz + t * dz
+                i, j, k = _cell_index(gx, nx), _cell_index(gy, ny), _cell_index(gz, nz)
+                packed = cell_index[slot, (i * U32(ny) + j) * U32(nz) + k]
+                if packed <= 0:
+                    way_x, way_y = (F32(i) + wx - gx) * ix, (F32(j) + wy - gy) * iy
+                    way = min(min(way_x, way_y), (F32(k) + wz - gz) * iz)
+                    if packed < -1:  # empty within -packed - 1 more cells in every direction
+                        more = F32(-packed - 1)
+                        way = min(way_x + more * abs(ix), way_y + more * abs(iy))
+                        way = min(way, (F32(k) + wz - gz) * iz + more * abs(iz))
+                    step += max(F32(1), np.ceil(way * steps_a_m))
+                    continue
+                ex = (gx - (F32(i) + F32(0.5))) * cell_m
+                ey = (gy - (F32(j) + F32(0.5))) * cell_m
+                ez = (gz - (F32(k) + F32(0.5))) * cell_m
+                best, chosen = F32(-1), U32(0)
+                px, py, pz = F32(0), F32(0), F32(0)
+                row, bent = U32(packed >> 3), packed & 4
+                asked = ends or packed & 3 > 1
+                for _ in range(packed & 3):
+                    x, y, z = canonical_point(cell_roots, slot, row, bent, ex, ey, ez)
+                    here = _cached_density(occupied, density, low, cells_per_m, x, y, z, asked)
+                    if here > best:
+                        best, chosen = here, row
+                        px, py, pz = x, y, z
+                    row += U32(3) if bent else U32(1)
+                if best >= F32(0):
+                    points[ray, kept, 0] = px
+                    points[ray, kept, 1] = py
+                    points[ray, kept, 2] = pz
+                    rows[ray, kept] = chosen
+                    kept += U32(1)
+                    optical += best * sample_step_m
+                    if optical > F32(OPAQUE_DEPTH):
+                        left -= 1
+                        if left < 0:
+                            break
+                step += F32(1)
+            counts[ray] = kept
+            next_steps[ray] = I32(step)
 
 
 @compile_kernel(**NO_ALLOCATION)
