@@ -37,6 +37,9 @@ INTERIOR_DEPTH_M = 0.015
 MIN_COMPONENT_SHARE = 0.003
 """Size, relative to the largest component, below which a component is a floater."""
 
+FLOATER_INTERVAL = 4
+"""Updates of the occupancy between searches for floaters."""
+
 
 @final
 class OccupancyGrid:
@@ -65,6 +68,7 @@ class OccupancyGrid:
         self._near_skin = rig.skin_distance <= NEAR_SKIN_M
         self._rig = rig
         self._cached_empty_cells: tuple[int, Tensor] | None = None
+        self._floaters, self._updates = torch.zeros_like(self._in_band), 0
 
     @torch.no_grad()
     def update(
@@ -100,9 +104,11 @@ class OccupancyGrid:
         ).to(torch.uint8)
         occupied = dilate(dense) & self._in_band
         if drop_floaters:
-            occupied &= 1 - find_floaters(
-                self.density_grid.density > SOLID_DENSITY, self._near_skin
-            )
+            if self._updates % FLOATER_INTERVAL == 0:
+                solid = self.density_grid.density > SOLID_DENSITY
+                self._floaters = find_floaters(solid, self._near_skin)
+            occupied &= 1 - self._floaters
+            self._updates += 1
         self.density_grid.occupied.copy_(occupied)
 
     def for_rendering(self, sample_step_m: float) -> DensityGrid:

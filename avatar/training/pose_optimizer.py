@@ -149,6 +149,7 @@ class PoseOptimizer:
         self._ray_counts = torch.zeros(capacity, dtype=torch.int64, device=device)
         self._tracker_poses: list[BodyPose | None] = [None] * capacity
         self._joint_transforms = np.zeros((capacity, 24, 4, 4))
+        self._root_turns = np.zeros((capacity, 3, 3))
         self._joints_at_solve = np.zeros((capacity, 24, 3))
         self._rest_from_canonical = np.linalg.inv(
             body_from_rest(rig.rest_joints, rig.parents, rig.canonical_rotations)
@@ -262,8 +263,9 @@ class PoseOptimizer:
         rank = torch.arange(len(slots), device=slots.device) - (counts.cumsum(0) - counts)[slots]
         place = self._ray_counts[slots] + rank
         kept = (place < self._rays_per_frame) & self._is_correctable[slots]
-        self._wrenches[slots[kept], place[kept]] = wrenches[kept]
-        self._losses[slots[kept], place[kept]] = loss[kept]
+        row = (slots * self._rays_per_frame + place)[kept]
+        self._wrenches.view(-1, 24, 6).index_copy_(0, row, wrenches[kept])
+        self._losses.view(-1).index_copy_(0, row, loss[kept])
         self._ray_counts = (self._ray_counts + counts * self._is_correctable).clamp(
             max=self._rays_per_frame
         )
@@ -333,10 +335,8 @@ class PoseOptimizer:
 
     def root_correction(self, slot: int) -> RootCorrection:
         """Motion of the slot's rays by its root correction."""
-        turn, shift = self.corrections[slot, 0], self.corrections[slot, 24]
-        return RootCorrection(
-            rotation=rotation_matrices(turn), shift=shift, pivot=self.rig.rest_joints[0]
-        )
+        turn, shift = self._root_turns[slot], self.corrections[slot, 24]
+        return RootCorrection(rotation=turn, shift=shift, pivot=self.rig.rest_joints[0])
 
     def pose_gradients(self, slot: int) -> Float[np.ndarray, "rays 25 3"]:
         """Gradient of each accumulated ray's loss with respect to the slot's correction.
@@ -352,7 +352,7 @@ class PoseOptimizer:
         carried = np.concatenate([turned @ across, -turned], axis=2)
         felt[:24] = self._descendants[:, None, :, None] * carried[:, :, None]
         # the shift lives in the given body frame, the force in the corrected one
-        felt[24, :, :, :3] = -rotation_matrices(self.corrections[slot, 0])[:, None]
+        felt[24, :, :, :3] = -self._root_turns[slot][:, None]
         flat = felt.reshape(75, 144).astype(np.float32)
         return (wrench.reshape(-1, 144) @ flat.T).reshape(-1, 25, 3)
 
@@ -377,9 +377,11 @@ class PoseOptimizer:
         rig = self.rig
         given = self._tracker_poses[slot]
         assert given is not None
-        turns = rotation_matrices(np.stack([given.joint_rotations, self.corrections[slot, 1:24]]))
-        self._joint_transforms[slot] = joint_transforms(
-            rig.rest_joints, rig.parents, np.concatenate([np.eye(3)[None], turns[0] @ turns[1]])
+        turns = rotation_matrices(
+            np.concatenate([given.joint_rotations, self.corrections[slot, :24]])
         )
+        self._root_turns[slot] = turns[23]
+        joints = np.concatenate([np.eye(3)[None], turns[:23] @ turns[24:]])
+        self._joint_transforms[slot] = joint_transforms(rig.rest_joints, rig.parents, joints)
         bones = (self._joint_transforms[slot] @ self._rest_from_canonical)[:, :3].reshape(24, 12)
         self.bones[slot] = torch.from_numpy(bones.astype(np.float32)).to(self.bones.device)
