@@ -36,7 +36,6 @@ INTERIOR_DEPTH_M = 0.015
 """Depth under the skin from which the body is solid even if its shape fits badly, metres."""
 MIN_COMPONENT_SHARE = 0.003
 """Size, relative to the largest component, below which a component is a floater."""
-
 FLOATER_INTERVAL = 4
 """Updates of the occupancy between searches for floaters."""
 
