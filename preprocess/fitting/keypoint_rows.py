@@ -48,6 +48,9 @@ DEPTH_PAIRS = (
     (29, 31, 0.15), (30, 32, 0.15), (7, 8, 0.04), (7, 0, 0.04), (8, 0, 0.04),
 )  # fmt: skip
 """Key points whose difference in depth is compared, and its standard deviation, metres."""
+NEARER_M = ((11, 12, 0.06), (13, 14, 0.10), *((hand, hand + 1, 0.135) for hand in (15, 17, 19, 21)))
+"""Left and right key points, and how much too near they are found, compared with the hips, metres:
+shoulders, elbows, wrists and hands. Means of five motions, in all of which they are."""
 ROBUST_DEPTH = 3.0
 """Standard deviations at which a difference in depth counts a quarter."""
 MIN_PRESENCE = 0.5
@@ -102,7 +105,7 @@ class ClipKeypoints:
 
     Attributes:
         pixels: In pixels of the reduced masks.
-        depths_m: Distance along the view of each key point, from any place.
+        depths_m: Distance along the view of each key point, from any place, with `NEARER_M`.
         confidence: What each key point counts, in [0, 1]; 0 in frames without key points.
     """
 
@@ -142,7 +145,7 @@ class ClipKeypoints:
         depths = (track.world_m[rows] * view[:, None]).sum(axis=-1)
         return cls(
             pixels=pixels,
-            depths_m=depths / _world_scale(track, rest_joints),
+            depths_m=depths / _world_scale(track, rest_joints) + _NEARER_M,
             confidence=np.where(known[:, None], track.visibility[rows], 0.0),
         )
 
@@ -276,6 +279,9 @@ class KeypointModel:
         return placed
 
 
+_NEARER_M = np.zeros(33)
+for _left, _right, _nearer in NEARER_M:
+    _NEARER_M[[_left, _right]] = _nearer
 _PAIRS = np.array([pair[:2] for pair in DEPTH_PAIRS])
 _PAIR_SIGMAS = np.array([pair[2] for pair in DEPTH_PAIRS])
 
