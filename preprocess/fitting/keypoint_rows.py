@@ -50,7 +50,7 @@ DEPTH_PAIRS = (
 """Key points whose difference in depth is compared, and its standard deviation, metres."""
 NEARER_M = ((11, 12, 0.06), (13, 14, 0.10), *((hand, hand + 1, 0.135) for hand in (15, 17, 19, 21)))
 """Left and right key points, and how much too near they are found, compared with the hips, metres:
-shoulders, elbows, wrists and hands. Means of five motions, in all of which they are."""
+shoulders, elbows, wrists and hands. Means of five films of actors, alike in sign."""
 ROBUST_DEPTH = 3.0
 """Standard deviations at which a difference in depth counts a quarter."""
 MIN_PRESENCE = 0.5
