@@ -49,8 +49,8 @@ DEPTH_PAIRS = (
 )  # fmt: skip
 """Key points whose difference in depth is compared, and its standard deviation, metres."""
 NEARER_M = ((11, 12, 0.06), (13, 14, 0.10), *((hand, hand + 1, 0.135) for hand in (15, 17, 19, 21)))
-"""Left and right key points, and how much too near they are found, compared with the hips, metres:
-shoulders, elbows, wrists and hands. Means of five films of actors, alike in sign."""
+"""Left and right key points that BlazePose finds too near to the camera, relative to the hips, and
+by how much, metres: shoulders, elbows, wrists and hands. Means of five films, all of one sign."""
 ROBUST_DEPTH = 3.0
 """Standard deviations at which a difference in depth counts a quarter."""
 MIN_PRESENCE = 0.5
@@ -105,7 +105,7 @@ class ClipKeypoints:
 
     Attributes:
         pixels: In pixels of the reduced masks.
-        depths_m: Distance along the view of each key point, from any place, with `NEARER_M`.
+        depths_m: Depth of each key point, from any origin, corrected by `NEARER_M`.
         confidence: What each key point counts, in [0, 1]; 0 in frames without key points.
     """
 
