@@ -196,7 +196,7 @@ class MaskRefiner:
         alpha = band.inside.astype(np.float32)
         alpha[at] = odds / (np.float32(1.0) + odds)
         alpha[shown] = 0.0
-        return alpha
+        return _without_islands(alpha, band.inside)
 
     def _color_frequencies(self, band: _Band) -> tuple[Pixels, Pixels]:
         """How frequent the band's colors are on the person, and around them."""
@@ -254,6 +254,16 @@ def _find_band(image: Channels, soft: Plane, unit_px: float) -> tuple[_Band | No
         columns=columns,
         colors=np.stack([plane.ravel()[index] for plane in part]),
     ), far
+
+
+def _without_islands(alpha: Plane, inside: PixelMask) -> Plane:
+    """Clear parts that are cut off from the person, unless the network saw person there."""
+    _, found = cv2.connectedComponents((alpha > 0.5).astype(np.uint8), ltype=cv2.CV_16U)
+    labels = np.asarray(found, dtype=np.uint16)
+    kept = np.zeros(2**16, np.float32)
+    kept[0] = 1.0  # what is less likely person
+    kept[labels[inside]] = 1.0
+    return alpha * kept[labels]
 
 
 def _color_bins(colors: Float32[np.ndarray, "3 *pixels"]) -> Int[np.ndarray, "*pixels"]:
