@@ -79,7 +79,7 @@ def test_a_dark_film_is_bad_input(track_film, frames):
 def test_a_picture_that_stands_still_shows_one_side_only(track_film, frames):
     code, grade, told = track_film(frames[:1] * 12)
     assert code == 0
-    assert grade["directions_seen"] < 0.1
+    assert grade["directions_seen"] < 0.2  # one of twelve, two if it lies between them
     assert "The sides that the camera never saw will be guesses" in told
 
 
