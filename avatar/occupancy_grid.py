@@ -198,7 +198,7 @@ def in_occupied_cells(
 
 
 def dilate(occupied: UInt8[Tensor, "x y z"]) -> UInt8[Tensor, "x y z"]:
-    """The cells and their six neighbours."""
+    """The cells and their six neighbors."""
     out = occupied.clone()
     for axis in range(3):
         length = occupied.shape[axis] - 1

@@ -152,7 +152,7 @@ MECHANISMS = [
         ),
     ),
     Mechanism(
-        name="neighbours' pose errors",
+        name="neighbors' pose errors",
         patched={"avatar.training.pose_correction.NEIGHBOR_PRECISION": 0.0},
         code=(
             "avatar.training.pose_correction.TemporalPosePrior",

@@ -128,7 +128,7 @@ def prior_from_neighbors(
 def interpolate_correction(
     frame: int, corrections: Mapping[int, Float[np.ndarray, "25 3"]]
 ) -> Float[np.ndarray, "25 3"]:
-    """The correction of a frame that was never learnt from, by those of its neighbours.
+    """The correction of a frame that was never learnt from, by those of its neighbors.
 
     Args:
         frame: Its number.

@@ -106,7 +106,7 @@ FRAME_GRID_INTERVAL = 4
 
 
 def threshold_and_dilate(density: Float32[Tensor, "x y z"]) -> UInt8[Tensor, "x y z"]:
-    """Cells that hold something, and all their neighbours."""
+    """Cells that hold something, and all their neighbors."""
     opacity = 1.0 - torch.exp(-0.01 * density)
     full = (opacity > opacity.mean().clamp(max=GRID_OPACITY)).float()
     return torch.nn.functional.max_pool3d(full[None], 3, stride=1, padding=1)[0].to(torch.uint8)
