@@ -18,6 +18,7 @@ from jaxtyping import Float32
 from avatar.kernels import torch_correspondence, torch_reference
 from avatar.kernels.backend_protocol import (
     FEATURES_PER_LEVEL,
+    AdamSettings,
     Backend,
     CorrespondenceTables,
     DensityGrid,
@@ -47,6 +48,7 @@ class TorchBackend:
     scatter_max_density = staticmethod(torch_reference.scatter_max_density)
     bone_wrenches = staticmethod(torch_correspondence.bone_wrenches)
     update_roots = staticmethod(torch_correspondence.update_roots)
+    adam_step = staticmethod(torch_reference.adam_step)
 
     def encode(self, points, table, levels):
         with torch.no_grad():
@@ -165,6 +167,8 @@ def failing_operation(backend: Backend) -> str | None:
         grad_table = torch.zeros_like(table)
         of.encode_backward(points, slope, levels, grad_table)
         rendered, loss, grad = of.composite_loss(raw, samples, 0.01, target, background, 0.1, 0.1)
+        how, stepped = AdamSettings(0.1, (0.9, 0.99), 1e-15, 3), table.clone()
+        of.adam_step(how, table.clone(), 0.1 * table, table.square(), stepped)
         return {
             "encode": of.encode(points, table, levels),
             "encode_backward": grad_table,
@@ -175,6 +179,7 @@ def failing_operation(backend: Backend) -> str | None:
             "march": _march_to_seeds(of, cells, rig, bones, canonical),
             "composite": of.composite(raw, samples, 0.01),
             "composite_loss": torch.cat([rendered.flatten(), loss, grad.flatten() * len(loss)]),
+            "adam_step": stepped,
         }
 
     expected = results(TorchBackend())

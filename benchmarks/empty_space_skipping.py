@@ -18,7 +18,7 @@ from avatar.kernels.backend_protocol import RayBatch
 from avatar.render import correspondence_tables, render
 from avatar.training.frame_stream import RayView, TrainingFrame, rebuild_frame
 from avatar.training.replay_buffer import ReplayBuffer
-from avatar.training.trainer import cosine_decay
+from avatar.training.trainer import cosine_decay, step_optimizer
 from benchmarks.dense_sampling import DenseSampler, dense_as_in_paper, dense_in_box
 from benchmarks.measurements import Measurement
 from benchmarks.sample_training import LoadedTrainer
@@ -102,8 +102,7 @@ def dense_step(
             config.alpha_weight, config.hard_surface_weight,
         )  # fmt: skip
         field.backward(activations, grad)
-        trainer.optimizer.step()
-        field.table_grad.zero_()
+        step_optimizer(trainer.optimizer, trainer.backend)
         return len(samples.points)
 
     return step

@@ -235,6 +235,28 @@ class MarchSettings(NamedTuple):
         return int(min(self.opaque_margin_m / self.sample_step_m + 1.0, 1e9))
 
 
+class AdamSettings(NamedTuple):
+    """Rates of one step of Adam (Kingma and Ba 2015).
+
+    Attributes:
+        rate: Learning rate.
+        betas: Decays of the running means of the gradients and of their squares.
+        eps: Added to the root of the latter.
+        steps: Number of steps, this one included.
+    """
+
+    rate: float
+    betas: tuple[float, float]
+    eps: float
+    steps: int
+
+    @property
+    def scales(self) -> tuple[float, float]:
+        """Factors of the mean and of the squares' root, which correct that both started at 0."""
+        first, second = self.betas
+        return self.rate / (1.0 - first**self.steps), (1.0 - second**self.steps) ** -0.5
+
+
 @runtime_checkable
 class Backend(Protocol):
     """The operations of a training step, each defined by its reference in `torch_*`.
@@ -258,6 +280,15 @@ class Backend(Protocol):
         self, points: Points, grad_features: Features, table: HashTable, levels: HashLevels
     ) -> Points:
         """Gradient of the features with respect to the points."""
+        ...
+
+    def adam_step(
+        self, how: AdamSettings, grad: Tensor, mean: Tensor, square: Tensor, parameter: Tensor
+    ) -> None:
+        """Takes Adam's step on contiguous tensors, in place, and zeroes the gradient.
+
+        `mean` and `square` are the running means of the gradient and of its square.
+        """
         ...
 
     def solve_correspondences(

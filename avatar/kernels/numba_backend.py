@@ -87,6 +87,13 @@ class NumbaBackend(Backend):
             points.numpy(), *_level_arrays(levels), grad_features.numpy(), grad_table.numpy()
         )
 
+    def adam_step(self, how, grad, mean, square, parameter):
+        (first, second), (rate, scale) = how.betas, how.scales
+        numba_hash_grid.adam_step(
+            *(part.detach().view(-1).numpy() for part in (grad, mean, square, parameter)),
+            *map(np.float32, (rate, 1.0 - first, 1.0 - second, scale, how.eps)),
+        )
+
     def solve_correspondences(self, rig, bones, band_m, cell_m, device):
         return SolvedCorrespondences(
             *numba_correspondence.solve_correspondences(rig, bones, band_m, cell_m)

@@ -1,4 +1,4 @@
-"""Hash-grid encoding and its gradients, compiled for the CPU.
+"""Hash-grid encoding, its gradients, and Adam's step on it, compiled for the CPU.
 
 Points are worked on in blocks that stay in the nearest cache: first where all of a block's corners
 lie, in loops over points that LLVM vectorises, then the entries themselves, four features at once.
@@ -21,6 +21,8 @@ from avatar.kernels.kernel_compiler import (
 )
 
 POINTS_PER_BLOCK = 256
+ENTRIES_PER_BLOCK = 4096
+"""Numbers that one turn of Adam's loop over blocks works on."""
 F32, I32, U32 = np.float32, np.int32, np.uint32
 PRIME_Y, PRIME_Z = U32(PRIMES[1]), U32(PRIMES[2])
 
@@ -197,3 +199,20 @@ def encode_points_backward(
         for i in range(number):
             for axis in range(3):
                 grad_points[start + i, axis] = total[axis, i]
+
+
+@compile_kernel(parallel=True, **FAST_MATH)
+def adam_step(grad, mean, square, parameter, rate, new_share, new_square_share, scale, eps):
+    """Adam's step on flat arrays; the gradient is zeroed in the same pass over the memory.
+
+    Blocks are slices, because LLVM vectorises only loops that begin at 0.
+    """
+    for block in prange((parameter.shape[0] + ENTRIES_PER_BLOCK - 1) // ENTRIES_PER_BLOCK):
+        part = slice(block * ENTRIES_PER_BLOCK, (block + 1) * ENTRIES_PER_BLOCK)
+        g, m, v, p = grad[part], mean[part], square[part], parameter[part]
+        for i in range(p.shape[0]):
+            here = g[i]
+            m[i] += (here - m[i]) * new_share
+            v[i] += (here * here - v[i]) * new_square_share
+            p[i] -= rate * m[i] / (np.sqrt(v[i]) * scale + eps)
+            g[i] = F32(0)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from avatar.kernels.backend_protocol import (
     PRIMES,
+    AdamSettings,
     CorrespondenceTables,
     DensityGrid,
     HashLevels,
@@ -73,6 +74,18 @@ def _table_entries(
         return first + x + nx * (y + ny * z)
     hashed = (x * PRIMES[0]) ^ (y * PRIMES[1]) ^ (z * PRIMES[2])
     return first + (hashed & (last - first - 1))
+
+
+def adam_step(
+    how: AdamSettings, grad: Tensor, mean: Tensor, square: Tensor, parameter: Tensor
+) -> None:
+    """Adam's step, in place (Kingma and Ba 2015, algorithm 1); the gradient is zeroed."""
+    (first, second), (rate, scale) = how.betas, how.scales
+    with torch.no_grad():
+        mean.lerp_(grad, 1.0 - first)
+        square.mul_(second).addcmul_(grad, grad, value=1.0 - second)
+        parameter.addcdiv_(mean, square.sqrt().mul_(scale).add_(how.eps), value=-rate)
+        grad.zero_()
 
 
 def activate(

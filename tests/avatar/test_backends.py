@@ -46,7 +46,7 @@ def test_the_compiled_backend_is_sound():
     "operation",
     [
         "encode", "encode_backward", "encode_points_backward", "solve_correspondences", "march",
-        "composite", "composite_loss",
+        "composite", "composite_loss", "adam_step",
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("factor", [1.01, float("nan")])

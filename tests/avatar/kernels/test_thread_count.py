@@ -4,13 +4,13 @@ import numba
 import pytest
 import torch
 
-from avatar.kernels.backend_protocol import MarchSettings
+from avatar.kernels.backend_protocol import AdamSettings, MarchSettings
 from avatar.kernels.numba_backend import NumbaBackend
 
 NUMBA = NumbaBackend()
 OPERATIONS = (
     "encode", "encode_backward", "encode_points_backward", "march", "composite", "composite_loss",
-    "scatter_max_density", "bone_wrenches", "update_roots", "mean_normals",
+    "scatter_max_density", "bone_wrenches", "update_roots", "mean_normals", "adam_step",
 )  # fmt: skip
 
 
@@ -37,8 +37,11 @@ def results_of(learnt) -> dict[str, list[torch.Tensor]]:
     NUMBA.update_roots(moved, 0, poses.skinning, poses.bones[0])
     volume = trainer.learner.shading._normals
     normals = NUMBA.mean_normals(raw, samples, 0.01, batch.rays.slots, cells, volume)
+    stepped = [grad_table.clone(), *(torch.ones_like(grad_table) for _ in range(3))]
+    NUMBA.adam_step(AdamSettings(0.01, (0.9, 0.99), 1e-15, 1), *stepped)
     return {
         "mean_normals": [normals],
+        "adam_step": stepped[1:],
         "encode": [NUMBA.encode(points, field.table, field.levels)],
         "encode_backward": [grad_table],
         "encode_points_backward": [grad_points],

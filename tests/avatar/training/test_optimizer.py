@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.backends import backend_for
+from avatar.backends import TorchBackend, backend_for
 from avatar.config import TrainConfig
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
+from avatar.kernels.numba_backend import NumbaBackend
 from avatar.radiance_field import RadianceField
 from avatar.training import trainer as trainer_module
 from avatar.training.frame_stream import prepare_stream
@@ -23,6 +24,7 @@ from avatar.training.trainer import (
     EMA_INTERVAL,
     Trainer,
     UncompiledAdam,
+    step_optimizer,
     update_ema,
 )
 
@@ -95,10 +97,14 @@ def test_while_the_rate_is_high_the_mean_is_closer_to_unseen_frames_than_the_las
 WITHOUT_COMPILER = """
 import sys, torch
 from avatar.training.trainer import UncompiledAdam
+from avatar.backends import backend_for
+from avatar.training.trainer import step_optimizer
 numbers = torch.nn.Parameter(torch.zeros(3))
+adam = UncompiledAdam([numbers])
 numbers.grad = torch.ones(3)
-adam = UncompiledAdam([numbers], fused=True)
 adam.step()
+numbers.grad = torch.ones(3)
+step_optimizer(adam, backend_for(numbers.device))
 adam.load_state_dict(adam.state_dict())
 assert numbers.max() < 0
 print("torch._dynamo" in sys.modules)
@@ -120,6 +126,31 @@ def test_its_steps_are_those_of_torch():
             adam.step()
     assert torch.equal(ours, theirs)
     assert not torch.equal(ours, start)
+
+
+@pytest.mark.parametrize("backend", [NumbaBackend(), TorchBackend()], ids=["numba", "torch"])
+def test_a_backends_steps_are_those_of_torch_and_spend_the_gradient(backend):
+    """Rates and eps of two groups, blocks that are not full, entries without a gradient so far."""
+    generator = torch.Generator().manual_seed(0)
+    start = [torch.randn(5001, 4, generator=generator), torch.randn(7, generator=generator)]
+    ours, theirs = ([torch.nn.Parameter(p.clone()) for p in start] for _ in range(2))
+    pair = [
+        kind([{"params": p[:1], "lr": 0.01, "eps": 1e-15}, {"params": p[1:]}], betas=(0.9, 0.99))
+        for p, kind in ((ours, UncompiledAdam), (theirs, torch.optim.Adam))
+    ]
+    for step in range(6):
+        for mine, other in zip(ours, theirs, strict=True):
+            grad = torch.randn(mine.shape, generator=generator)
+            mine.grad = grad * (torch.rand(grad.shape, generator=generator) < 0.2)
+            other.grad = mine.grad.clone()
+        step_optimizer(pair[0], backend)
+        pair[1].step()
+        assert not any(p.grad.any() for p in ours)
+        if step == 3:
+            pair[0].load_state_dict(pair[0].state_dict())
+    for mine, other, before in zip(ours, theirs, start, strict=True):
+        torch.testing.assert_close(mine, other, atol=1e-6, rtol=0)
+        assert not torch.equal(mine, before)
 
 
 def test_a_step_and_a_checkpoint_load_no_compiler():
