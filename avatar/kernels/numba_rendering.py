@@ -169,17 +169,18 @@ def march(
             wx = F32(1) if ix > 0 else F32(0)  # the far wall of a cell
             wy = F32(1) if iy > 0 else F32(0)
             wz = F32(1) if iz > 0 else F32(0)
+            a_step = sample_step_m * cell_m  # of a ray's direction in cells, in metres
             optical, left, kept, step = F32(0), opaque_margin_steps, U32(0), F32(0)
-            while kept < most:
+            while kept < most and left >= 0:
                 t = enter + (step + jitter[ray]) * sample_step_m
                 if t >= leave:
                     break
                 gx, gy, gz = ox + t * dx, oy + t * dy, oz + t * dz
                 i, j, k = _cell_index(gx, nx), _cell_index(gy, ny), _cell_index(gz, nz)
                 packed = cell_index[slot, (i * U32(ny) + j) * U32(nz) + k]
+                way_x, way_y = (F32(i) + wx - gx) * ix, (F32(j) + wy - gy) * iy
+                way = min(min(way_x, way_y), (F32(k) + wz - gz) * iz)
                 if packed <= 0:
-                    way_x, way_y = (F32(i) + wx - gx) * ix, (F32(j) + wy - gy) * iy
-                    way = min(min(way_x, way_y), (F32(k) + wz - gz) * iz)
                     if packed < -1:  # empty within -packed - 1 more cells in every direction
                         more = F32(-packed - 1)
                         way = min(way_x + more * abs(ix), way_y + more * abs(iy))
@@ -189,29 +190,38 @@ def march(
                 ex = (gx - (F32(i) + F32(0.5))) * cell_m
                 ey = (gy - (F32(j) + F32(0.5))) * cell_m
                 ez = (gz - (F32(k) + F32(0.5))) * cell_m
-                best, chosen = F32(-1), U32(0)
-                px, py, pz = F32(0), F32(0), F32(0)
-                row, bent = U32(packed >> 3), packed & 4
-                asked = ends or packed & 3 > 1
-                for _ in range(packed & 3):
-                    x, y, z = canonical_point(cell_roots, slot, row, bent, ex, ey, ez)
-                    here = _cached_density(occupied, density, low, cells_per_m, x, y, z, asked)
-                    if here > best:
-                        best, chosen = here, row
-                        px, py, pz = x, y, z
-                    row += U32(3) if bent else U32(1)
-                if best >= F32(0):
-                    points[ray, kept, 0] = px
-                    points[ray, kept, 1] = py
-                    points[ray, kept, 2] = pz
-                    rows[ray, kept] = chosen
-                    kept += U32(1)
-                    optical += best * sample_step_m
-                    if optical > F32(OPAQUE_DEPTH):
-                        left -= 1
-                        if left < 0:
-                            break
-                step += F32(1)
+                chosen, bent = U32(packed >> 3), packed & 4
+                px, py, pz = canonical_point(cell_roots, slot, chosen, False, ex, ey, ez)
+                fx, fy, fz = ex + dx * a_step, ey + dy * a_step, ez + dz * a_step
+                ux, uy, uz = canonical_point(cell_roots, slot, chosen, False, fx, fy, fz)
+                ux, uy, uz = ux - px, uy - py, uz - pz
+                straight = packed & 7 == 1  # nine in ten cells: a line through canonical space
+                samples = max(I32(np.ceil(way * steps_a_m)), I32(1)) if straight else I32(1)
+                for _ in range(samples):
+                    best, row = F32(-1), chosen
+                    if straight:
+                        best = _cached_density(
+                            occupied, density, low, cells_per_m, px, py, pz, ends
+                        )
+                    for _ in range(0 if straight else packed & 3):
+                        x, y, z = canonical_point(cell_roots, slot, row, bent, ex, ey, ez)
+                        asked = ends or packed & 3 > 1
+                        here = _cached_density(occupied, density, low, cells_per_m, x, y, z, asked)
+                        if here > best:
+                            best, chosen, px, py, pz = here, row, x, y, z
+                        row += U32(3) if bent else U32(1)
+                    if best >= F32(0):
+                        points[ray, kept, 0] = px
+                        points[ray, kept, 1] = py
+                        points[ray, kept, 2] = pz
+                        rows[ray, kept] = chosen
+                        kept += U32(1)
+                        optical += best * sample_step_m
+                        left -= optical > F32(OPAQUE_DEPTH)
+                    step += F32(1)
+                    if kept == most or left < 0:
+                        break
+                    px, py, pz = px + ux, py + uy, pz + uz
             counts[ray] = kept
             next_steps[ray] = I32(step)
 
