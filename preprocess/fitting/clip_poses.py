@@ -191,10 +191,10 @@ CHANGE_M = (0.013, 0.013, 0.013)
 CUT_TURN_RAD = 0.25
 """Rotation of the root from frame to frame that photographs show, but no film; at it neighbors
 tell a quarter about each other."""
-FAST_CHANGE = 6.0
+FAST_CHANGE = 2.0
 """Standard deviations of a change between frames at which it counts a quarter (Geman-McClure):
-people move fast at times."""
-FIRST_FAST_CHANGE = 100.0
+people move fast at times. At 6 the arms of boxers and dancers lag behind their key points."""
+FIRST_FAST_CHANGE = 25.0
 """`FAST_CHANGE` in the first iteration, halved from one to the next: a frame that a tracker got
 wrong is drawn to its neighbors before it may count as a fast motion (graduated non-convexity)."""
 
