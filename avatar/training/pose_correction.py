@@ -16,7 +16,9 @@ from collections.abc import Mapping
 from typing import NamedTuple, final
 
 import numpy as np
-from jaxtyping import Float, Float32, Int64
+from jaxtyping import Bool, Float, Float32, Int64
+
+from avatar.kernels import numba_pose
 
 MIN_NEIGHBOR_PAIRS = 12
 """Neighbor pairs below which their correlation cannot be measured."""
@@ -70,57 +72,52 @@ class TemporalPosePrior:
 
     def prior_for(self, slot: int, corrections: Float[np.ndarray, "slots 25 3"]) -> PosePrior:
         """Prior of a slot's correction from the other slots."""
-        row, asked = self._is_sequential, self._has_estimate
+        row = self._is_sequential
         if not row[slot]:
             return UNINFORMATIVE_PRIOR
-        alike = neighbor_correlation(self._frames[asked], self._unregularized[asked])
-        return prior_from_neighbors(
-            int(self._frames[slot]), self._frames[row], corrections[row], alike
-        )
+        alike = neighbor_correlation(self._frames, self._unregularized, self._has_estimate)
+        return prior_from_neighbors(int(self._frames[slot]), self._frames, corrections, row, alike)
 
 
 def neighbor_correlation(
-    frames: Int64[np.ndarray, "asked"], estimates: Float[np.ndarray, "asked 25 3"]
+    frames: Int64[np.ndarray, "frames"],
+    estimates: Float[np.ndarray, "frames 25 3"],
+    known: Bool[np.ndarray, "frames"],
 ) -> float:
-    """How alike the errors of neighbouring frames are, in [-1, 1]; 0 if too few tell.
+    """How alike the errors of neighboring frames are, in [-1, 1]; 0 if too few tell.
 
     Args:
         frames: Indices of the frames, in any order.
-        unregularized: Correction of each frame by its rays alone, in any unit.
+        estimates: Correction of each frame by its rays alone, in any unit.
+        known: Which frames have an estimate.
     """
-    order = np.argsort(frames, kind="stable")
-    apart = np.diff(frames[order])
-    near = np.flatnonzero((apart > 0) & (apart <= MAX_FRAME_GAP))
-    if len(near) < MIN_NEIGHBOR_PAIRS:
-        return 0.0
-    one, other = estimates[order[near]], estimates[order[near + 1]]
-    power = 0.5 * float((one**2).sum() + (other**2).sum())
-    return float((one * other).sum()) / max(power, 1e-12)
+    return numba_pose.neighbor_correlation(
+        frames, estimates, known, MAX_FRAME_GAP, MIN_NEIGHBOR_PAIRS
+    )
 
 
 def prior_from_neighbors(
     frame: int,
-    frames: Int64[np.ndarray, "others"],
-    corrections: Float[np.ndarray, "others 25 3"],
+    frames: Int64[np.ndarray, "frames"],
+    corrections: Float[np.ndarray, "frames 25 3"],
+    held: Bool[np.ndarray, "frames"],
     error_correlation: float,
 ) -> PosePrior:
     """Prior of a correction: the mean of neighboring frames' corrections, weighted by nearness.
 
     Args:
         frame: Index of the frame.
-        frames: Indices of its neighbors; its own is ignored.
-        corrections: Corrections of the neighbors.
+        frames, corrections: Indices and corrections of all frames; its own is ignored.
+        held: Which of these count.
         error_correlation: Correlation of neighboring frames' errors.
     """
     share = min(
         max((error_correlation - MIN_CORRELATION) / (FULL_CORRELATION - MIN_CORRELATION), 0.0), 1.0
     )
-    apart = np.abs(frames - frame)
-    near = (apart > 0) & (apart <= MAX_FRAME_GAP)
-    if share == 0.0 or not near.any():
+    mean = np.zeros((25, 3))
+    near = numba_pose.neighbor_mean(frame, frames, corrections, held, MAX_FRAME_GAP, mean)
+    if share == 0.0 or not near:
         return UNINFORMATIVE_PRIOR
-    weights = 1.0 / apart[near]
-    mean = np.einsum("s,sja->ja", weights / weights.sum(), corrections[near])
     worth = share * NEIGHBOR_PRECISION
     return PosePrior(worth / (1.0 + worth) * mean, 1.0 + worth)
 
@@ -137,7 +134,9 @@ def interpolate_correction(
     if not corrections:
         return UNINFORMATIVE_PRIOR.mean
     frames, found = np.array(list(corrections)), np.array(list(corrections.values()))
-    return prior_from_neighbors(frame, frames, found, neighbor_correlation(frames, found)).mean
+    held = np.ones(len(frames), dtype=bool)
+    alike = neighbor_correlation(frames, found, held)
+    return prior_from_neighbors(frame, frames, found, held, alike).mean
 
 
 PRIOR_SIGMA_RAD = 0.05
@@ -155,27 +154,114 @@ MAX_STEP = 0.1
 """Largest change of a parameter in one step, radians or metres."""
 
 
+PRIOR_SIGMAS = np.append(np.full(24, PRIOR_SIGMA_RAD), PRIOR_SIGMA_M)[:, None]
+"""Prior standard deviation of each row of a correction."""
+
+
 class NormalEquations(NamedTuple):
-    """Normal equations of a pose from the rays of its last corrections, in prior sigmas.
+    """Normal equations of a pose, in prior sigmas; rows are padded with zeros.
 
     Attributes:
-        curvature: Sum of the rays' curvatures.
-        gradient: Sum of their gradients at `correction`.
-        correction: Correction at which they are linearized.
+        curvature: Sum of the rays' curvatures ∇ℓ ∇ℓᵀ / 2ℓ.
+        gradient: Sum of their gradients ∇ℓ.
+        moments: Sum of ∇ℓ ∇ℓᵀ; None if the rays' agreement is not asked for.
+        ray_stiffness: Curvature of a mean ray.
     """
 
-    curvature: Float32[np.ndarray, "75 75"]
-    gradient: Float32[np.ndarray, "75"]
-    correction: Float32[np.ndarray, "75"]
+    curvature: Float32[np.ndarray, "75 80"]
+    gradient: Float32[np.ndarray, "80"]
+    moments: Float32[np.ndarray, "75 80"] | None
+    ray_stiffness: float
 
-    def plus(self, earlier: "NormalEquations", decay: float) -> "NormalEquations":
-        """The sum of these and `decay` times earlier ones, which are linearized here, too."""
-        moved = earlier.gradient + earlier.curvature @ (self.correction - earlier.correction)
-        return NormalEquations(
-            self.curvature + decay * earlier.curvature,
-            self.gradient + decay * moved,
-            self.correction,
-        )
+
+class JointFrames(NamedTuple):
+    """Joints of the slots' corrected poses, in their body frames.
+
+    Attributes:
+        turns: Rotation of each joint.
+        places: Place of each joint, metres.
+        root_turns: Correction of the root's rotation.
+    """
+
+    turns: Float32[np.ndarray, "slots 24 3 3"]
+    places: Float32[np.ndarray, "slots 24 3"]
+    root_turns: Float[np.ndarray, "slots 3 3"]
+
+
+@final
+class RaySums:
+    """Sums over the rays of each slot, of which its pose's normal equations consist.
+
+    Attributes:
+        counts: Rays since the slot's last correction.
+    """
+
+    def __init__(
+        self, parents: Int64[np.ndarray, "24"], capacity: int, *, with_moments: bool
+    ) -> None:
+        """Starts without rays.
+
+        Args:
+            parents: Parent of each joint, before its children.
+            capacity: Number of slots.
+            with_moments: Whether the rays' agreement will be asked for.
+        """
+        self._parents = parents
+        self.counts = np.zeros(capacity, dtype=np.int64)
+        self._gradients = np.zeros((capacity, numba_pose.PADDED), dtype=np.float32)
+        square = (75, numba_pose.PADDED)
+        self._curvatures = np.zeros((capacity, *square), dtype=np.float32)
+        self._moments = np.zeros((capacity if with_moments else 0, *square), dtype=np.float32)
+        self._powers = np.zeros((capacity, 2), dtype=np.float32)
+
+    def add(
+        self,
+        slots: Int64[np.ndarray, "rays"],
+        wrenches: Float32[np.ndarray, "rays 24 6"],
+        loss: Float32[np.ndarray, "rays"],
+        room: Int64[np.ndarray, "slots"],
+        joints: JointFrames,
+    ) -> None:
+        """Adds rays, by the wrenches that they exert on the bones.
+
+        Args:
+            slots, wrenches, loss: Slot, wrenches and loss of each ray.
+            room: Most rays of each slot; rays beyond are left out.
+            joints: Joints of the poses at which the wrenches were found.
+        """
+        numba_pose.add_rays(
+            slots, wrenches, loss, MIN_RAY_LOSS, (PRIOR_SIGMA_RAD, PRIOR_SIGMA_M), room,
+            self._parents, *joints, self.counts, self._gradients, self._curvatures,
+            self._moments, self._powers,
+        )  # fmt: skip
+
+    def equations(self, slot: int) -> NormalEquations:
+        """The normal equations of a slot's pose; views, which later rays change."""
+        power, weighted = self._powers[slot].tolist()
+        moments = self._moments[slot] if len(self._moments) else None
+        # the prior's stiffness in units of the curvature: one sigma weighs as much as a mean ray
+        stiffness = power / (weighted + 1e-12) + 1e-12
+        return NormalEquations(self._curvatures[slot], self._gradients[slot], moments, stiffness)
+
+    def fade(self, slot: int, moved: Float[np.ndarray, "25 3"], decay: float) -> None:
+        """Lets a slot's rays count less, linearized where its pose has moved since.
+
+        Args:
+            slot: The slot, whose count starts again from 0.
+            moved: Change of its correction.
+            decay: Factor of the rays so far, in [0, 1).
+        """
+        curvature, gradient = self._curvatures[slot], self._gradients[slot]
+        steps = (moved / PRIOR_SIGMAS).astype(np.float32).reshape(75)
+        gradient[:75] = decay * (gradient[:75] + curvature[:, :75] @ steps)
+        curvature *= decay
+        self.counts[slot], self._powers[slot] = 0, 0.0
+        if len(self._moments):
+            self._moments[slot] *= decay
+
+    def clear(self, slot: int) -> None:
+        """Forgets a slot's rays."""
+        self.fade(slot, np.zeros((25, 3)), 0.0)
 
 
 class GaussNewtonStep(NamedTuple):
@@ -183,82 +269,59 @@ class GaussNewtonStep(NamedTuple):
 
     Attributes:
         change: Change of the correction: radians, and metres in the last row.
-        equations: The normal equations that it solves, without the prior.
         evidence: Mean of (Σ g)² / Σ g² over the directions that the rays determine: about 1 if
             their gradients g are noise, about the number of rays if all agree.
         unregularized: Correction that the rays alone would converge to, in prior sigmas.
     """
 
     change: Float[np.ndarray, "25 3"]
-    equations: NormalEquations
     evidence: float
     unregularized: Float[np.ndarray, "25 3"]
 
 
 def gauss_newton_step(
-    gradients: Float32[np.ndarray, "rays 25 3"],
-    loss: Float32[np.ndarray, "rays"],
+    rays: NormalEquations,
     correction: Float[np.ndarray, "25 3"],
     shared_evidence: float,
     *,
     prior: PosePrior = UNINFORMATIVE_PRIOR,
-    earlier: NormalEquations | None = None,
-    decay: float = 0.0,
 ) -> GaussNewtonStep:
     """The step towards the pose at which the rays fit, in the directions that they determine.
 
     Args:
-        gradients: Gradient of each ray's loss with respect to the correction.
-        loss: Loss of each ray.
+        rays: Normal equations of the pose's rays, at the correction.
         correction: Current correction; undetermined directions return to the prior.
         shared_evidence: Mean evidence of all frames, which one tracker produced; infinite if the
-            pose is to move in any case.
+            pose is to move in any case, and `moments` are not asked for.
         prior: Prior of the correction.
-        earlier: Normal equations of the pose's last step; None if there was none.
-        decay: Factor of those, which are added to the rays' own.
     """
-    scale = np.full((25, 3), PRIOR_SIGMA_RAD, dtype=np.float32)
-    scale[24] = PRIOR_SIGMA_M
-    scaled = (gradients * scale).reshape(-1, 75)
-    curvature = (scaled / (2.0 * (loss.clip(min=0.0) + MIN_RAY_LOSS))[:, None]).T @ scaled
-    # the prior's stiffness in units of the curvature: one sigma weighs as much as a mean ray
-    given = float((scaled**2).sum() / (np.trace(curvature) + 1e-12) + 1e-12)
     evidence, share = math.inf, 1.0
     if math.isfinite(shared_evidence):
-        evidence = _agreement(scaled, curvature, given)
+        evidence = _agreement(rays)
         full = FULL_EVIDENCE - MIN_EVIDENCE
         share = min(max((0.5 * (evidence + shared_evidence) - MIN_EVIDENCE) / full, 0.0), 1.0)
 
-    here = (correction / scale).astype(np.float32).reshape(75)
-    equations = NormalEquations(curvature, scaled.sum(axis=0), here)
-    if earlier is not None:
-        equations = equations.plus(earlier, decay)
+    room = np.empty((75, 75))
 
     def asked(believed: PosePrior) -> Float[np.ndarray, "25 3"]:
-        stiff = believed.precision * given
-        back = stiff * ((correction - believed.mean) / scale).reshape(75)
-        held = equations.curvature + stiff * np.eye(75, dtype=np.float32)
-        found = np.linalg.solve(held, equations.gradient + back)
-        return found.reshape(25, 3).astype(np.float64)
+        back, found = ((correction - believed.mean) / PRIOR_SIGMAS).reshape(75), np.empty(75)
+        stiffness = believed.precision * rays.ray_stiffness
+        numba_pose.solve_with_prior(rays.curvature, rays.gradient, stiffness, back, room, found)
+        return found.reshape(25, 3)
 
-    change = -share * scale * asked(prior)
+    change = -share * PRIOR_SIGMAS * asked(prior)
     shortened = MAX_STEP / max(float(np.abs(change).max()), MAX_STEP)
-    alone = correction / scale - asked(UNINFORMATIVE_PRIOR)
-    return GaussNewtonStep(shortened * change, equations, evidence, alone)
+    alone = correction / PRIOR_SIGMAS - asked(UNINFORMATIVE_PRIOR)
+    return GaussNewtonStep(shortened * change, evidence, alone)
 
 
-def _agreement(
-    scaled: Float32[np.ndarray, "rays 75"], curvature: Float32[np.ndarray, "75 75"], given: float
-) -> float:
-    """`GaussNewtonStep.evidence` of gradients in prior sigmas.
-
-    Args:
-        scaled: The gradients.
-        curvature: Their curvature.
-        given: Curvature from which the rays determine a direction.
-    """
-    determined, axes = np.linalg.eigh(curvature)
-    along = (scaled @ axes)[:, determined > given]
-    if not along.size:
+def _agreement(rays: NormalEquations) -> float:
+    """`GaussNewtonStep.evidence` of the rays."""
+    assert rays.moments is not None
+    determined, axes = np.linalg.eigh(rays.curvature[:, :75])
+    axes = axes[:, determined > rays.ray_stiffness]
+    if not axes.size:
         return 0.0
-    return float(np.mean(along.sum(axis=0) ** 2 / ((along**2).sum(axis=0) + 1e-12)))
+    along = rays.gradient[:75] @ axes
+    power = ((rays.moments[:, :75] @ axes) * axes).sum(axis=0)
+    return float(np.mean(along**2 / (power + 1e-12)))

@@ -19,20 +19,18 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from avatar.kernels.backend_protocol import SkinningVolume
+from avatar.kernels.numba_pose import pose_joints
 from avatar.rig import Rig
 from avatar.training.pose_correction import (
     MIN_EVIDENCE,
-    NormalEquations,
+    PRIOR_SIGMAS,
+    JointFrames,
+    RaySums,
     TemporalPosePrior,
     gauss_newton_step,
 )
 from preprocess.body.body_pose import BodyPose
-from preprocess.body.kinematics import (
-    body_from_rest,
-    descendant_matrix,
-    joint_transforms,
-    rotation_matrices,
-)
+from preprocess.body.kinematics import body_from_rest, rotation_matrices
 
 MAX_RAYS_PER_FRAME = 512
 """Rays per frame that are accumulated until its pose is corrected."""
@@ -134,7 +132,8 @@ class PoseOptimizer:
         self.rig = rig
         self._rays_per_frame, self._prior_precision = rays_per_frame, prior_precision
         self._equation_decay = 0.0 if poses_may_be_exact else equation_decay
-        self._equations: list[NormalEquations | None] = [None] * capacity
+        self._parents = np.array(rig.parents, dtype=np.int64)
+        self._rays = RaySums(self._parents, capacity, with_moments=poses_may_be_exact)
         self.poses_may_be_exact = poses_may_be_exact
         self.min_gradient_cell_m = MIN_POSE_GRADIENT_CELL_M
         self.corrections: Float[np.ndarray, "slots 25 3"] = np.zeros((capacity, 25, 3))
@@ -144,23 +143,23 @@ class PoseOptimizer:
             torch.from_numpy(rig.box_low).to(device),
             torch.from_numpy(rig.nodes_per_m).to(device),
         )
-        self._wrenches = torch.zeros(capacity, rays_per_frame, 24, 6, device=device)
-        self._losses = torch.zeros(capacity, rays_per_frame, device=device)
-        self._ray_counts = torch.zeros(capacity, dtype=torch.int64, device=device)
         self._tracker_poses: list[BodyPose | None] = [None] * capacity
-        self._joint_transforms = np.zeros((capacity, 24, 4, 4))
-        self._root_turns = np.zeros((capacity, 3, 3))
-        self._joints_at_solve = np.zeros((capacity, 24, 3))
+        self._given_turns = np.zeros((capacity, 23, 3, 3))
+        self._joints = JointFrames(
+            np.zeros((capacity, 24, 3, 3), dtype=np.float32),
+            np.zeros((capacity, 24, 3), dtype=np.float32),
+            np.zeros((capacity, 3, 3)),
+        )
+        self._joints_at_solve = np.zeros((capacity, 24, 3), dtype=np.float32)
         self._rest_from_canonical = np.linalg.inv(
             body_from_rest(rig.rest_joints, rig.parents, rig.canonical_rotations)
         )
-        self._descendants = descendant_matrix(rig.parents)
         self._moved_share, self._evidence = 1.0, MIN_EVIDENCE
         self._added_at_step = np.zeros(capacity, dtype=np.int64)
         self._can_freeze, self._is_frozen = np.zeros((2, capacity), dtype=bool)
         self._estimate_count, self._evidence_sum = np.zeros((2, capacity))
         self._temporal_prior = TemporalPosePrior(capacity)
-        self._is_correctable = torch.ones(capacity, dtype=torch.bool, device=device)
+        self._is_correctable = np.ones(capacity, dtype=bool)
 
     def set_pose(
         self,
@@ -189,9 +188,10 @@ class PoseOptimizer:
         self.corrections[slot] = 0.0
         if correction is not None:
             self.corrections[slot] = correction
-        self._ray_counts[slot], self._equations[slot] = 0, None
+        self._given_turns[slot] = rotation_matrices(pose.joint_rotations)
+        self._rays.clear(slot)
         self._update_bones(slot)
-        self._joints_at_solve[slot] = self._joint_positions(slot)
+        self._joints_at_solve[slot] = self._joints.places[slot]
 
     def replace_pose(self, slot: int, pose: BodyPose, *, frame: int, step: int) -> bool:
         """Assigns a better pose of its tracker to a slot's frame, without a correction.
@@ -205,14 +205,12 @@ class PoseOptimizer:
             Whether it is too far from the one before for the roots to follow: the caller is
             expected to solve the correspondences again then.
         """
-        before, solved_at = self._joint_positions(slot), self._joints_at_solve[slot].copy()
+        before = np.stack([self._joints.places[slot], self._joints_at_solve[slot]])
         self.set_pose(slot, pose, frame=frame, step=step)
-        moved = np.linalg.norm(self._joint_positions(slot) - [before, solved_at], axis=2).max(
-            axis=1
-        )
+        moved = np.linalg.norm(self._joints.places[slot] - before, axis=2).max(axis=1)
         if (moved > (MAX_JOINT_STEP_M, RESOLVE_DISTANCE_M)).any():
             return True
-        self._joints_at_solve[slot] = solved_at
+        self._joints_at_solve[slot] = before[1]
         return False
 
     def pose(self, slot: int) -> BodyPose:
@@ -248,8 +246,8 @@ class PoseOptimizer:
         if self.poses_may_be_exact:
             self._is_frozen |= exact | (age >= FREEZE_AFTER_STEPS)
         open_now = held & ~self._is_frozen & (age >= FIRST_CORRECTION_STEPS)
-        self._is_correctable.copy_(torch.from_numpy(open_now))
-        self._ray_counts *= self._is_correctable
+        self._is_correctable = open_now
+        self._rays.counts *= open_now
         return bool(open_now.any())
 
     def accumulate(
@@ -258,17 +256,11 @@ class PoseOptimizer:
         wrenches: Float32[Tensor, "rays 24 6"],
         loss: Float32[Tensor, "rays"],
     ) -> None:
-        """Accumulates the wrenches of a step's rays on their frames' bones; slots must ascend."""
-        counts = torch.bincount(slots, minlength=len(self._ray_counts))
-        rank = torch.arange(len(slots), device=slots.device) - (counts.cumsum(0) - counts)[slots]
-        place = self._ray_counts[slots] + rank
-        kept = (place < self._rays_per_frame) & self._is_correctable[slots]
-        row = (slots * self._rays_per_frame + place)[kept]
-        self._wrenches.view(-1, 24, 6).index_copy_(0, row, wrenches[kept])
-        self._losses.view(-1).index_copy_(0, row, loss[kept])
-        self._ray_counts = (self._ray_counts + counts * self._is_correctable).clamp(
-            max=self._rays_per_frame
-        )
+        """Accumulates the wrenches of a step's rays on their frames' bones."""
+        self._rays.add(
+            slots.cpu().numpy(), wrenches.cpu().numpy(), loss.cpu().numpy(),
+            self._rays_per_frame * self._is_correctable, self._joints,
+        )  # fmt: skip
 
     def correct_next(self, *, rate: float) -> int | None:
         """Corrects the pose with the most accumulated rays; its roots and rays have to follow.
@@ -279,19 +271,17 @@ class PoseOptimizer:
         Returns:
             The slot, or None if no frame has enough rays or the pose does not move.
         """
-        slot = int(self._ray_counts.argmax())
-        rows = int(self._ray_counts[slot])
-        if rows < MIN_RAYS_SHARE * self._rays_per_frame:
+        slot = int(self._rays.counts.argmax())
+        if self._rays.counts[slot] < MIN_RAYS_SHARE * self._rays_per_frame:
             return None
-        loss = self._losses[slot, :rows].cpu().numpy()
         evidence = self._evidence if self.poses_may_be_exact else math.inf
         prior = self._temporal_prior.prior_for(slot, self.corrections)
         step = gauss_newton_step(
-            self.pose_gradients(slot), loss, self.corrections[slot], evidence,
+            self._rays.equations(slot),
+            self.corrections[slot],
+            evidence,
             prior=prior._replace(precision=self._prior_precision * prior.precision),
-            earlier=self._equations[slot], decay=self._equation_decay,
-        )  # fmt: skip
-        self._ray_counts[slot], self._equations[slot] = 0, step.equations
+        )
         self._temporal_prior.record_estimate(slot, step.unregularized)
         self._evidence = (
             EVIDENCE_EMA_DECAY * self._evidence + (1.0 - EVIDENCE_EMA_DECAY) * step.evidence
@@ -301,16 +291,15 @@ class PoseOptimizer:
             self._evidence_sum[slot] += step.evidence
         moves = bool(step.change.any())
         self._moved_share += (1.0 - EVIDENCE_EMA_DECAY) * (moves - self._moved_share)
-        if not moves:
-            return None
-        change = rate * step.change
-        if self.poses_may_be_exact:
+        change, before = rate * step.change, self.corrections[slot].copy()
+        if moves and self.poses_may_be_exact:
             held = [i for i, pose in enumerate(self._tracker_poses) if pose is not None]
             mean = self.corrections[held].mean(axis=0)
             change = STEP_DAMPING * change - MEAN_CORRECTION_DECAY * mean
-        moved = self.corrections[slot] + change
-        self._apply_correction(slot, np.clip(moved, -MAX_CORRECTION, MAX_CORRECTION))
-        return slot
+        if moves:
+            self._apply_correction(slot, np.clip(before + change, -MAX_CORRECTION, MAX_CORRECTION))
+        self._rays.fade(slot, self.corrections[slot] - before, self._equation_decay)
+        return slot if moves else None
 
     def correction_interval(self, rate: float) -> int:
         """Steps between pose gradients: more where poses prove to be exact, or steps are short.
@@ -327,7 +316,7 @@ class PoseOptimizer:
 
         The caller is expected to solve them when the answer is True.
         """
-        places = self._joint_positions(slot)
+        places = self._joints.places[slot]
         moved = np.linalg.norm(places - self._joints_at_solve[slot], axis=1).max()
         if moved > RESOLVE_DISTANCE_M:
             self._joints_at_solve[slot] = places
@@ -335,53 +324,29 @@ class PoseOptimizer:
 
     def root_correction(self, slot: int) -> RootCorrection:
         """Motion of the slot's rays by its root correction."""
-        turn, shift = self._root_turns[slot], self.corrections[slot, 24]
+        turn, shift = self._joints.root_turns[slot], self.corrections[slot, 24]
         return RootCorrection(rotation=turn, shift=shift, pivot=self.rig.rest_joints[0])
 
-    def pose_gradients(self, slot: int) -> Float[np.ndarray, "rays 25 3"]:
-        """Gradient of each accumulated ray's loss with respect to the slot's correction.
-
-        By virtual work: a joint at c that rotates by ω moves every bone below it, so that
-        dL/dω = -Σ (M - c × F) over these bones' wrenches (F, M), in body-frame axes. It is
-        expressed in the axes of the joint, in which the corrections are.
-        """
-        wrench = self._wrenches[slot, : int(self._ray_counts[slot])].cpu().numpy()
-        felt = np.zeros((25, 3, 24, 6))
-        across = np.cross(np.eye(3), self._joint_positions(slot)[:, None])  # c × F = across @ F
-        turned = self._joint_transforms[slot, :, :3, :3].swapaxes(1, 2)
-        carried = np.concatenate([turned @ across, -turned], axis=2)
-        felt[:24] = self._descendants[:, None, :, None] * carried[:, :, None]
-        # the shift lives in the given body frame, the force in the corrected one
-        felt[24, :, :, :3] = -self._root_turns[slot][:, None]
-        flat = felt.reshape(75, 144).astype(np.float32)
-        return (wrench.reshape(-1, 144) @ flat.T).reshape(-1, 25, 3)
+    def pose_gradient(self, slot: int) -> Float[np.ndarray, "25 3"]:
+        """Gradient of the accumulated rays' losses with respect to the slot's correction."""
+        return self._rays.equations(slot).gradient[:75].reshape(25, 3) / PRIOR_SIGMAS
 
     def _apply_correction(self, slot: int, correction: Float[np.ndarray, "25 3"]) -> None:
         """Applies a correction, or the part of it that the frame's roots can follow."""
-        before, places = self.corrections[slot].copy(), self._joint_positions(slot)
+        before, places = self.corrections[slot].copy(), self._joints.places[slot].copy()
         self.corrections[slot] = correction
         self._update_bones(slot)
-        moved = float(np.linalg.norm(self._joint_positions(slot) - places, axis=1).max())
+        moved = float(np.linalg.norm(self._joints.places[slot] - places, axis=1).max())
         if moved > MAX_JOINT_STEP_M:
             self.corrections[slot] = before + MAX_JOINT_STEP_M / moved * (correction - before)
             self._update_bones(slot)
 
-    def _joint_positions(self, slot: int) -> Float[np.ndarray, "24 3"]:
-        """Joint positions in the body frame, metres."""
-        posed = self._joint_transforms[slot]
-        turned = np.einsum("jab,jb->ja", posed[:, :3, :3], self.rig.rest_joints)
-        return turned + posed[:, :3, 3]
-
     def _update_bones(self, slot: int) -> None:
-        """Updates the slot's joint and bone transforms to its correction."""
-        rig = self.rig
-        given = self._tracker_poses[slot]
-        assert given is not None
-        turns = rotation_matrices(
-            np.concatenate([given.joint_rotations, self.corrections[slot, :24]])
-        )
-        self._root_turns[slot] = turns[23]
-        joints = np.concatenate([np.eye(3)[None], turns[:23] @ turns[24:]])
-        self._joint_transforms[slot] = joint_transforms(rig.rest_joints, rig.parents, joints)
-        bones = (self._joint_transforms[slot] @ self._rest_from_canonical)[:, :3].reshape(24, 12)
-        self.bones[slot] = torch.from_numpy(bones.astype(np.float32)).to(self.bones.device)
+        """Updates the slot's joints and bones to its correction."""
+        turns, places, root_turns = self._joints
+        bones = np.empty((24, 12), dtype=np.float32)
+        pose_joints(
+            self._given_turns[slot], self.corrections[slot], self.rig.rest_joints, self._parents,
+            self._rest_from_canonical, turns[slot], places[slot], bones, root_turns[slot],
+        )  # fmt: skip
+        self.bones[slot] = torch.from_numpy(bones).to(self.bones.device)

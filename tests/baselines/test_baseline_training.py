@@ -124,7 +124,7 @@ def test_poses_are_pulled_alike_wherever_samples_lie(rig, clip, learnt, skipping
             hard_surface_share=0.0, poses=poses, generator=torch.Generator().manual_seed(2),
         )  # fmt: skip
         avatar.field.table_grad.zero_()
-        found.append(torch.from_numpy(poses.pose_gradients(slot).ravel()))
+        found.append(torch.from_numpy(poses.pose_gradient(slot).ravel()))
     assert float(torch.cosine_similarity(*found, dim=0)) > 0.97
 
 

@@ -23,6 +23,7 @@ from avatar.render import correspondence_tables
 from avatar.training import checkpoint
 from avatar.training.frame_stream import prepare_stream
 from avatar.training.held_out_pose_fitting import fit_test_poses
+from avatar.training.pose_correction import MIN_RAY_LOSS, PRIOR_SIGMAS
 from avatar.training.pose_optimizer import (
     FIRST_CORRECTION_STEPS,
     FREEZE_AFTER_STEPS,
@@ -34,6 +35,7 @@ from avatar.training.pose_optimizer import (
 )
 from avatar.training.trainer import Trainer, cosine_decay
 from preprocess.body.body_pose import BodyPose
+from preprocess.body.kinematics import descendant_matrix, joint_transforms, rotation_matrices
 
 TORCH, NUMBA = TorchBackend(), NumbaBackend()
 CPU = torch.device("cpu")
@@ -158,7 +160,7 @@ def test_the_poses_gradient_is_what_the_roots_do_when_the_pose_moves(rig, table,
     slots = torch.ones(1, dtype=torch.int32)
     wrenches = NUMBA.bone_wrenches(samples, pull, slots, cells, table.skinning, table.bones)
     table.accumulate(slots.long(), wrenches, torch.ones(1))
-    (gradient,) = table.pose_gradients(1)
+    gradient = table.pose_gradient(1)
     given = (
         torch_correspondence.skin_points(samples.points, *table.skinning, table.bones[1])
         .double()
@@ -185,6 +187,49 @@ def test_the_poses_gradient_is_what_the_roots_do_when_the_pose_moves(rig, table,
             measured = (pulled(joint, axis, 2e-3) - pulled(joint, axis, -2e-3)) / 4e-3
             scale = float(np.abs(gradient[joint]).max()) + 0.1
             assert gradient[joint, axis] == pytest.approx(measured, abs=0.08 * scale), joint
+
+
+def test_sums_over_rays_are_those_of_their_own_gradients(rig, table, generator):
+    """By a matrix of what each number of the correction does to each bone's wrench."""
+    joints = joint_transforms(rig.rest_joints, rig.parents, turns_of(table.pose(1)))
+    places = (joints[:, :3, :3] @ rig.rest_joints[:, :, None])[..., 0] + joints[:, :3, 3]
+    across, turned = np.cross(np.eye(3), places[:, None]), joints[:, :3, :3].swapaxes(1, 2)
+    felt = np.zeros((25, 3, 24, 6))
+    carried = np.concatenate([turned @ across, -turned], axis=2)
+    felt[:24] = descendant_matrix(rig.parents)[:, None, :, None] * carried[:, :, None]
+    felt[24, :, :, :3] = -np.eye(3)[:, None]
+    wrenches, loss = torch.randn(40, 24, 6, generator=generator), torch.rand(40)
+    table.accumulate(torch.ones(40, dtype=torch.int64), wrenches, loss)
+    scaled = np.einsum("jabq,rbq->rja", felt, wrenches.numpy()) * PRIOR_SIGMAS
+    scaled = scaled.reshape(40, 75)
+    curved = scaled / (2.0 * (loss.numpy() + MIN_RAY_LOSS))[:, None]
+    found = table._rays.equations(1)
+    assert found.moments is not None
+    for ours, theirs in (
+        (found.gradient, scaled.sum(axis=0)),
+        (found.curvature, curved.T @ scaled),
+        (found.moments, scaled.T @ scaled),
+    ):
+        np.testing.assert_allclose(
+            ours[..., :75], theirs, rtol=1e-3, atol=1e-4 * np.abs(theirs).max()
+        )
+        assert not ours[..., 75:].any()
+    mean_ray = np.square(scaled).sum() / (curved * scaled).sum()
+    assert found.ray_stiffness == pytest.approx(mean_ray, rel=1e-3)
+
+
+def turns_of(pose: BodyPose):
+    """Joint rotations in the body frame, where the root rests."""
+    return rotation_matrices(np.concatenate([np.zeros((1, 3)), pose.joint_rotations]))
+
+
+def test_bones_follow_the_corrected_pose(rig, bent_pose, rng):
+    table = PoseOptimizer(rig, 1, CPU)
+    table.set_pose(0, pose_of(bent_pose), correction=rng.normal(size=(25, 3)) * 0.3)
+    bones = rig.body_from_canonical(table.pose(0).joint_rotations)[:, :3].reshape(24, 12)
+    np.testing.assert_allclose(table.bones[0].numpy(), bones, atol=1e-6)
+    root = rotation_matrices(table.corrections[0, 0])
+    np.testing.assert_allclose(table.root_correction(0).rotation, root, atol=1e-12)
 
 
 @pytest.fixture(scope="module")

@@ -173,7 +173,7 @@ def test_half_of_the_samples_give_nearly_the_steps_whole_gradient(trainer):
             dataclasses.replace(CONFIG, faint_gradient_share=share), hard_surface_share=1.0,
             poses=poses, generator=torch.Generator().manual_seed(4),
         )  # fmt: skip
-        pulls = torch.cat([torch.from_numpy(poses.pose_gradients(slot)) for slot in range(4)])
+        pulls = torch.cat([torch.from_numpy(poses.pose_gradient(slot)) for slot in range(4)])
         found.append((trainer.field.table_grad.clone(), pulls))
     for whole, drawn in zip(*found, strict=True):
         assert not torch.equal(whole, drawn)
