@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Int32, Int64
 
-from avatar.kernels import numba_correspondence, numba_hash_grid, numba_rendering, numba_skinning
+from avatar.kernels import numba_correspondence, numba_hash_grid, numba_pose, numba_rendering
 from avatar.kernels.backend_protocol import (
     Backend,
     HashLevels,
@@ -159,7 +159,7 @@ class NumbaBackend(Backend):
 
     def bone_wrenches(self, samples, grad_points, slots, cells, skin, bones):
         out = torch.zeros(len(slots), 24, 6)
-        numba_skinning.bone_wrenches(
+        numba_pose.bone_wrenches(
             samples.points.numpy(), grad_points.numpy(), samples.root_rows.numpy(),
             samples.offsets.numpy(), samples.counts.numpy(), slots.numpy(), cells.roots.numpy(),
             *_skinning_arrays(skin), bones.numpy(), out.numpy(),
@@ -167,7 +167,7 @@ class NumbaBackend(Backend):
         return out
 
     def update_roots(self, cells, slot, skin, bones):
-        numba_skinning.update_roots(
+        numba_pose.update_roots(
             cells.packed_cells[slot].numpy(), cells.shape[slot].numpy(), cells.low[slot].numpy(),
             np.float32(cells.cell_m), cells.roots[slot].numpy(),
             *_skinning_arrays(skin), bones.numpy(),

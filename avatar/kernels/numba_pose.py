@@ -1,19 +1,195 @@
-"""Corrections of poses: sums over rays, the step that they ask for, and forward kinematics.
+"""Corrections of poses: what their rays pull, the step, and the bones and roots that follow.
 
-Compiled for the CPU: a correction is some twenty operations on arrays of 75 numbers, which took
-four times as long one by one, since each waits for memory that the training step has replaced.
+Compiled for the CPU. A sample's canonical point is x = warp(p; θ) with LBS(x; θ) = p. Where the
+loss pulls x with g_x, it pulls the posed point with g = J⁻ᵀ g_x, and by the implicit function
+theorem the pose feels -(∂LBS/∂θ)ᵀ g. A bone of weight w turns its share of the body rigidly, so
+that all of it is carried by one wrench a bone: the force Σ w g and the moment Σ w (B x) × g.
+
+A correction is some twenty operations on arrays of 75 numbers, which took three times as long one
+by one in numpy, since each waits for memory that the training step has replaced.
 """
 
 import math
 
 import numpy as np
+from numba import prange
 
-from avatar.kernels.kernel_compiler import FAST_MATH, compile_kernel
+from avatar.kernels.kernel_compiler import (
+    FAST_MATH,
+    add4,
+    compile_kernel,
+    load4,
+    prefetch,
+    scale4,
+    store4,
+)
+from avatar.kernels.numba_skinning import transform_point
+from avatar.kernels.torch_correspondence import MAX_ROOT_STEP_M
 
-F32 = np.float32
+F32, I32 = np.float32, np.int32
+ROOTS_AHEAD = 8
+"""Cells between one whose root moves and the one whose weights are fetched meanwhile."""
+MIN_PULL_SHARE = 1e-3
+"""Pull on a sample, as a share of its ray's strongest, up to which it is left out."""
 PADDED = 80
 """Length of a row of 75 numbers that is a multiple of a register's; the last five are zero."""
 JOINTS = 24
+
+
+@compile_kernel(inline="always", **FAST_MATH)
+def _weights_at(weights, shape, low, nodes_per_m, x, y, z, out):
+    """Trilinear skinning weights at a point, four bones at once, in the first row of `out`.
+
+    Args:
+        weights: (nodes, 24).
+        shape: Nodes along each axis.
+        low, nodes_per_m: Corner and nodes per metre.
+        x, y, z: The point.
+        out: (rows, 24).
+    """
+    a = min(max((x - low[0]) * nodes_per_m[0], F32(0)), F32(shape[0]) - F32(1.001))
+    b = min(max((y - low[1]) * nodes_per_m[1], F32(0)), F32(shape[1]) - F32(1.001))
+    c = min(max((z - low[2]) * nodes_per_m[2], F32(0)), F32(shape[2]) - F32(1.001))
+    i, j, k = I32(a), I32(b), I32(c)
+    a, b, c = a - F32(i), b - F32(j), c - F32(k)
+    u, v, w = F32(1) - a, F32(1) - b, F32(1) - c
+    n00 = (i * shape[1] + j) * shape[2] + k
+    n01, n10 = n00 + shape[2], n00 + shape[1] * shape[2]
+    n11 = n10 + shape[2]
+    for q in range(0, 24, 4):
+        near = add4(
+            scale4(u * v * w, load4(weights, n00, q)), scale4(u * v * c, load4(weights, n00 + 1, q))
+        )
+        near = add4(near, scale4(u * b * w, load4(weights, n01, q)))
+        near = add4(near, scale4(u * b * c, load4(weights, n01 + 1, q)))
+        far = add4(
+            scale4(a * v * w, load4(weights, n10, q)), scale4(a * v * c, load4(weights, n10 + 1, q))
+        )
+        far = add4(far, scale4(a * b * w, load4(weights, n11, q)))
+        far = add4(far, scale4(a * b * c, load4(weights, n11 + 1, q)))
+        store4(out, 0, q, add4(near, far))
+
+
+@compile_kernel(parallel=True, **FAST_MATH)
+def bone_wrenches(
+    points, grad_points, rows, first, count, slots, cell_roots,
+    weights, shape, low, nodes_per_m, bones, out,
+):  # fmt: skip
+    """Adds up what each ray's samples exert on the bones that move them.
+
+    Args:
+        points, grad_points: Canonical samples and what pulls them.
+        rows: Root of `cell_roots[slot]` that each sample was warped with.
+        first, count, slots: Each ray's samples and its frame's slot.
+        cell_roots: Roots and inverse Jacobians (slots, roots, 12).
+        weights, shape, low, nodes_per_m: The skinning volume, as for `_weights_at`.
+        bones: Body-from-canonical matrices (slots, 24, 12).
+        out: (rays, 24, 6), zero before: force then moment about the body frame's origin.
+    """
+    for ray in prange(first.shape[0]):
+        share, slot = np.empty((1, 24), F32), slots[ray]
+        strongest = F32(0)
+        for i in range(first[ray], first[ray] + count[ray]):
+            a, b, c = grad_points[i, 0], grad_points[i, 1], grad_points[i, 2]
+            strongest = max(strongest, a * a + b * b + c * c)
+        for i in range(first[ray], first[ray] + count[ray]):
+            a, b, c = grad_points[i, 0], grad_points[i, 1], grad_points[i, 2]
+            if a * a + b * b + c * c <= F32(MIN_PULL_SHARE**2) * strongest:
+                continue
+            n = rows[i]
+            fx = (
+                cell_roots[slot, n, 3] * a + cell_roots[slot, n, 6] * b + cell_roots[slot, n, 9] * c
+            )
+            fy = (
+                cell_roots[slot, n, 4] * a + cell_roots[slot, n, 7] * b
+                + cell_roots[slot, n, 10] * c
+            )  # fmt: skip
+            fz = (
+                cell_roots[slot, n, 5] * a + cell_roots[slot, n, 8] * b
+                + cell_roots[slot, n, 11] * c
+            )  # fmt: skip
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            _weights_at(weights, shape, low, nodes_per_m, x, y, z, share)
+            for joint in range(24):
+                w = share[0, joint]
+                if w < F32(1e-3):
+                    continue
+                px, py, pz = transform_point(bones[slot, joint], x, y, z)
+                out[ray, joint, 0] += w * fx
+                out[ray, joint, 1] += w * fy
+                out[ray, joint, 2] += w * fz
+                out[ray, joint, 3] += w * (py * fz - pz * fy)
+                out[ray, joint, 4] += w * (pz * fx - px * fz)
+                out[ray, joint, 5] += w * (px * fy - py * fx)
+
+
+@compile_kernel(inline="always", **FAST_MATH)
+def _prefetch_weights(weights, shape, low, nodes_per_m, roots, row):
+    """Has the cache fetch the weights about a root, as `_weights_at` will read them."""
+    a = min(max((roots[row, 0] - low[0]) * nodes_per_m[0], F32(0)), F32(shape[0]) - F32(1.001))
+    b = min(max((roots[row, 1] - low[1]) * nodes_per_m[1], F32(0)), F32(shape[1]) - F32(1.001))
+    c = min(max((roots[row, 2] - low[2]) * nodes_per_m[2], F32(0)), F32(shape[2]) - F32(1.001))
+    node = (I32(a) * shape[1] + I32(b)) * shape[2] + I32(c)
+    for side in range(4):
+        pair = node + (side & 1) * shape[2] + (side >> 1) * shape[1] * shape[2]
+        for q in range(0, 48, 16):
+            prefetch(weights, pair, q)
+
+
+@compile_kernel(parallel=True, **FAST_MATH)
+def update_roots(
+    packed_cells, cells, grid_low, cell_m, roots, weights, shape, low, nodes_per_m, bones
+):
+    """Moves a frame's roots to follow its pose, by one chord step towards the cell's center.
+
+    Args:
+        packed_cells: Packed cells of the frame, flat.
+        cells, grid_low, cell_m: Shape, corner and cell size of their grid.
+        roots: Roots, updated in place; inverse Jacobians and second-order terms stay.
+        weights, shape, low, nodes_per_m: The skinning volume, as for `_weights_at`.
+        bones: The new pose's matrices (24, 12).
+    """
+    for i in prange(cells[0]):
+        room, last = np.empty((2, 24), F32), cells[0] * cells[1] * cells[2] - 1
+        for j in range(cells[1]):
+            for k in range(cells[2]):
+                cell = (i * cells[1] + j) * cells[2] + k
+                packed, later = packed_cells[cell], packed_cells[min(cell + ROOTS_AHEAD, last)]
+                if later > 0:
+                    _prefetch_weights(weights, shape, low, nodes_per_m, roots, later >> 3)
+                later = packed_cells[min(cell + 2 * ROOTS_AHEAD, last)]
+                if later > 0:
+                    prefetch(roots, later >> 3, 0)
+                if packed <= 0:
+                    continue
+                rows = 3 if packed & 4 else 1
+                for candidate in range(packed & 3):
+                    n = (packed >> 3) + candidate * rows
+                    x, y, z = roots[n, 0], roots[n, 1], roots[n, 2]
+                    _weights_at(weights, shape, low, nodes_per_m, x, y, z, room)
+                    one, two, three = load4(bones, 0, 0), load4(bones, 0, 4), load4(bones, 0, 8)
+                    w = room[0, 0]
+                    one, two, three = scale4(w, one), scale4(w, two), scale4(w, three)
+                    for joint in range(1, 24):
+                        w = room[0, joint]
+                        if w > F32(0):
+                            one = add4(one, scale4(w, load4(bones, joint, 0)))
+                            two = add4(two, scale4(w, load4(bones, joint, 4)))
+                            three = add4(three, scale4(w, load4(bones, joint, 8)))
+                    store4(room, 1, 0, one)
+                    store4(room, 1, 4, two)
+                    store4(room, 1, 8, three)
+                    sx, sy, sz = transform_point(room[1], x, y, z)
+                    ex = grid_low[0] + (F32(i) + F32(0.5)) * cell_m - sx
+                    ey = grid_low[1] + (F32(j) + F32(0.5)) * cell_m - sy
+                    ez = grid_low[2] + (F32(k) + F32(0.5)) * cell_m - sz
+                    dx = roots[n, 3] * ex + roots[n, 4] * ey + roots[n, 5] * ez
+                    dy = roots[n, 6] * ex + roots[n, 7] * ey + roots[n, 8] * ez
+                    dz = roots[n, 9] * ex + roots[n, 10] * ey + roots[n, 11] * ez
+                    if dx * dx + dy * dy + dz * dz <= F32(MAX_ROOT_STEP_M**2):
+                        roots[n, 0] = x + dx
+                        roots[n, 1] = y + dy
+                        roots[n, 2] = z + dz
 
 
 @compile_kernel(**FAST_MATH)
@@ -114,58 +290,6 @@ def solve_with_prior(curvature, gradient, stiffness, back, factor, found):
         found[i] /= factor[i, i]
         for k in range(i):
             found[k] -= factor[i, k] * found[i]
-
-
-@compile_kernel(**FAST_MATH)
-def neighbor_correlation(frames, estimates, known, max_gap, min_pairs):
-    """Correlation of the estimates of successive known frames; 0 for fewer pairs than asked for.
-
-    Args:
-        frames: Indices of the frames, in any order.
-        estimates: Of each frame (frames, 25, 3).
-        known: Which frames have an estimate.
-        max_gap: Distance in frames up to which two make a pair.
-        min_pairs: Fewest pairs.
-    """
-    order = np.argsort(frames)
-    pairs, product, power, before = 0, 0.0, 0.0, -1
-    for row in range(order.shape[0]):
-        here = order[row]
-        if not known[here]:
-            continue
-        if before >= 0 and 0 < frames[here] - frames[before] <= max_gap:
-            pairs += 1
-            for j in range(25):
-                for a in range(3):
-                    one, other = estimates[before, j, a], estimates[here, j, a]
-                    product += one * other
-                    power += 0.5 * (one * one + other * other)
-        before = here
-    return product / max(power, 1e-12) if pairs >= min_pairs else 0.0
-
-
-@compile_kernel(**FAST_MATH)
-def neighbor_mean(frame, frames, corrections, held, max_gap, mean):
-    """Adds up the neighbors' mean correction, weighted by nearness; whether there is a neighbor.
-
-    Args:
-        frame: Index of the frame.
-        frames, corrections: Indices and corrections (25, 3) of all frames; its own is ignored.
-        held: Which of these count.
-        max_gap: Distance in frames up to which one is a neighbor.
-        mean: (25, 3), zero before.
-    """
-    total = 0.0
-    for row in range(frames.shape[0]):
-        apart = abs(frames[row] - frame)
-        if held[row] and 0 < apart <= max_gap:
-            total += 1.0 / apart
-            for j in range(25):
-                for a in range(3):
-                    mean[j, a] += corrections[row, j, a] / apart
-    if total > 0.0:
-        mean /= total
-    return total > 0.0
 
 
 @compile_kernel(**FAST_MATH)

@@ -1,33 +1,16 @@
-"""Linear blend skinning at one point, its root by Broyden's method, and the gradient of a pose.
-
-Compiled for the CPU. A sample's canonical point is x = warp(p; θ) with LBS(x; θ) = p. Where the
-loss pulls x with g_x, it pulls the posed point with g = J⁻ᵀ g_x, and by the implicit function
-theorem the pose feels -(∂LBS/∂θ)ᵀ g. A bone of weight w turns its share of the body rigidly, so
-that all of it is carried by one wrench a bone: the force Σ w g and the moment Σ w (B x) × g.
-"""
+"""Linear blend skinning at one point and its root by Broyden's method, compiled for the CPU."""
 
 import math
 
 import numpy as np
-from numba import prange
 
-from avatar.kernels.kernel_compiler import (
-    FAST_MATH,
-    NO_ALLOCATION,
-    add4,
-    compile_kernel,
-    load4,
-    scale4,
-    store4,
-)
-from avatar.kernels.torch_correspondence import MAX_PROBE_CORRECTION_M, MAX_ROOT_STEP_M
+from avatar.kernels.kernel_compiler import FAST_MATH, NO_ALLOCATION, compile_kernel
+from avatar.kernels.torch_correspondence import MAX_PROBE_CORRECTION_M
 
-F32, I32, U32 = np.float32, np.int32, np.uint32
+F32, U32 = np.float32, np.uint32
 MATRIX_LANES = 16
 """Floats that a 3×4 matrix takes in a volume of transforms: as many as a register and a cache line
 hold. The last four are nothing."""
-MIN_PULL_SHARE = 1e-3
-"""Pull on a sample, as a share of its ray's strongest, up to which it is left out."""
 
 
 @compile_kernel(inline="always", **FAST_MATH)
@@ -80,143 +63,6 @@ def blend_nodes(nodes, first, joints, shares, bones, transforms):
             joint, share = joints[e], shares[e]
             for q in range(MATRIX_LANES):
                 transforms[node, q] += share * bones[joint, q]
-
-
-@compile_kernel(inline="always", **FAST_MATH)
-def _weights_at(weights, shape, low, nodes_per_m, x, y, z, out):
-    """Trilinear skinning weights at a point, four bones at once, in the first row of `out`.
-
-    Args:
-        weights: (nodes, 24).
-        shape: Nodes along each axis.
-        low, nodes_per_m: Corner and nodes per metre.
-        x, y, z: The point.
-        out: (rows, 24).
-    """
-    a = min(max((x - low[0]) * nodes_per_m[0], F32(0)), F32(shape[0]) - F32(1.001))
-    b = min(max((y - low[1]) * nodes_per_m[1], F32(0)), F32(shape[1]) - F32(1.001))
-    c = min(max((z - low[2]) * nodes_per_m[2], F32(0)), F32(shape[2]) - F32(1.001))
-    i, j, k = I32(a), I32(b), I32(c)
-    a, b, c = a - F32(i), b - F32(j), c - F32(k)
-    u, v, w = F32(1) - a, F32(1) - b, F32(1) - c
-    n00 = (i * shape[1] + j) * shape[2] + k
-    n01, n10 = n00 + shape[2], n00 + shape[1] * shape[2]
-    n11 = n10 + shape[2]
-    for q in range(0, 24, 4):
-        near = add4(
-            scale4(u * v * w, load4(weights, n00, q)), scale4(u * v * c, load4(weights, n00 + 1, q))
-        )
-        near = add4(near, scale4(u * b * w, load4(weights, n01, q)))
-        near = add4(near, scale4(u * b * c, load4(weights, n01 + 1, q)))
-        far = add4(
-            scale4(a * v * w, load4(weights, n10, q)), scale4(a * v * c, load4(weights, n10 + 1, q))
-        )
-        far = add4(far, scale4(a * b * w, load4(weights, n11, q)))
-        far = add4(far, scale4(a * b * c, load4(weights, n11 + 1, q)))
-        store4(out, 0, q, add4(near, far))
-
-
-@compile_kernel(parallel=True, **FAST_MATH)
-def bone_wrenches(
-    points, grad_points, rows, first, count, slots, cell_roots,
-    weights, shape, low, nodes_per_m, bones, out,
-):  # fmt: skip
-    """Adds up what each ray's samples exert on the bones that move them.
-
-    Args:
-        points, grad_points: Canonical samples and what pulls them.
-        rows: Root of `cell_roots[slot]` that each sample was warped with.
-        first, count, slots: Each ray's samples and its frame's slot.
-        cell_roots: Roots and inverse Jacobians (slots, roots, 12).
-        weights, shape, low, nodes_per_m: The skinning volume, as for `_weights_at`.
-        bones: Body-from-canonical matrices (slots, 24, 12).
-        out: (rays, 24, 6), zero before: force then moment about the body frame's origin.
-    """
-    for ray in prange(first.shape[0]):
-        share, slot = np.empty((1, 24), F32), slots[ray]
-        strongest = F32(0)
-        for i in range(first[ray], first[ray] + count[ray]):
-            a, b, c = grad_points[i, 0], grad_points[i, 1], grad_points[i, 2]
-            strongest = max(strongest, a * a + b * b + c * c)
-        for i in range(first[ray], first[ray] + count[ray]):
-            a, b, c = grad_points[i, 0], grad_points[i, 1], grad_points[i, 2]
-            if a * a + b * b + c * c <= F32(MIN_PULL_SHARE**2) * strongest:
-                continue
-            n = rows[i]
-            fx = (
-                cell_roots[slot, n, 3] * a + cell_roots[slot, n, 6] * b + cell_roots[slot, n, 9] * c
-            )
-            fy = (
-                cell_roots[slot, n, 4] * a + cell_roots[slot, n, 7] * b
-                + cell_roots[slot, n, 10] * c
-            )  # fmt: skip
-            fz = (
-                cell_roots[slot, n, 5] * a + cell_roots[slot, n, 8] * b
-                + cell_roots[slot, n, 11] * c
-            )  # fmt: skip
-            x, y, z = points[i, 0], points[i, 1], points[i, 2]
-            _weights_at(weights, shape, low, nodes_per_m, x, y, z, share)
-            for joint in range(24):
-                w = share[0, joint]
-                if w < F32(1e-3):
-                    continue
-                px, py, pz = transform_point(bones[slot, joint], x, y, z)
-                out[ray, joint, 0] += w * fx
-                out[ray, joint, 1] += w * fy
-                out[ray, joint, 2] += w * fz
-                out[ray, joint, 3] += w * (py * fz - pz * fy)
-                out[ray, joint, 4] += w * (pz * fx - px * fz)
-                out[ray, joint, 5] += w * (px * fy - py * fx)
-
-
-@compile_kernel(parallel=True, **FAST_MATH)
-def update_roots(
-    packed_cells, cells, grid_low, cell_m, roots, weights, shape, low, nodes_per_m, bones
-):
-    """Moves a frame's roots to follow its pose, by one chord step towards the cell's center.
-
-    Args:
-        packed_cells: Packed cells of the frame, flat.
-        cells, grid_low, cell_m: Shape, corner and cell size of their grid.
-        roots: Roots, updated in place; inverse Jacobians and second-order terms stay.
-        weights, shape, low, nodes_per_m: The skinning volume, as for `_weights_at`.
-        bones: The new pose's matrices (24, 12).
-    """
-    for i in prange(cells[0]):
-        room = np.empty((2, 24), F32)
-        for j in range(cells[1]):
-            for k in range(cells[2]):
-                packed = packed_cells[(i * cells[1] + j) * cells[2] + k]
-                if packed <= 0:
-                    continue
-                rows = 3 if packed & 4 else 1
-                for candidate in range(packed & 3):
-                    n = (packed >> 3) + candidate * rows
-                    x, y, z = roots[n, 0], roots[n, 1], roots[n, 2]
-                    _weights_at(weights, shape, low, nodes_per_m, x, y, z, room)
-                    one, two, three = load4(bones, 0, 0), load4(bones, 0, 4), load4(bones, 0, 8)
-                    w = room[0, 0]
-                    one, two, three = scale4(w, one), scale4(w, two), scale4(w, three)
-                    for joint in range(1, 24):
-                        w = room[0, joint]
-                        if w > F32(0):
-                            one = add4(one, scale4(w, load4(bones, joint, 0)))
-                            two = add4(two, scale4(w, load4(bones, joint, 4)))
-                            three = add4(three, scale4(w, load4(bones, joint, 8)))
-                    store4(room, 1, 0, one)
-                    store4(room, 1, 4, two)
-                    store4(room, 1, 8, three)
-                    sx, sy, sz = transform_point(room[1], x, y, z)
-                    ex = grid_low[0] + (F32(i) + F32(0.5)) * cell_m - sx
-                    ey = grid_low[1] + (F32(j) + F32(0.5)) * cell_m - sy
-                    ez = grid_low[2] + (F32(k) + F32(0.5)) * cell_m - sz
-                    dx = roots[n, 3] * ex + roots[n, 4] * ey + roots[n, 5] * ez
-                    dy = roots[n, 6] * ex + roots[n, 7] * ey + roots[n, 8] * ez
-                    dz = roots[n, 9] * ex + roots[n, 10] * ey + roots[n, 11] * ez
-                    if dx * dx + dy * dy + dz * dz <= F32(MAX_ROOT_STEP_M**2):
-                        roots[n, 0] = x + dx
-                        roots[n, 1] = y + dy
-                        roots[n, 2] = z + dz
 
 
 TOLERANCE_M = 1e-4

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
 
 from avatar.kernels import numba_pose
+from avatar.kernels.kernel_compiler import FAST_MATH, compile_kernel
 
 MIN_NEIGHBOR_PAIRS = 12
 """Neighbor pairs below which their correlation cannot be measured."""
@@ -79,6 +80,7 @@ class TemporalPosePrior:
         return prior_from_neighbors(int(self._frames[slot]), self._frames, corrections, row, alike)
 
 
+@compile_kernel(**FAST_MATH)
 def neighbor_correlation(
     frames: Int64[np.ndarray, "frames"],
     estimates: Float[np.ndarray, "frames 25 3"],
@@ -91,9 +93,34 @@ def neighbor_correlation(
         estimates: Correction of each frame by its rays alone, in any unit.
         known: Which frames have an estimate.
     """
-    return numba_pose.neighbor_correlation(
-        frames, estimates, known, MAX_FRAME_GAP, MIN_NEIGHBOR_PAIRS
-    )
+    order = np.argsort(frames)
+    pairs, product, power, before = 0, 0.0, 0.0, -1
+    for here in order:
+        if not known[here]:
+            continue
+        if before >= 0 and 0 < frames[here] - frames[before] <= MAX_FRAME_GAP:
+            pairs += 1
+            for j in range(25):
+                for a in range(3):
+                    one, other = estimates[before, j, a], estimates[here, j, a]
+                    product += one * other
+                    power += 0.5 * (one * one + other * other)
+        before = here
+    return product / max(power, 1e-12) if pairs >= MIN_NEIGHBOR_PAIRS else 0.0
+
+
+@compile_kernel(**FAST_MATH)
+def _add_up_neighbors(frame, frames, corrections, held, total):
+    """Adds neighbors' corrections, weighted by nearness, to a total; returns the weights' sum."""
+    weights = 0.0
+    for row in range(frames.shape[0]):
+        apart = abs(frames[row] - frame)
+        if held[row] and 0 < apart <= MAX_FRAME_GAP:
+            weights += 1.0 / apart
+            for j in range(25):
+                for a in range(3):
+                    total[j, a] += corrections[row, j, a] / apart
+    return weights
 
 
 def prior_from_neighbors(
@@ -114,12 +141,12 @@ def prior_from_neighbors(
     share = min(
         max((error_correlation - MIN_CORRELATION) / (FULL_CORRELATION - MIN_CORRELATION), 0.0), 1.0
     )
-    mean = np.zeros((25, 3))
-    near = numba_pose.neighbor_mean(frame, frames, corrections, held, MAX_FRAME_GAP, mean)
-    if share == 0.0 or not near:
+    total = np.zeros((25, 3))
+    weights = _add_up_neighbors(frame, frames, corrections, held, total)
+    if share == 0.0 or weights == 0.0:
         return UNINFORMATIVE_PRIOR
     worth = share * NEIGHBOR_PRECISION
-    return PosePrior(worth / (1.0 + worth) * mean, 1.0 + worth)
+    return PosePrior(worth / (1.0 + worth) / weights * total, 1.0 + worth)
 
 
 def interpolate_correction(

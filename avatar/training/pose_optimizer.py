@@ -2,7 +2,7 @@
 
 A tracker's jitter of 2° and 1 cm costs 5-8 dB, more than anything else on real people. The field's
 gradient at a sample reaches the pose through the warp's implicit derivative, root included, as one
-wrench per bone (`avatar.kernels.numba_skinning`). A few hundred rays of a frame make one
+wrench per bone (`avatar.kernels.numba_pose`). A few hundred rays of a frame make one
 Gauss-Newton step (`pose_correction`), to which the rays of its last steps are added; exact poses do
 not move, and are soon probed rarely.
 A correction that all frames share is a change of the canonical body rather than an error of a
