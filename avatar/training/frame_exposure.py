@@ -6,6 +6,7 @@ pixels to the rendering of the same rays, from running sums, so that they cost n
 targets are divided by them. Their geometric mean over the frames is 1: the avatar stays neutral.
 """
 
+import math
 from collections.abc import Mapping
 from typing import final
 
@@ -15,6 +16,7 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from avatar.kernels.backend_protocol import PremultipliedPixels
+from avatar.kernels.kernel_compiler import FAST_MATH, compile_kernel
 from avatar.training.replay_buffer import TrainingBatch
 
 ChannelGains = Float32[np.ndarray, "3"]
@@ -55,8 +57,7 @@ class FrameExposures:
         self._avatar_frozen = avatar_frozen
         self._frames: list[int] = []
         self._restored: dict[int, ChannelGains] = {}
-        self._pixels = torch.zeros(capacity, 3, device=device)
-        self._rendered = torch.zeros(capacity, 3, device=device)
+        self._pixels, self._rendered = np.zeros((2, capacity, 3))
 
     @property
     def by_frame(self) -> dict[int, ChannelGains]:
@@ -88,7 +89,7 @@ class FrameExposures:
         self._frames[slot : slot + 1] = [frame]
         self.gains[slot] = torch.from_numpy(gain).to(self.gains)
         self._rendered[slot] = INITIAL_RAYS * INITIAL_COLOR
-        self._pixels[slot] = self._rendered[slot] * self.gains[slot]
+        self._pixels[slot] = self._rendered[slot] * gain
 
     def neutralize(self, batch: TrainingBatch) -> TrainingBatch:
         """The batch as the neutral avatar should look; unchanged while no exposure differs."""
@@ -103,17 +104,43 @@ class FrameExposures:
             batch: Rays with their pixels as filmed.
             rendered: Neutral rendering of the same rays.
         """
-        slots, held = batch.rays.slots.long(), len(self._frames)
-        is_person = torch.minimum(batch.target[:, 3], rendered[:, 3]) > MIN_PERSON_ALPHA
-        seen = torch.cat([torch.ones_like(rendered[:, 3:]), batch.target, rendered], dim=1)
-        sums = seen.new_zeros(held, 9).index_add_(0, slots, seen * is_person[:, None])
-        kept = torch.exp(-sums[:, :1] / MEMORY_RAYS)
-        self._pixels[:held] = kept * self._pixels[:held] + sums[:, 1:4]
-        self._rendered[:held] = kept * self._rendered[:held] + sums[:, 5:8]
-        log_gains = torch.log(self._pixels[:held] / self._rendered[:held])
-        if not self._avatar_frozen:
-            log_gains -= log_gains.mean(dim=0)
+        held = len(self._frames)
+        gains = np.zeros((held, 3), dtype=np.float32)
+        _update_gains(
+            batch.rays.slots.cpu().numpy(), batch.target.cpu().numpy(), rendered.cpu().numpy(),
+            self._avatar_frozen, self._pixels, self._rendered, gains,
+        )  # fmt: skip
+        self.gains[:held] = torch.from_numpy(gains).to(self.gains)
+
+
+@compile_kernel(**FAST_MATH)
+def _update_gains(slots, target, rendered, avatar_frozen, pixels, renderings, gains):
+    """Adds the colors of a batch's rays to the running sums of their slots, and finds the gains.
+
+    Args:
+        slots, target, rendered: Slot, pixel and rendering of each ray, premultiplied RGBA.
+        avatar_frozen: Whether gains are neither centered nor shrunk.
+        pixels, renderings: Running sums (slots, 3), which fade with each new ray; updated.
+        gains: Of the slots that hold a frame (held, 3); written.
+    """
+    held = gains.shape[0]
+    sums, log_gains = np.zeros((held, 7)), np.empty(held)
+    for ray in range(slots.shape[0]):
+        if min(target[ray, 3], rendered[ray, 3]) > MIN_PERSON_ALPHA:
+            slot = slots[ray]
+            sums[slot, 0] += 1.0
+            for q in range(3):
+                sums[slot, 1 + q] += target[ray, q]
+                sums[slot, 4 + q] += rendered[ray, q]
+    for q in range(3):
+        for slot in range(held):
+            kept = math.exp(-sums[slot, 0] / MEMORY_RAYS)
+            pixels[slot, q] = kept * pixels[slot, q] + sums[slot, 1 + q]
+            renderings[slot, q] = kept * renderings[slot, q] + sums[slot, 4 + q]
+            log_gains[slot] = math.log(pixels[slot, q] / renderings[slot, q])
+        if not avatar_frozen:
+            log_gains -= log_gains.mean()
             # James and Stein's shrinkage: differences no larger than their error are not believed
-            power = log_gains.square().mean(dim=0).clamp(min=1e-12)
-            log_gains *= (1.0 - CONSTANT_EXPOSURE_ERROR**2 / power).clamp(min=0.0)
-        self.gains[:held] = log_gains.exp()
+            power = max((log_gains * log_gains).mean(), 1e-12)
+            log_gains *= max(1.0 - CONSTANT_EXPOSURE_ERROR**2 / power, 0.0)
+        gains[:, q] = np.exp(log_gains)
