@@ -158,12 +158,17 @@ MECHANISMS = [
             "avatar.training.pose_correction.TemporalPosePrior",
             "avatar.training.pose_correction.prior_from_neighbors",
             "avatar.training.pose_correction.neighbor_correlation",
+            "avatar.training.pose_correction._add_up_neighbors",
         ),
     ),
     Mechanism(
         name="pose refinement",
         off={"refine_poses": False},
-        code=("avatar.training.pose_optimizer", "avatar.training.pose_correction"),
+        code=(
+            "avatar.training.pose_optimizer",
+            "avatar.training.pose_correction",
+            "avatar.kernels.numba_pose",
+        ),
     ),
 ]
 """What phone-like films are trained without, one by one."""
