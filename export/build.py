@@ -223,7 +223,7 @@ def _fine_tune(
     max_pictures: int,
     progress: ExportProgress,
 ) -> FineTuningResult:
-    """Fine-tune bricks until Ctrl-C; where the player is far from the renderer, all tiers'.
+    """Fine-tune bricks until Ctrl-C; bake again where the player is far from the renderer.
 
     Args:
         inputs: What is tuned, against what.
@@ -235,10 +235,7 @@ def _fine_tune(
         with suppress(KeyboardInterrupt):
             if is_below_target(inputs):
                 settings = {tier: THICK_FIELD_TIERS[tier] for tier in inputs.settings}
-                inputs = replace(
-                    inputs, tables=bake_again(inputs.tables), settings=settings,
-                    tuned_tiers=tuple(settings),
-                )  # fmt: skip
+                inputs = replace(inputs, tables=bake_again(inputs.tables), settings=settings)
                 max_pictures = min(max_pictures, THICK_FIELD_PICTURES)
             return fine_tune(inputs, max_pictures=max_pictures, progress=progress)
     return FineTuningResult(tables=inputs.tables, settings=inputs.settings, psnr=None)

@@ -3,9 +3,10 @@
 Sampled a few times, interpolated and quantized, voxels that hold the field's values at their nodes
 are not the ones that look most like the field. Rays of the player are compared with the
 same rays of the renderer, and each shares its error among the voxels that it has read (SIRT).
+Voxels that hardly show then share codes (`voxel_cells`), and the shared codes are tuned again.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,10 +21,9 @@ from capture.camera import Camera
 from export.bake.compositor import SirtUpdate, VoxelCodes, back_project, composite_segments
 from export.bake.reference_geometry import RaySegments
 from export.bake.reference_player import PlayerInputs, TracedPicture, trace_picture
+from export.bake.voxel_cells import VoxelCells, choose_cells, share_codes
 from export.package.player_tables import (
     BRICK_SIZE,
-    COLOR_CODE_STEP,
-    DENSITY_CODE_STEP,
     BrickTable,
     PlayerTables,
     RenderSettings,
@@ -114,10 +114,19 @@ VALIDATION_PX = 256
 """Longer side of the pictures that judge, pixels."""
 MAX_UPSCALE = 2
 """Largest factor by which a view's camera is enlarged."""
-MIN_GAIN_DB = 0.01
-"""Stop at the first round that gains less."""
-ROUNDS = 4
-"""SIRT rounds; three quarters of the gain come with the first two, and more overfit the rays."""
+FREE_ROUNDS = 2
+"""SIRT rounds in which each voxel has its own codes; more change little or overfit the rays."""
+SHARED_ROUNDS = 2
+"""SIRT rounds in which the voxels of a cell share a code."""
+MIN_ERROR_SHARE = 6e-7
+"""Share of the pictures' squared error that a color or a density has to save to be stored: a
+million such codes are worth what their bytes are."""
+MAX_LOSS_DB = 0.1
+"""Loss, dB, above which bricks are left as they were baked."""
+COLOR_STEP = 5
+"""Multiple to which tuned colors are rounded."""
+DENSITY_STEP = 6
+"""Multiple to which tuned densities are rounded: steps of 23 %."""
 COLOR_DAMPING = 0.5
 """Added to color normalizers, in rays: a voxel seen by less than half a ray hardly changes."""
 DENSITY_DAMPING = 1e-3
@@ -152,8 +161,8 @@ class FineTuningInputs:
     Attributes:
         tables: As baked.
         rig: What moves them.
-        settings: How the player draws them, by tier; "hq" is always among them.
-        tuned_tiers: Tiers whose rays are learnt from, in turn, and that judge.
+        settings: How the player draws them, by tier; "hq" is always among them. Rays of all tiers
+            are learnt from, in turn, and judge.
         renderer: Renders the exact picture, on the caller's thread alone.
         views: Poses and cameras of the avatar.
         executor: Traces the player's rays meanwhile.
@@ -162,7 +171,6 @@ class FineTuningInputs:
     tables: PlayerTables
     rig: Rig
     settings: Mapping[str, RenderSettings]
-    tuned_tiers: Sequence[str] = ("hq",)
     renderer: RenderFunction
     views: Sequence[PosedView]
     executor: Executor
@@ -239,7 +247,7 @@ class FineTuningResult:
         tables: The best tables seen; the given ones if no others were better.
         settings: Settings by tier that they are drawn with.
         psnr: To the renderer before and after, dB, on pictures that were not trained on; None if
-            nothing was tuned. The mean over the tuned tiers.
+            nothing was tuned. The mean over the tiers.
     """
 
     tables: PlayerTables
@@ -280,8 +288,9 @@ def fine_tune(
         (pose, fit_camera(camera, VALIDATION_PX, max_upscale=MAX_UPSCALE))
         for pose, camera in inputs.views
     ]
-    tiers = [inputs.settings[tier] for tier in inputs.tuned_tiers]
-    total = len(training) + len(tiers) * (len(asked) + len(novel)) + ROUNDS
+    tiers = list(inputs.settings.values())
+    total = len(training) + len(tiers) * (len(asked) + len(novel))
+    total += FREE_ROUNDS + SHARED_ROUNDS
     steps = iter(range(1, total + 1))
 
     def drawn(views: list[PosedView], settings: RenderSettings) -> RenderTargets:
@@ -296,18 +305,24 @@ def fine_tune(
     def judge(codes: VoxelCodes) -> float:
         return float(np.mean([targets.psnr(tables, each, codes) for targets, each in judges]))
 
-    baked = best = inputs.codes
-    first = score = judge(baked)
-    for latent in _sirt_rounds(learnt, tables, baked):
-        quantized = _quantize_codes(latent, baked)
-        reached = judge(quantized)
+    baked = inputs.codes
+    solver = _SirtSolver(learnt=learnt, bricks=tables.bricks, baked=baked, executor=inputs.executor)
+    first = judge(baked)
+    latent, cells = baked, None
+    pixels = sum(int(targets.pixels.sum()) for targets, _ in learnt)
+    for turn in range(FREE_ROUNDS + SHARED_ROUNDS):
+        latent, update = solver.descend(latent, cells)
+        if turn == FREE_ROUNDS - 1:
+            price = MIN_ERROR_SHARE * _squared_error(first, pixels)
+            cells = choose_cells(latent, update, baked, price)
+            latent = share_codes(latent, update, baked, cells)
         progress(next(steps) / total)
-        if reached < score + MIN_GAIN_DB:
-            break
-        best, score = quantized, reached
-    if best is not baked:
-        tables = replace(tables, bricks=_bricks_from_codes(tables.bricks, best))
-    return FineTuningResult(tables=tables, settings=inputs.settings, psnr=(first, score))
+    quantized = _quantize_codes(latent, baked)
+    reached = judge(quantized)
+    if reached < first - MAX_LOSS_DB:
+        return FineTuningResult(tables=tables, settings=inputs.settings, psnr=(first, first))
+    tables = replace(tables, bricks=_bricks_from_codes(tables.bricks, quantized))
+    return FineTuningResult(tables=tables, settings=inputs.settings, psnr=(first, reached))
 
 
 def _in_turn(training: Sequence[PosedView], tiers: int, num_views: int) -> list[list[PosedView]]:
@@ -319,37 +334,60 @@ def _in_turn(training: Sequence[PosedView], tiers: int, num_views: int) -> list[
     return parts
 
 
-def _sirt_rounds(
-    learnt: Sequence[tuple[RenderTargets, RenderSettings]],
-    tables: PlayerTables,
-    baked: VoxelCodes,
-) -> Iterator[VoxelCodes]:
-    """Yield the codes after each round, not yet quantized."""
-    codes, density = baked, baked.density
-    low, high = (
-        np.maximum(density - MAX_DENSITY_CODE_CHANGE, 0.0),
-        np.minimum(density + MAX_DENSITY_CODE_CHANGE, 255.0),
-    )
-    for _ in range(ROUNDS):
-        updates = [
-            back_project(targets.segments, each, tables.bricks, codes, targets.target_colors)
-            for targets, each in learnt
-        ]
-        update = SirtUpdate(*(np.sum(part, axis=0) for part in zip(*updates, strict=True)))
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _SirtSolver:
+    """Lowers the squared error of rays by SIRT rounds.
+
+    Attributes:
+        learnt: The rays, and how each tier draws them.
+        bricks: Which brick covers each block.
+        baked: Codes before the first round; densities stay within `MAX_DENSITY_CODE_CHANGE`.
+        executor: Runs over the tiers' rays.
+    """
+
+    learnt: Sequence[tuple[RenderTargets, RenderSettings]]
+    bricks: BrickTable
+    baked: VoxelCodes
+    executor: Executor
+
+    def descend(self, codes: VoxelCodes, cells: VoxelCells | None) -> tuple[VoxelCodes, SirtUpdate]:
+        """Return the codes after a round, not rounded, and the update of single voxels.
+
+        Args:
+            codes: Before the round; equal in all voxels of a cell.
+            cells: Voxels that share a code; None if each has its own.
+        """
+
+        def updates(learnt: tuple[RenderTargets, RenderSettings]) -> SirtUpdate:
+            targets, settings = learnt
+            return back_project(
+                targets.segments, settings, self.bricks, codes, targets.target_colors
+            )
+
+        parts = self.executor.map(updates, self.learnt)
+        single = SirtUpdate(*(np.sum(part, axis=0) for part in zip(*parts, strict=True)))
+        update, middle = single, self.baked.density
+        if cells is not None:
+            update, middle = cells.sum_update(single), cells.mean_density(middle)
         color_step = update.color / (update.color_normalizer + np.float32(COLOR_DAMPING))[:, None]
         density_step = update.density / (update.density_normalizer + np.float32(DENSITY_DAMPING))
-        color, density = codes.color - color_step, codes.density - density_step
-        color, density = np.clip(color, 0.0, 255.0), np.clip(density, low, high)
+        low, high = middle - MAX_DENSITY_CODE_CHANGE, middle + MAX_DENSITY_CODE_CHANGE
+        color = np.clip(codes.color - color_step, 0.0, 255.0)
+        density = np.clip(np.clip(codes.density - density_step, low, high), 0.0, 255.0)
         color[: BRICK_SIZE**3], density[: BRICK_SIZE**3] = 0.0, 0.0  # the empty brick
-        codes = VoxelCodes(density, color)
-        yield codes
+        return VoxelCodes(density, color), single
+
+
+def _squared_error(psnr: float, pixels: int) -> float:
+    """Return the squared error of pictures with this mean PSNR (dB) over all channels, 1/255²."""
+    return 3.0 * pixels * 255.0**2 * 10.0 ** (-0.1 * psnr)
 
 
 def _quantize_codes(latent: VoxelCodes, baked: VoxelCodes) -> VoxelCodes:
     """Round codes to those that are stored; keep visible voxels visible."""
-    color = round_codes(np.round(latent.color).astype(np.uint8), COLOR_CODE_STEP, 255)
-    density = round_codes(np.round(latent.density).astype(np.uint8), DENSITY_CODE_STEP, 255)
-    density = np.where(baked.density > 0, np.maximum(density, DENSITY_CODE_STEP), density)
+    color = round_codes(np.round(latent.color).astype(np.uint8), COLOR_STEP, 255)
+    density = round_codes(np.round(latent.density).astype(np.uint8), DENSITY_STEP, 255)
+    density = np.where(baked.density > 0, np.maximum(density, DENSITY_STEP), density)
     return VoxelCodes(density.astype(np.float32), color.astype(np.float32))
 
 

@@ -113,10 +113,10 @@ QUALITY_TIERS = {
         uniform_blocks=1,
         max_blocks=3,
         skinning_subdivision=1,
-        entry_margin_m=0.001,
+        entry_margin_m=0.002,
         min_transmittance=0.05,
         max_lengthening=4.0,
-        layer_min_transmittance=0.15,
+        layer_min_transmittance=0.11,
     ),
 }
 """Settings by tier; "hq" comes first."""
@@ -145,9 +145,10 @@ WEIGHT_SCALE = 65535
 THICKNESS_STEP_M = 0.0005
 """Thickness of code 1, metres."""
 COLOR_CODE_STEP = 8
-"""Multiple to which color codes are rounded: invisible, and bytes halve."""
+"""Multiple to which color codes are rounded when they are baked: invisible, and bytes halve."""
 DENSITY_CODE_STEP = 16
-"""Multiple to which density codes are rounded: steps of 72 %, invisible, and bytes halve."""
+"""Multiple to which density codes are rounded when they are baked: steps of 72 %, invisible, and
+bytes halve."""
 SURFEL_BITS = 17
 """Low bits of a z-buffer key, which number the surfel."""
 SURFEL_MASK = (1 << SURFEL_BITS) - 1

@@ -1,0 +1,159 @@
+"""Cells of 2³, 4³ or 8³ voxels that share one code, where pictures hardly show the difference.
+
+Half of a person's visible voxels make up a few percent of the pictures: they lie behind others.
+Every brick is an octree, pruned from its leaves wherever a cell costs more than it shows (Chou,
+Lookabaugh and Gray 1989, "Optimal pruning with applications to tree-structured source coding").
+Differences between the voxels of a cell are 0 and hardly take bytes.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64, Int64
+
+from export.bake.compositor import SirtUpdate, VoxelCodes
+from export.package.player_tables import BRICK_SIZE
+
+WEIGHT_FLOOR = 1e-3
+"""Weight of a visible voxel that no ray has seen, in rays."""
+SEPARATE_CODE = -1e4
+"""Density code by which empty voxels are kept apart from visible ones."""
+
+
+def prune_octrees(
+    codes: Float[np.ndarray, "voxels channels"],
+    weights: Float[np.ndarray, "voxels"],
+    price: float,
+) -> Int64[np.ndarray, "voxels"]:
+    """Choose the cells that minimize squared error plus price times the number of cells.
+
+    Args:
+        codes: Of every brick's 8³ voxels.
+        weights: Squared error for a change of a voxel's code by 1. A cell's code is the weighted
+            mean of its voxels'; where all weights are 0, cells are as large as bricks.
+        price: Squared error that one code more has to save.
+
+    Returns:
+        The number of the first voxel of each voxel's cell.
+    """
+    bricks = len(codes) // BRICK_SIZE**3
+    shape = (bricks, BRICK_SIZE, BRICK_SIZE, BRICK_SIZE)
+    weight = weights.reshape(shape).astype(np.float64)
+    first = weight[..., None] * codes.reshape(*shape, -1)
+    second = (first * codes.reshape(*shape, -1)).sum(axis=-1)
+    cost = np.full(shape, float(price))
+    cells = np.arange(len(codes)).reshape(shape)
+    size = 1
+    while size < BRICK_SIZE:
+        size *= 2
+        weight, first, second, cost = (_pooled(part) for part in (weight, first, second, cost))
+        square_of_mean = (first**2).sum(axis=-1) / np.maximum(weight, 1e-12)
+        merged = second - square_of_mean + price
+        chosen = merged <= cost
+        cost = np.where(chosen, merged, cost)
+        corner = cells[:, ::size, ::size, ::size]
+        cells = np.where(_repeated(chosen, size), _repeated(corner, size), cells)
+    return cells.ravel()
+
+
+def _pooled(values: Float64[np.ndarray, "bricks *rest"]) -> Float64[np.ndarray, "bricks *half"]:
+    """Sum blocks of 2³ values."""
+    for axis in (1, 2, 3):
+        values = np.add.reduceat(values, np.arange(0, values.shape[axis], 2), axis=axis)
+    return values
+
+
+def _repeated(values: np.ndarray, size: int) -> np.ndarray:
+    """Repeat values of cells for each of their size³ voxels."""
+    for axis in (1, 2, 3):
+        values = values.repeat(size, axis=axis)
+    return values
+
+
+def sum_over_cells(
+    values: Float32[np.ndarray, "voxels *channels"], cells: Int64[np.ndarray, "voxels"]
+) -> Float32[np.ndarray, "voxels *channels"]:
+    """Give each voxel the sum of its cell's values."""
+    columns = values.reshape(len(cells), -1).T
+    sums = [np.bincount(cells, column, len(cells))[cells] for column in columns]
+    return np.stack(sums, axis=-1).astype(np.float32).reshape(values.shape)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class VoxelCells:
+    """The cell of every voxel, as the number of its first voxel; bricks as in `VoxelCodes`.
+
+    Attributes:
+        density: Voxels that share a density.
+        color: Voxels that share a color.
+    """
+
+    density: Int64[np.ndarray, "voxels"]
+    color: Int64[np.ndarray, "voxels"]
+
+    def sum_update(self, update: SirtUpdate) -> SirtUpdate:
+        """Give each voxel the update of its cells."""
+        return SirtUpdate(
+            color=sum_over_cells(update.color, self.color),
+            color_normalizer=sum_over_cells(update.color_normalizer, self.color),
+            density=sum_over_cells(update.density, self.density),
+            density_normalizer=sum_over_cells(update.density_normalizer, self.density),
+        )
+
+    def mean_density(self, density: Float32[np.ndarray, "voxels"]) -> Float32[np.ndarray, "voxels"]:
+        """Give each voxel the mean of its cell."""
+        return sum_over_cells(density, self.density) / sum_over_cells(
+            np.ones_like(density), self.density
+        )
+
+
+def choose_cells(
+    codes: VoxelCodes, update: SirtUpdate, baked: VoxelCodes, price: float
+) -> VoxelCells:
+    """Choose the voxels that share codes.
+
+    Args:
+        codes: Tuned, each voxel alone.
+        update: Its normalizers tell how much each voxel shows.
+        baked: Empty voxels remain apart from others.
+        price: Squared error, 1/255², that one code more has to save.
+    """
+    weights = _error_weights(update, baked)
+    apart = np.where(baked.density > 0, codes.density, np.float32(SEPARATE_CODE))
+    return VoxelCells(
+        density=prune_octrees(apart[:, None], weights.density, price),
+        color=prune_octrees(codes.color, weights.color, price),
+    )
+
+
+def share_codes(
+    codes: VoxelCodes, update: SirtUpdate, baked: VoxelCodes, cells: VoxelCells
+) -> VoxelCodes:
+    """Give all voxels of a cell their weighted mean; other arguments as of `choose_cells`."""
+    weights = _error_weights(update, baked)
+
+    def mean(values, weight, cell):
+        total = sum_over_cells(weight, cell)
+        weighted = sum_over_cells(values * weight[:, None], cell)
+        return weighted / np.maximum(total, np.float32(1e-12))[:, None]
+
+    density = mean(codes.density[:, None], weights.density, cells.density)[:, 0]
+    return VoxelCodes(density, mean(codes.color, weights.color, cells.color))
+
+
+class _ErrorWeights(NamedTuple):
+    density: Float32[np.ndarray, "voxels"]
+    color: Float32[np.ndarray, "voxels"]
+
+
+def _error_weights(update: SirtUpdate, baked: VoxelCodes) -> _ErrorWeights:
+    """Return the squared error, 1/255², for a change of each voxel's codes by 1."""
+    visible = baked.density > 0
+    floor = np.where(visible, np.float32(WEIGHT_FLOOR), np.float32(0.0))
+    # normalizers of densities hold the squares on black and on white, of colors in [0, 1]
+    density = update.density_normalizer * np.float32(0.5 * 255.0**2)
+    return _ErrorWeights(
+        density=np.where(visible, density + floor, np.float32(1.0)),
+        color=update.color_normalizer + floor,
+    )
