@@ -93,6 +93,9 @@ def encode_weights(weights: Float32[np.ndarray, "nodes 24"]) -> UInt16[np.ndarra
 
 THICK_FAINT_FRACTION = 0.04
 """`BakeConfig.faint_fraction` of thick fields: haze of 10/m about a core of 120/m is seen."""
+THICK_SURFACE_DENSITY = 12.0
+"""`BakeConfig.surface_density` of thick fields, 1/m: ten centimetres of it hide 70 % of what lies
+behind."""
 BRICK_MARGIN_M = 0.012
 """Distance outside the surface that bricks cover, metres."""
 VOXEL_TO_CELL_RATIO = 0.53
@@ -161,7 +164,12 @@ class BakeConfig:
         """
         factor = (brick_bytes / BRICK_BYTES) ** (1.0 / BYTES_EXPONENT)
         factor = float(np.clip(factor, *VOXEL_FACTORS))
-        return replace(self, voxel_m=factor * self.voxel_m, faint_fraction=THICK_FAINT_FRACTION)
+        return replace(
+            self,
+            voxel_m=factor * self.voxel_m,
+            surface_density=THICK_SURFACE_DENSITY,
+            faint_fraction=THICK_FAINT_FRACTION,
+        )
 
     def quick(self) -> "BakeConfig":
         """Return the configuration of a coarser package of one tier, without fine-tuning."""

@@ -21,15 +21,18 @@ from capture.camera import Camera
 from export.bake.compositor import SirtUpdate, VoxelCodes, back_project, composite_segments
 from export.bake.reference_geometry import RaySegments
 from export.bake.reference_player import PlayerInputs, TracedPicture, trace_picture
-from export.bake.voxel_cells import VoxelCells, choose_cells, share_codes
+from export.bake.voxel_cells import (
+    VoxelCells,
+    bricks_from_codes,
+    quantize_codes,
+    share_codes_within_budget,
+)
 from export.package.player_tables import (
     BRICK_SIZE,
     BrickTable,
     PlayerTables,
     RenderSettings,
-    round_codes,
 )
-from export.package.table_codec import add_border_voxels
 from export.player import picture_on_white
 from export.player_inputs import fit_camera
 from preprocess.body.body_pose import BodyPose
@@ -123,10 +126,6 @@ MIN_ERROR_SHARE = 6e-7
 million such codes are worth what their bytes are."""
 MAX_LOSS_DB = 0.1
 """Loss, dB, above which bricks are left as they were baked."""
-COLOR_STEP = 5
-"""Multiple to which tuned colors are rounded."""
-DENSITY_STEP = 6
-"""Multiple to which tuned densities are rounded: steps of 23 %."""
 COLOR_DAMPING = 0.5
 """Added to color normalizers, in rays: a voxel seen by less than half a ray hardly changes."""
 DENSITY_DAMPING = 1e-3
@@ -314,14 +313,13 @@ def fine_tune(
         latent, update = solver.descend(latent, cells)
         if turn == FREE_ROUNDS - 1:
             price = MIN_ERROR_SHARE * _squared_error(first, pixels)
-            cells = choose_cells(latent, update, baked, price)
-            latent = share_codes(latent, update, baked, cells)
+            cells, latent = share_codes_within_budget(tables.bricks, latent, update, baked, price)
         progress(next(steps) / total)
-    quantized = _quantize_codes(latent, baked)
+    quantized = quantize_codes(latent, baked)
     reached = judge(quantized)
     if reached < first - MAX_LOSS_DB:
         return FineTuningResult(tables=tables, settings=inputs.settings, psnr=(first, first))
-    tables = replace(tables, bricks=_bricks_from_codes(tables.bricks, quantized))
+    tables = replace(tables, bricks=bricks_from_codes(tables.bricks, quantized))
     return FineTuningResult(tables=tables, settings=inputs.settings, psnr=(first, reached))
 
 
@@ -381,17 +379,3 @@ class _SirtSolver:
 def _squared_error(psnr: float, pixels: int) -> float:
     """Return the squared error of pictures with this mean PSNR (dB) over all channels, 1/255²."""
     return 3.0 * pixels * 255.0**2 * 10.0 ** (-0.1 * psnr)
-
-
-def _quantize_codes(latent: VoxelCodes, baked: VoxelCodes) -> VoxelCodes:
-    """Round codes to those that are stored; keep visible voxels visible."""
-    color = round_codes(np.round(latent.color).astype(np.uint8), COLOR_STEP, 255)
-    density = round_codes(np.round(latent.density).astype(np.uint8), DENSITY_STEP, 255)
-    density = np.where(baked.density > 0, np.maximum(density, DENSITY_STEP), density)
-    return VoxelCodes(density.astype(np.float32), color.astype(np.float32))
-
-
-def _bricks_from_codes(bricks: BrickTable, codes: VoxelCodes) -> BrickTable:
-    core = np.concatenate([codes.color, codes.density[:, None]], axis=1).astype(np.uint8)
-    shape = (len(bricks.voxels), BRICK_SIZE, BRICK_SIZE, BRICK_SIZE, 4)
-    return replace(bricks, voxels=add_border_voxels(bricks.index, core.reshape(shape)))

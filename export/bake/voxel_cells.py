@@ -6,15 +6,22 @@ Lookabaugh and Gray 1989, "Optimal pruning with applications to tree-structured 
 Differences between the voxels of a cell are 0 and hardly take bytes.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64
 
 from export.bake.compositor import SirtUpdate, VoxelCodes
-from export.package.player_tables import BRICK_SIZE
+from export.package.player_tables import BRICK_SIZE, BrickTable, round_codes
+from export.package.table_codec import add_border_voxels, estimate_brick_bytes
 
+MAX_BRICK_BYTES = 3.2e6
+"""Deflated size of bricks, about: a package of at most 4 MB. Codes must save more error beyond."""
+COLOR_STEP = 5
+"""Multiple to which tuned colors are rounded."""
+DENSITY_STEP = 6
+"""Multiple to which tuned densities are rounded: steps of 23 %."""
 WEIGHT_FLOOR = 1e-3
 """Weight of a visible voxel that no ray has seen, in rays."""
 SEPARATE_CODE = -1e4
@@ -157,3 +164,36 @@ def _error_weights(update: SirtUpdate, baked: VoxelCodes) -> _ErrorWeights:
         density=np.where(visible, density + floor, np.float32(1.0)),
         color=update.color_normalizer + floor,
     )
+
+
+def share_codes_within_budget(
+    bricks: BrickTable, codes: VoxelCodes, update: SirtUpdate, baked: VoxelCodes, price: float
+) -> tuple[VoxelCells, VoxelCodes]:
+    """Choose cells, dearer ones until they take at most `MAX_BRICK_BYTES`; return their codes, too.
+
+    Args:
+        bricks: Which brick covers each block.
+        codes, update, baked, price: As of `choose_cells`.
+    """
+    while True:
+        cells = choose_cells(codes, update, baked, price)
+        shared = share_codes(codes, update, baked, cells)
+        stored = bricks_from_codes(bricks, quantize_codes(shared, baked))
+        if estimate_brick_bytes(stored) <= MAX_BRICK_BYTES:
+            return cells, shared
+        price *= 1.5
+
+
+def quantize_codes(latent: VoxelCodes, baked: VoxelCodes) -> VoxelCodes:
+    """Round codes to those that are stored; keep visible voxels visible."""
+    color = round_codes(np.round(latent.color).astype(np.uint8), COLOR_STEP, 255)
+    density = round_codes(np.round(latent.density).astype(np.uint8), DENSITY_STEP, 255)
+    density = np.where(baked.density > 0, np.maximum(density, DENSITY_STEP), density)
+    return VoxelCodes(density.astype(np.float32), color.astype(np.float32))
+
+
+def bricks_from_codes(bricks: BrickTable, codes: VoxelCodes) -> BrickTable:
+    """Store rounded codes in bricks of the same blocks."""
+    core = np.concatenate([codes.color, codes.density[:, None]], axis=1).astype(np.uint8)
+    shape = (len(bricks.voxels), BRICK_SIZE, BRICK_SIZE, BRICK_SIZE, 4)
+    return replace(bricks, voxels=add_border_voxels(bricks.index, core.reshape(shape)))

@@ -127,7 +127,7 @@ THICK_FIELD_TIERS = {
         block_samples=3,
         entry_margin_m=0.004,
         min_transmittance=0.02,
-        layer_min_transmittance=0.05,
+        layer_min_transmittance=0.08,
     ),
 }
 """The same for fields that the usual settings cut short: haze in front of the surface, light that

@@ -167,7 +167,7 @@ def test_bricks_that_became_worse_are_not_kept(tune, renderer, spoilt):
         return picture if lies.asked <= 4 else picture[..., [2, 1, 0, 3]]
 
     lies.asked = 0
-    assert tune(spoilt, lies).tables is spoilt
+    assert tune(spoilt, PictureCache(lies)).tables is spoilt
     assert lies.asked == 10
 
 
@@ -210,7 +210,7 @@ def test_tiers_share_the_pictures_and_both_gain(
         asked.append(pose)
         return renderer(pose, camera)
 
-    after = tune(spoilt, PictureCache(counted), tuned_tiers=("hq", "lite"))
+    after = tune(spoilt, PictureCache(counted))
     assert len(asked) == 10  # four judge both tiers, six are learnt from by one of them each
     assert after.psnr[1] > after.psnr[0] + 1.0
     unseen = inputs_of(stand_in.rig, bent, camera(96, 120, distance_m=2.6))
