@@ -118,8 +118,8 @@ POSITION_CODE_STEP = 32
 """Multiple to which position codes are rounded, about a millimetre, so that they deflate well."""
 NORMAL_CODE_STEP = 7
 """Multiple to which normal codes are rounded, about three degrees, so that they deflate well."""
-FINE_TUNING_PICTURES = 16
-"""Pictures on which bricks are fine-tuned, half a second each."""
+FINE_TUNING_PICTURES = 10
+"""Pictures on which bricks are fine-tuned, a second each: both tiers learn from all of them."""
 EMPTY_AVATAR_MESSAGE = (
     f"The avatar is empty: its density is nowhere above {MIN_DENSITY:g} per metre. "
     "No package was written. Train it longer (--resume), or check the masks."

@@ -4,8 +4,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from capture.camera import Camera
-from export.bake import fine_tuning
 from export.bake.bake_tables import (
     BRICK_BYTES,
     THICK_FAINT_FRACTION,
@@ -20,7 +18,6 @@ from export.bake.reference_player import PlayerInputs, draw_reference, trace_pic
 from export.build import export_field
 from export.package.package_file import read_package
 from export.package.player_tables import QUALITY_TIERS, THICK_FIELD_TIERS
-from preprocess.body.body_pose import BodyPose
 
 SETTINGS = QUALITY_TIERS["hq"]
 
@@ -211,7 +208,7 @@ def test_tiers_share_the_pictures_and_both_gain(
         return renderer(pose, camera)
 
     after = tune(spoilt, PictureCache(counted))
-    assert len(asked) == 10  # four judge both tiers, six are learnt from by one of them each
+    assert len(asked) == 10  # four judge, six are learnt from, each for both tiers
     assert after.psnr[1] > after.psnr[0] + 1.0
     unseen = inputs_of(stand_in.rig, bent, camera(96, 120, distance_m=2.6))
     for settings in QUALITY_TIERS.values():
@@ -279,16 +276,3 @@ def test_where_the_player_is_far_from_the_renderer_bytes_choose_the_voxels(
     assert {tier: each.settings for tier, each in thick.manifest.tiers.items()} == (
         {tier: THICK_FIELD_TIERS[tier] for tier in thick.manifest.tiers}
     )
-
-
-@pytest.mark.parametrize("num_views", [1, 2, 3, 4])
-def test_each_tier_gets_pictures_of_every_view(num_views):
-    cameras = [
-        Camera.from_intrinsic(np.diag([100.0 + number, 100.0, 1.0]), (64, 64))
-        for number in range(num_views)
-    ]
-    training = [(BodyPose.rest(), cameras[number % num_views]) for number in range(12)]
-    parts = fine_tuning._in_turn(training, 2, num_views)
-    for part in parts:
-        assert {camera.focal_px[0] for _, camera in part} == {c.focal_px[0] for c in cameras}
-    assert abs(len(parts[0]) - len(parts[1])) <= 1
