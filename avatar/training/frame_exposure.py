@@ -126,8 +126,8 @@ def _update_gains(slots, target, rendered, avatar_frozen, pixels, renderings, ga
     held = gains.shape[0]
     sums, log_gains = np.zeros((held, 7)), np.empty(held)
     for ray in range(slots.shape[0]):
-        if min(target[ray, 3], rendered[ray, 3]) > MIN_PERSON_ALPHA:
-            slot = slots[ray]
+        slot = slots[ray]
+        if slot < held and min(target[ray, 3], rendered[ray, 3]) > MIN_PERSON_ALPHA:
             sums[slot, 0] += 1.0
             for q in range(3):
                 sums[slot, 1 + q] += target[ray, q]
