@@ -29,7 +29,7 @@ MIN_CORRELATION = 0.1
 """Correlation of neighbors' errors up to which they are ignored."""
 FULL_CORRELATION = 0.3
 """Correlation of neighbors' errors from which they have their full precision."""
-NEIGHBOR_PRECISION = 128.0
+NEIGHBOR_PRECISION = 32.0
 """Precision of all neighbors together, relative to that of the tracker's pose. With 8, poses drift
 from the truth: rays err alike, and turn joints about axes that hardly show."""
 
