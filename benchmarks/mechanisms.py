@@ -1,8 +1,7 @@
 """What each mechanism of training buys: each off in turn, on phone-like films and on few frames.
 
-A row trains without one mechanism for the same number of steps as the others, in turns with them,
-and is scored in poses and exposures fitted by the product, which is how captures with inexact poses
-are scored. The row with a tenth more steps says what the time that a mechanism takes could buy.
+A row trains without one mechanism for as many steps as the others, in turns with them, and is
+scored in fitted poses and exposures. A row with a tenth more steps tells what time could buy.
 """
 
 import inspect
@@ -297,8 +296,7 @@ def measured_scores(
         size_px: Longer side, pixels.
         steps: Of training.
         seed: Of training.
-        frames: How few of its frames are used; then the few-frame priors are left out, one by one.
-            All, and the other mechanisms, if None.
+        frames: How few of its frames are used, to leave out few-frame priors; all if None.
         dance: File of the poses in which the exported player is compared with the renderer.
     """
     if not kept.exists():
@@ -308,8 +306,7 @@ def measured_scores(
             compared, rows = open_few(folder, size_px, frames), FEW_FRAME_MECHANISMS
             name = f"{len(compared.frames) + len(compared.held_out)} frames of {folder.name}"
         measured = ", ".join(Hardware.here().lines()[:2])
-        poses = None if dance is None else read_motion(dance)
-        scores = list(score_mechanisms(compared, rows, steps, seed, poses))
+        scores = list(score_mechanisms(compared, rows, steps, seed, dance and read_motion(dance)))
         found = CaptureScores(name, seed, steps, size_px, measured, scores)
         kept.write_text(json.dumps(found._asdict(), indent=1) + "\n")
     found = CaptureScores(**json.loads(kept.read_text()))

@@ -243,7 +243,7 @@ class FineTuningResult:
     """Outcome of fine-tuning.
 
     Attributes:
-        tables: The best tables seen; the given ones if no others were better.
+        tables: Tuned; the given ones if tuning would lose more than `MAX_LOSS_DB`.
         settings: Settings by tier that they are drawn with.
         psnr: To the renderer before and after, dB, on pictures that were not trained on; None if
             nothing was tuned. The mean over the tiers.

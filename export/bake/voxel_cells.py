@@ -17,7 +17,11 @@ from export.package.player_tables import BRICK_SIZE, BrickTable, round_codes
 from export.package.table_codec import add_border_voxels, estimate_brick_bytes
 
 MAX_BRICK_BYTES = 3.2e6
-"""Deflated size of bricks, about: a package of at most 4 MB. Codes must save more error beyond."""
+"""Estimated deflated size of bricks, bytes, that leaves a package of at most 4 MB."""
+PRICE_FACTOR = 1.5
+"""Factor by which the price is raised where bricks do not fit."""
+MAX_PRICES = 24
+"""Most prices that are tried; the last is 10,000 times the first."""
 COLOR_STEP = 5
 """Multiple to which tuned colors are rounded."""
 DENSITY_STEP = 6
@@ -169,19 +173,19 @@ def _error_weights(update: SirtUpdate, baked: VoxelCodes) -> _ErrorWeights:
 def share_codes_within_budget(
     bricks: BrickTable, codes: VoxelCodes, update: SirtUpdate, baked: VoxelCodes, price: float
 ) -> tuple[VoxelCells, VoxelCodes]:
-    """Choose cells, dearer ones until they take at most `MAX_BRICK_BYTES`; return their codes, too.
+    """Choose cells, at higher prices until bricks fit into `MAX_BRICK_BYTES`; return codes, too.
 
     Args:
         bricks: Which brick covers each block.
         codes, update, baked, price: As of `choose_cells`.
     """
-    while True:
-        cells = choose_cells(codes, update, baked, price)
+    for raised in price * PRICE_FACTOR ** np.arange(MAX_PRICES):
+        cells = choose_cells(codes, update, baked, float(raised))
         shared = share_codes(codes, update, baked, cells)
         stored = bricks_from_codes(bricks, quantize_codes(shared, baked))
         if estimate_brick_bytes(stored) <= MAX_BRICK_BYTES:
-            return cells, shared
-        price *= 1.5
+            break
+    return cells, shared
 
 
 def quantize_codes(latent: VoxelCodes, baked: VoxelCodes) -> VoxelCodes:
