@@ -75,13 +75,11 @@ class TorchBackend:
         with torch.no_grad():
             return torch_reference.composite(raw, samples.offsets, samples.counts, step_m)
 
-    def composite_loss(self, raw, samples, step_m, target, background, alpha_weight, hard_weight):
+    def composite_loss(self, raw, samples, step_m, target, alpha_weight, hard_weight):
         leaf = raw.detach().requires_grad_()
         with torch.enable_grad():
             rendered = torch_reference.composite(leaf, samples.offsets, samples.counts, step_m)
-            loss = torch_reference.loss_per_ray(
-                rendered, target, background, alpha_weight, hard_weight
-            )
+            loss = torch_reference.loss_per_ray(rendered, target, alpha_weight, hard_weight)
             (grad,) = torch.autograd.grad(loss.mean(), leaf)
         return rendered.detach(), loss.detach(), grad
 
@@ -157,7 +155,6 @@ def failing_operation(backend: Backend) -> str | None:
     rows = torch.zeros(TEST_POINTS, dtype=torch.int32)
     samples = RaySamples(points, torch.cumsum(count, 0) - count, count, rows)
     target = torch.rand(16, 4, generator=generator)
-    background = torch.rand(16, 3, generator=generator)
 
     rig, bones = _bent_tube()
     canonical = torch.from_numpy(rig.seeds) * torch.tensor([1.0, 1.2, 1.2])
@@ -166,7 +163,7 @@ def failing_operation(backend: Backend) -> str | None:
     def results(of: Backend) -> dict[str, torch.Tensor]:
         grad_table = torch.zeros_like(table)
         of.encode_backward(points, slope, levels, grad_table)
-        rendered, loss, grad = of.composite_loss(raw, samples, 0.01, target, background, 0.1, 0.1)
+        rendered, loss, grad = of.composite_loss(raw, samples, 0.01, target, 0.1, 0.1)
         how, stepped = AdamSettings(0.1, (0.9, 0.99), 1e-15, 3), table.clone()
         of.adam_step(how, table.clone(), 0.1 * table, table.square(), stepped)
         return {

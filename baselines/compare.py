@@ -41,11 +41,11 @@ class CompareArguments:
         python -m baselines.compare sample --out comparison --seconds 20
 
     All systems get the same capture (poses and body fitted to its masks as by ia-ingest), the same
-    frames, rays, backgrounds and decay of learning rates, and one thread. Time is that of the
-    processor, so that other programs hardly count; scoring is not charged, and neither is compiling
-    kernels. Baselines are our own implementations of their papers, in plain torch. Scores are those
-    in the poses given, and in poses fitted to the scored pictures; the fit is the same for all
-    systems, has the same budget, and uses nothing of a system but its pictures.
+    frames, rays and decay of learning rates, and one thread. Time is that of the processor, so that
+    other programs hardly count; scoring is not charged, and neither is compiling kernels. Baselines
+    are our own implementations of their papers, in plain torch. Scores are those in the given poses
+    and in poses fitted to the scored pictures; the fit is the same for all systems, has the same
+    budget, and uses nothing of a system but its pictures.
 
         anim-nerf     inverse skinning by the nearest vertices, a NeRF, poses optimized
         neural-body   a code for every vertex, diffused by a sparse 3-D network

@@ -96,9 +96,8 @@ def dense_step(
         samples = unskipped.samples(field.backend, batch.rays, grid, config.sample_step_m)
         activations = field.forward(samples.points)
         unskipped.clear_substitutes(activations.raw, samples.root_rows)
-        background = torch.rand(config.rays, 3, generator=chance, device=chance.device)
         _, _, grad = field.backend.composite_loss(
-            activations.raw, samples, config.sample_step_m, batch.target, background,
+            activations.raw, samples, config.sample_step_m, batch.target,
             config.alpha_weight, config.hard_surface_weight,
         )  # fmt: skip
         field.backward(activations, grad)

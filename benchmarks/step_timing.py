@@ -41,7 +41,6 @@ def step_marks(seen: LoadedTrainer, device: torch.device) -> list[Measurement]:
     chance = _seeded(device)
     empty = avatar.occupancy.sample_empty(config.empty_space_points, chance)
     near = sample_tv_pairs(samples.points, config, chance)
-    background = torch.rand(config.rays, 3, generator=chance, device=device)
     plain, scene = AutogradField(field), PaperStepInputs.of(avatar.rig, frame, seen.frames, grid)
     counts: list[tuple[int, int]] = []
 
@@ -54,10 +53,10 @@ def step_marks(seen: LoadedTrainer, device: torch.device) -> list[Measurement]:
 
     alternatives: dict[str, Callable[[], object]] = {
         "ours": ours,
-        "torch": lambda: autograd_step(plain, samples, empty, near, batch, background, config),
+        "torch": lambda: autograd_step(plain, samples, empty, near, batch, config),
         "march": lambda: TorchBackend().march(batch.rays, replay.correspondences, grid, how),
         "paper": lambda: counts.append(
-            paper_step(scene, plain, batch, empty, background, config)
+            paper_step(scene, plain, batch, empty, config)
         ),
     }  # fmt: skip
     ours(replace(config, faint_gradient_share=0.0))

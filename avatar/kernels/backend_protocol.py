@@ -324,7 +324,6 @@ class Backend(Protocol):
         samples: RaySamples,
         step_m: float,
         target: PremultipliedPixels,
-        background: Float32[Tensor, "rays 3"],
         alpha_weight: float,
         hard_weight: float,
     ) -> tuple[PremultipliedPixels, Float32[Tensor, "rays"], RawOutputs]:

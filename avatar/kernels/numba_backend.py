@@ -124,13 +124,13 @@ class NumbaBackend(Backend):
         )  # fmt: skip
         return rendered
 
-    def composite_loss(self, raw, samples, step_m, target, background, alpha_weight, hard_weight):
+    def composite_loss(self, raw, samples, step_m, target, alpha_weight, hard_weight):
         rendered, loss = torch.empty(len(samples.counts), 4), torch.empty(len(samples.counts))
         grad = torch.empty_like(raw)
         numba_rendering.composite_loss(
             raw.numpy(), samples.offsets.numpy(), samples.counts.numpy(), np.float32(step_m),
-            target.numpy(), background.numpy(), np.float32(alpha_weight),
-            np.float32(hard_weight), rendered.numpy(), loss.numpy(), grad.numpy(),
+            target.numpy(), np.float32(alpha_weight), np.float32(hard_weight),
+            rendered.numpy(), loss.numpy(), grad.numpy(),
         )  # fmt: skip
         return rendered, loss, grad
 

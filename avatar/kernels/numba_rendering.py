@@ -6,7 +6,9 @@ from numba import prange
 from avatar.kernels.kernel_compiler import FAST_MATH, NO_ALLOCATION, compile_kernel, prefetch
 from avatar.kernels.torch_reference import (
     ALPHA_DEAD_ZONE,
+    BRIGHT_GRAY,
     COLOR_HUBER_DELTA,
+    DARK_GRAY,
     MAX_LOG_DENSITY,
     MIN_NORMAL_DEPTH,
     OPAQUE_DEPTH,
@@ -320,21 +322,23 @@ def mean_normals(
 
 
 @compile_kernel(inline="always")
-def _huber_slope(error, scale):
-    return max(F32(-1), min(F32(1), error * F32(1.0 / COLOR_HUBER_DELTA))) * scale
+def _half_huber_slope(error):
+    return max(F32(-0.5), min(F32(0.5), error * F32(0.5 / COLOR_HUBER_DELTA)))
 
 
-@compile_kernel(inline="always")
-def _huber(error):
-    size = abs(error)
-    if size <= F32(COLOR_HUBER_DELTA):
-        return size * size * F32(0.5 / COLOR_HUBER_DELTA)
-    return size - F32(0.5 * COLOR_HUBER_DELTA)
+@compile_kernel()
+def _mean_huber(error, excess_alpha):
+    """Mean loss of a channel over both backgrounds; its derivatives by color and by alpha."""
+    dark, bright = F32(DARK_GRAY), F32(BRIGHT_GRAY)
+    on_dark, on_bright = error - excess_alpha * dark, error - excess_alpha * bright
+    p, q = _half_huber_slope(on_dark), _half_huber_slope(on_bright)
+    loss = p * on_dark + q * on_bright - F32(COLOR_HUBER_DELTA) * (p * p + q * q)
+    return loss, p + q, -(p * dark + q * bright)
 
 
 @compile_kernel(parallel=True, **FAST_MATH)
 def composite_loss(
-    raw, offsets, counts, sample_step_m, target, background, alpha_weight, hard_surface_weight,
+    raw, offsets, counts, sample_step_m, target, alpha_weight, hard_surface_weight,
     rendered, loss, grad_raw,
 ):  # fmt: skip
     """Composite, loss of every ray, and the gradient of the mean loss with respect to `raw`.
@@ -367,20 +371,17 @@ def composite_loss(
         rendered[ray, 2] = blue
         rendered[ray, 3] = alpha
 
-        b0, b1, b2 = background[ray, 0], background[ray, 1], background[ray, 2]
-        clear = F32(1) - target[ray, 3]
-        d0 = red + through * b0 - (target[ray, 0] + clear * b0)
-        d1 = green + through * b1 - (target[ray, 1] + clear * b1)
-        d2 = blue + through * b2 - (target[ray, 2] + clear * b2)
-        g0, g1, g2 = _huber_slope(d0, share), _huber_slope(d1, share), _huber_slope(d2, share)
         off = alpha - target[ray, 3]
-        g_alpha = F32(0)
+        e0, g0, a0 = _mean_huber(red - target[ray, 0], off)
+        e1, g1, a1 = _mean_huber(green - target[ray, 1], off)
+        e2, g2, a2 = _mean_huber(blue - target[ray, 2], off)
+        g0, g1, g2, g_alpha = share * g0, share * g1, share * g2, share * (a0 + a1 + a2)
         if abs(off) > F32(ALPHA_DEAD_ZONE):
-            g_alpha = alpha_weight * share * (F32(1) if off > F32(0) else F32(-1))
+            g_alpha += alpha_weight * share * (F32(1) if off > F32(0) else F32(-1))
         solid, empty = np.exp(-alpha), np.exp(alpha - F32(1))
         g_alpha += hard_surface_weight * share * (solid - empty) / (solid + empty)
         loss[ray] = (
-            _huber(d0) + _huber(d1) + _huber(d2)
+            e0 + e1 + e2
             + alpha_weight * max(F32(0), abs(off) - F32(ALPHA_DEAD_ZONE))
             - hard_surface_weight * np.log(solid + empty)
         )  # fmt: skip
@@ -389,7 +390,7 @@ def composite_loss(
         for i in range(stop - 1, start - 1, -1):
             q0, q1, q2, through = grad_raw[i, 0], grad_raw[i, 1], grad_raw[i, 2], grad_raw[i, 3]
             weight = (grad_raw[i - 1, 3] if i > start else F32(1)) - through
-            value = (q0 - b0) * g0 + (q1 - b1) * g1 + (q2 - b2) * g2 + g_alpha
+            value = q0 * g0 + q1 * g1 + q2 * g2 + g_alpha
             grad_raw[i, 0] = weight * g0 * q0 * (F32(1) - q0)
             grad_raw[i, 1] = weight * g1 * q1 * (F32(1) - q1)
             grad_raw[i, 2] = weight * g2 * q2 * (F32(1) - q2)

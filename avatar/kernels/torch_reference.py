@@ -25,6 +25,8 @@ MAX_LOG_DENSITY = 9.0
 """Log density (log 1/m) at which the activation is clamped."""
 COLOR_HUBER_DELTA = 0.1
 """Color error at which the Huber loss turns from quadratic to linear."""
+DARK_GRAY, BRIGHT_GRAY = 0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0)
+"""Backgrounds: the mean loss over both is that over all grays in [0, 1] (Gauss), if quadratic."""
 ALPHA_DEAD_ZONE = 1e-3
 """Error of alpha up to which the L1 loss on alpha is zero."""
 OPAQUE_DEPTH = 12.0
@@ -146,30 +148,26 @@ def mean_normals(
 def loss_per_ray(
     rendered: Float[Tensor, "rays 4"],
     target: Float[Tensor, "rays 4"],
-    background: Float[Tensor, "rays 3"],
     alpha_weight: float,
     hard_weight: float,
 ) -> Float[Tensor, "rays"]:
     """InstantAvatar's losses (§3.4): Huber on color, L1 on alpha, hard surface.
 
-    Both pictures are composited over the same random background, which makes half-transparency
-    costly. Huber (δ = 0.1) is divided by δ and summed over channels; L1 has a dead zone of 1e-3;
-    hard surface is -log(exp(-α) + exp(α - 1)).
+    Both pictures are composited over the same gray, one of two, whose mean stands for the paper's
+    random background; it makes half-transparency costly. Huber (δ = 0.1) is divided by δ and summed
+    over channels; L1 has a dead zone of 1e-3; hard surface is -log(exp(-α) + exp(α - 1)).
 
     Args:
         rendered: Premultiplied color and alpha.
         target: The same of the video.
-        background: Background color of each ray.
         alpha_weight, hard_weight: Weights of the last two.
     """
     alpha, truth = rendered[:, 3:], target[:, 3:]
-    error = (rendered[:, :3] + (1.0 - alpha) * background) - (
-        target[:, :3] + (1.0 - truth) * background
-    )
-    size = error.abs()
+    grays = alpha.new_tensor([DARK_GRAY, BRIGHT_GRAY])[:, None, None]
+    size = (rendered[:, :3] - target[:, :3] + (truth - alpha) * grays).abs()
     huber = torch.where(
         size <= COLOR_HUBER_DELTA, 0.5 * size**2 / COLOR_HUBER_DELTA, size - 0.5 * COLOR_HUBER_DELTA
-    ).sum(dim=1)
+    ).sum(dim=2).mean(dim=0)  # fmt: skip
     off = ((alpha - truth).abs() - ALPHA_DEAD_ZONE).clamp(min=0.0)[:, 0]
     hard = -torch.log(torch.exp(-alpha) + torch.exp(alpha - 1.0))[:, 0]
     return huber + alpha_weight * off + hard_weight * hard

@@ -113,7 +113,7 @@ def compute_gradients(
         surface_share: Progress from smooth densities to firm surfaces, in [0, 1].
         caches_density: Whether the samples raise the occupancy's cached densities.
         poses: Accumulates the samples' wrenches, if poses are refined.
-        generator: Draws backgrounds and regularization points, on the field's device.
+        generator: Draws regularization points and samples, on the field's device.
     """
     field = learner.field
     samples = sampler.sample_rays(batch.rays, correspondences)
@@ -121,7 +121,6 @@ def compute_gradients(
     seen = field.forward(torch.cat([samples.points, *asked]))
     raw, *raw_asked = seen.raw.split([len(points) for points in (samples.points, *asked)])
     count = len(raw)
-    background = torch.rand(len(batch.target), 3, generator=generator, device=generator.device)
     normals = learner.shading.body_normals(
         field.backend, batch.rays, samples, raw, correspondences, config.sample_step_m
     )
@@ -129,7 +128,7 @@ def compute_gradients(
     shade = learner.shading.factor(normals)
     lit = torch.cat([shade.expand(-1, 3), torch.ones_like(shade)], dim=1)
     rendered, loss, grad = field.backend.composite_loss(
-        raw, samples, config.sample_step_m, batch.target / lit, background,
+        raw, samples, config.sample_step_m, batch.target / lit,
         config.alpha_weight, config.hard_surface_weight * hard_surface_share,
     )  # fmt: skip
     grads = [grad, *_regularization_gradients(raw_asked, asked, config, surface_share)]

@@ -59,7 +59,6 @@ def autograd_step(
     empty: Float32[Tensor, "empty 3"],
     pairs: Float32[Tensor, "pairs 3"],
     batch: TrainingBatch,
-    background: Float32[Tensor, "rays 3"],
     config: TrainConfig,
 ) -> tuple[Tensor, ...]:
     """Gradients of the loss with respect to the field's parameters, by what the recipe asks."""
@@ -69,7 +68,7 @@ def autograd_step(
     )
     rendered = torch_reference.composite(raw, samples.offsets, samples.counts, config.sample_step_m)
     loss = torch_reference.loss_per_ray(
-        rendered, batch.target, background, config.alpha_weight, config.hard_surface_weight
+        rendered, batch.target, config.alpha_weight, config.hard_surface_weight
     ).mean()
     one, other = centimeter_opacity(raw_pairs).chunk(2)
     total = loss + config.empty_space_weight * centimeter_opacity(raw_empty).mean()
@@ -223,7 +222,6 @@ def paper_step(
     field: AutogradField,
     batch: TrainingBatch,
     empty: Float32[Tensor, "empty 3"],
-    background: Float32[Tensor, "rays 3"],
     config: TrainConfig,
 ) -> tuple[int, int]:
     """Gradients of the loss; how many samples survived, and how many roots were asked."""
@@ -241,7 +239,7 @@ def paper_step(
     first = torch.cumsum(count, 0) - count
     rendered = torch_reference.composite(chosen, first, count.int(), mean_step)
     loss = torch_reference.loss_per_ray(
-        rendered, batch.target, background, config.alpha_weight, config.hard_surface_weight
+        rendered, batch.target, config.alpha_weight, config.hard_surface_weight
     ).mean()
     total = loss + config.empty_space_weight * centimeter_opacity(raw[asked:]).mean()
     torch.autograd.grad(total, field.parameters)

@@ -126,8 +126,7 @@ def loss_case(generator, counts=(5, 0, 1, 30, 17)):
     raw[:, 3] += 3.0
     target = torch.rand(rays, 4, generator=generator)
     target[:, :3] *= target[:, 3:]
-    background = torch.rand(rays, 3, generator=generator)
-    return raw, samples, 0.01, target, background, 0.1, 0.1
+    return raw, samples, 0.01, target, 0.1, 0.1
 
 
 def test_compiled_loss_and_gradient_agree_with_autograd(generator):
@@ -164,10 +163,10 @@ def test_the_gradient_of_the_loss_is_exact_to_a_millionth_however_opaque_a_ray(g
     """Behind an opaque sample a gradient is nothing, not rounding times a large optical depth."""
     raw, samples, *rest = loss_case(generator, counts=(60, 90, 40, 1, 80))
     raw[:, 3] = 8.9 - 6.0 * torch.rand(len(raw), generator=generator)
-    step_m, target, background, *weights = rest
+    step_m, target, *weights = rest
     leaf = raw.double().requires_grad_()
     rendered = torch_reference.composite(leaf, samples.offsets, samples.counts, step_m)
-    loss = torch_reference.loss_per_ray(rendered, target.double(), background.double(), *weights)
+    loss = torch_reference.loss_per_ray(rendered, target.double(), *weights)
     (expected,) = torch.autograd.grad(loss.mean(), leaf)
     grad = NUMBA.composite_loss(raw, samples, *rest)[2]
     assert float((grad - expected).abs().max()) <= 2e-6 * float(expected.abs().max())
@@ -181,13 +180,11 @@ def test_the_density_of_a_saturated_sample_has_no_gradient(generator):
 
 
 def test_the_meaning_of_the_loss_passes_gradcheck_in_double(generator):
-    raw, samples, step_m, target, background, *weights = loss_case(generator)
+    raw, samples, step_m, target, *weights = loss_case(generator)
 
     def mean_loss(raw):
         rendered = torch_reference.composite(raw, samples.offsets, samples.counts, step_m)
-        return torch_reference.loss_per_ray(
-            rendered, target.double(), background.double(), *weights
-        ).mean()
+        return torch_reference.loss_per_ray(rendered, target.double(), *weights).mean()
 
     assert torch.autograd.gradcheck(mean_loss, (raw.double().requires_grad_(),))
 

@@ -25,7 +25,6 @@ def results_of(learnt) -> dict[str, list[torch.Tensor]]:
     points, count = samples.points, len(samples.points)
     raw = torch.randn(count, 4, generator=generator)
     slope = torch.randn(count, field.levels.feature_width, generator=generator)
-    background = torch.rand(700, 3, generator=generator)
     grad_table = torch.zeros_like(field.table)
     NUMBA.encode_backward(points, slope, field.levels, grad_table)
     grad_points = NUMBA.encode_points_backward(points, slope, field.table, field.levels)
@@ -47,9 +46,7 @@ def results_of(learnt) -> dict[str, list[torch.Tensor]]:
         "encode_points_backward": [grad_points],
         "march": list(samples),
         "composite": [NUMBA.composite(raw, samples, 0.01)],
-        "composite_loss": list(
-            NUMBA.composite_loss(raw, samples, 0.01, batch.target, background, 0.1, 0.1)
-        ),
+        "composite_loss": list(NUMBA.composite_loss(raw, samples, 0.01, batch.target, 0.1, 0.1)),
         "scatter_max_density": [grid.density],
         "bone_wrenches": [wrenches],
         "update_roots": [moved.roots[0, : int((cells.packed_cells[0] >> 3).max())]],

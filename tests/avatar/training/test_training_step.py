@@ -43,7 +43,7 @@ def trainer(rig, clip):
     return trainer
 
 
-def mean_loss(trainer, parameters, samples, empty, pairs, solid, close, gaps, batch, background):
+def mean_loss(trainer, parameters, samples, empty, pairs, solid, close, gaps, batch):
     """The whole loss of a step, differentiable, in whatever precision the parameters have."""
     table, first, first_bias, second, second_bias = parameters
     points = torch.cat([samples.points, empty, pairs, solid, close, gaps]).to(table.dtype)
@@ -55,7 +55,7 @@ def mean_loss(trainer, parameters, samples, empty, pairs, solid, close, gaps, ba
         raw[:count], samples.offsets, samples.counts, CONFIG.sample_step_m
     )
     loss = torch_reference.loss_per_ray(
-        rendered, batch.target.to(table.dtype), background.to(table.dtype),
+        rendered, batch.target.to(table.dtype),
         CONFIG.alpha_weight, CONFIG.hard_surface_weight,
     ).mean()  # fmt: skip
     parts = [len(part) for part in (empty, pairs, solid, close, gaps)]
@@ -108,9 +108,8 @@ def one_step(trainer, backend):
     solid = occupancy.sample_interior(CONFIG.interior_points, generator)
     close = radiance_field.sample_smoothness_pairs(samples.points, CONFIG, generator)
     gaps = occupancy.sample_inner_leg(CONFIG.inner_leg_points, generator)
-    background = torch.rand(len(batch.target), 3, generator=generator)
     grads = [parameter.grad.clone() for parameter in field.parameters()]
-    return grads, (samples, empty, pairs, solid, close, gaps, batch, background)
+    return grads, (samples, empty, pairs, solid, close, gaps, batch)
 
 
 @pytest.mark.parametrize("backend", [NumbaBackend(), TorchBackend()], ids=["numba", "torch"])
@@ -185,11 +184,11 @@ def test_a_step_without_samples_learns_nothing_from_its_rays(trainer):
     """Rays that miss everything: no crash, and no gradient but those of the priors."""
     trainer.avatar.occupancy.density_grid.occupied.zero_()
     (_, first, *_), drawn = one_step(trainer, NumbaBackend())
-    samples, empty, pairs, _, close, _, batch, background = drawn
+    samples, empty, pairs, _, close, _, batch = drawn
     assert isinstance(samples, RaySamples)
     assert len(samples.points) == 0
     assert torch.isfinite(first).all()
-    assert len(batch.target) == CONFIG.rays == len(background)
+    assert len(batch.target) == CONFIG.rays
     assert len(empty) == CONFIG.empty_space_points
     assert len(pairs) == len(close) == 0
 
