@@ -3,7 +3,6 @@
 Without any, masks are estimated in reduced images, and edges along the body's outline are measured.
 """
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -23,7 +22,6 @@ from preprocess.alignment.silhouette_objective import (
     SilhouetteObjective,
     reduce_masks,
     sample_masks,
-    spaced_indices,
 )
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.body_surface import (
@@ -40,12 +38,10 @@ from preprocess.plugins import DEFAULT_SEGMENTER, make_segmenter
 
 IMAGE_PERSON_PX = 130
 """Height of the person in the reduced images by the poses, px."""
-MAX_DECODED_IMAGES = 24
-"""Images to decode within the budget."""
 ALIGNMENT_IMAGES = 8
-"""Images to align to, of those decoded."""
-DECODE_BUDGET_S = 8.0
-"""Time for decoding, seconds; of a long video only the beginning is decoded."""
+"""Images to align to."""
+ALIGNMENT_FRAMES = 240
+"""Frames at the beginning of a video over which they are spread: decoding takes longest."""
 MAX_CLOTHING_M = 0.03
 """Distance outside the body within which clothes end, metres."""
 OFF_OUTLINE_MIN_M = 0.04
@@ -91,7 +87,9 @@ class BodyOutline:
 def sample_video(
     geometry: CaptureGeometry, skin: SkinPoints, cameras: CameraTrack, source: FrameSource
 ) -> list[ImageSample]:
-    """Decode images of frames that have a pose, spread over the video within the decoding budget.
+    """Decode images of frames that have a pose, spread over the beginning of a video.
+
+    Where frames without a pose are among these, later ones take their place.
 
     Args:
         geometry: Poses and cameras.
@@ -103,8 +101,8 @@ def sample_video(
         InputError: If cameras and frames do not belong together, or no image can be used.
     """
     camera_row, chosen = associate_cameras(cameras, source), source.selection
-    stride = chosen.step * max(1, (source.frame_count or 1) // MAX_DECODED_IMAGES)
-    began, found = time.perf_counter(), []
+    count = min(source.frame_count or 1, max(1, ALIGNMENT_FRAMES // chosen.step))
+    stride, found = chosen.step * max(1, count // ALIGNMENT_IMAGES), []
     some = slice(chosen.start + stride // 2 // chosen.step * chosen.step, chosen.stop, stride)
     size_px: tuple[int, int] | None = None
     for frame in open_source(source.path, frames=some).frames():
@@ -119,11 +117,11 @@ def sample_video(
             size_px = size_px or thumbnail_size_px(skin, geometry.motion[row], seen)
             rgb = cv2.resize(frame.rgb, size_px, interpolation=cv2.INTER_AREA)
             found.append(ImageSample(index=frame.index, camera_row=camera, rgb=np.asarray(rgb)))
-        if time.perf_counter() - began > DECODE_BUDGET_S:
+        if len(found) == ALIGNMENT_IMAGES:
             break
     if not found:
         raise InputError(f"No image of {source.path} has both a pose and a camera.")
-    return [found[place] for place in spaced_indices(len(found), ALIGNMENT_IMAGES)]
+    return found
 
 
 def thumbnail_size_px(skin: SkinPoints, pose: BodyPose, camera: Camera) -> tuple[int, int]:

@@ -38,9 +38,9 @@ from preprocess.fitting.clip_fitting import (
 from preprocess.fitting.outlines import OUTLINE_PERSON_PX, OutlineDistances
 from preprocess.observation import Observation, associate_cameras
 
-KEY_FRAMES = 75
+KEY_FRAMES = 50
 """Frames, evenly spread, whose masks are fitted."""
-CHAIN_FRAMES = 300
+CHAIN_FRAMES = 150
 """Frames, evenly spread, whose given poses are fitted: those without a mask follow their neighbors
 and are human; poses between them follow."""
 MIN_ITERATIONS = 4
