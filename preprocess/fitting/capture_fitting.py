@@ -59,10 +59,8 @@ POSE_ITERATIONS = 2
 """Iterations over poses alone after those, with `TRACKED_POSE_WEIGHTS`."""
 TRACKED_POSE_WEIGHTS = EvidenceWeights(outline_rows=480.0, keypoints=0.6)
 """Weights while poses alone are fitted: with these, proportions would follow the clothes."""
-PROPORTION_ITERATIONS = 7
-"""Iterations that show how well proportions and focal length alone explain the masks."""
 PROPORTION_STEP = 3
-"""Stride of the frames that are compared for that."""
+"""Stride of the frames that show how well proportions and focal length alone explain the masks."""
 MIN_ERROR_DECREASE = 0.01
 """Relative decrease of the error below which the iterations end."""
 MAX_ERROR_RATIO = 0.9
@@ -154,8 +152,7 @@ def _explained_error(capture: Capture, fitter: ClipFitter, fitted: FitParameters
     some = [frame for frame in fitter.frames if frame.mask is not None]
     some = some[:: PROPORTION_STEP if len(some) > KEY_FRAMES // 2 else 1]
     alone = ClipFitter(capture.motion, fitter.model.space, some)
-    held = fitted._replace(poses=False)
-    return [alone.iterate(held) for _ in range(PROPORTION_ITERATIONS)][-1]
+    return _iterate_until_settled(alone, fitted._replace(poses=False))[-1]
 
 
 def _fit_tracked(fitter: ClipFitter, everything: FitParameters) -> list[float]:

@@ -126,21 +126,20 @@ class ChainEquations:
         """The step of the frames' parameters and of the shared ones, by elimination."""
         count = len(self.right_shared)
         corner = np.column_stack([self.shared, self.right_shared])
-        factors, reduced = [], []
+        links = np.concatenate([self.links, np.zeros((1, self.right.shape[1]))])
+        reduced, passed_on = [], []  # K⁻¹ of a frame's right sides and of its links
         block, carried = np.zeros_like(self.blocks[0]), 0.0
-        for frame, own in enumerate(self.blocks):
+        for frame, link in enumerate(links):
             side = np.column_stack([self.borders[frame], self.right[frame]]) + carried
-            factors.append(cho_factor(own - block, lower=True))
-            reduced.append(cho_solve(factors[-1], side))
+            factor = cho_factor(self.blocks[frame] - block, lower=True, check_finite=False)
+            both = cho_solve(factor, np.column_stack([side, np.diag(link)]), check_finite=False)
+            reduced.append(both[:, : count + 1])
+            passed_on.append(both[:, count + 1 :])
             corner = corner - side[:, :count].T @ reduced[-1]
-            if frame < len(self.links):
-                link = self.links[frame]
-                carried = link[:, None] * reduced[-1]
-                block = link[:, None] * cho_solve(factors[-1], np.diag(link))
+            carried, block = link[:, None] * reduced[-1], link[:, None] * passed_on[-1]
         shared = np.linalg.solve(corner[:, :count], corner[:, count])
         found, after = np.zeros_like(self.right), np.zeros(self.right.shape[1])
-        for frame in range(len(self.blocks) - 1, -1, -1):
-            after_link = self.links[frame] * after if frame < len(self.links) else 0.0 * after
+        for frame in range(len(links) - 1, -1, -1):
             local = reduced[frame][:, count] - reduced[frame][:, :count] @ shared
-            found[frame] = after = local + cho_solve(factors[frame], after_link)
+            found[frame] = after = local + passed_on[frame] @ after
         return found, shared
