@@ -219,6 +219,7 @@ class TrainingSession:
             validation_views(self.held_out, self._recording),
             self._recording.source.paced,
         )
+        self.trainer.replay.clear_correspondences()  # nothing is learnt from here on
         self._begin_checkpoint(trains_on=False)  # baking changes nothing of it
         try:
             package = self._write_package("writing the package", views, quick=quick)

@@ -102,10 +102,7 @@ class ReplayBuffer:
         self._body_from_camera = np.zeros((capacity, 3, 3))
         self._turns = torch.zeros(capacity, 3, 3, device=device)
         self._world_from_camera = torch.zeros(capacity, 3, 3, device=device)
-        self._low = torch.zeros(capacity, 3, device=device)
-        self._shape = torch.ones(capacity, 3, dtype=torch.int32, device=device)
-        self._index = torch.zeros(capacity, 1, dtype=torch.int32, device=device)
-        self._roots = torch.zeros(capacity, 1, 12, device=device)
+        self.clear_correspondences()
         self._lenses: list[Camera] = []
         self._lens_numbers: dict[tuple[Any, ...], int] = {}
         self._lens = np.zeros(capacity, dtype=np.int64)
@@ -149,6 +146,16 @@ class ReplayBuffer:
             colors = self._colors[slot, : int(self._near[slot])].cpu().numpy().copy()
             kept.append(ReplayFrame(self.frame_indices[slot], pose, view, colors))
         return kept
+
+    def clear_correspondences(self) -> None:
+        """Empties the correspondence grids of all slots, which take most of the buffer's memory.
+
+        Rays of the frames then miss the person: to be called after the last step.
+        """
+        self._low = torch.zeros(self.capacity, 3, device=self.device)
+        self._shape = torch.ones(self.capacity, 3, dtype=torch.int32, device=self.device)
+        self._index = torch.zeros(self.capacity, 1, dtype=torch.int32, device=self.device)
+        self._roots = torch.zeros(self.capacity, 1, 12, device=self.device)
 
     def set_correspondences(self, slot: int, correspondences: CorrespondenceGrid) -> None:
         """Gives a slot the warp of its frame's pose."""

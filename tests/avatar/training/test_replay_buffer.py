@@ -162,6 +162,18 @@ def test_stores_that_grow_keep_what_they_hold(frames):
     assert replay.correspondences.cell_m == frames[0].correspondences.cell_m
 
 
+def test_frames_can_be_saved_after_their_correspondences_are_cleared(frames):
+    replay = store(frames)
+    before = replay.replay_frames()
+    replay.clear_correspondences()
+    tables = replay.correspondences
+    assert sum(table.nbytes for table in (tables.packed_cells, tables.roots)) < 1000
+    assert not tables.packed_cells.any()
+    for one, other in zip(before, replay.replay_frames(), strict=True):
+        assert one.pose is other.pose
+        assert np.array_equal(one.colors, other.colors)
+
+
 def test_rays_are_drawn_uniformly_from_all_frames(frames, generator):
     replay = store(frames[:2])
     np.testing.assert_allclose(drawn_from(replay, generator), [0.5, 0.5], atol=0.01)
