@@ -31,7 +31,6 @@ from export.bake.fine_tuning import (
     ExportProgress,
     FineTuningInputs,
     FineTuningResult,
-    PictureCache,
     PosedView,
     RenderFunction,
     RgbaPicture,
@@ -176,9 +175,10 @@ def export_field(
     started, config = time.perf_counter(), config or BakeConfig()
     views = [(pose, replace(camera, distortion=())) for pose, camera in views]
     # the field, and the renderer with it, is evaluated on this thread alone
-    grid = sample_field(field_at, rig, occupied=occupied, config=config)
     with PackageWriter(path) as writer, ThreadPoolExecutor(2) as executor:
-        baked = executor.submit(bake_tables, grid, rig, config)
+        baked = executor.submit(
+            bake_tables, sample_field(field_at, rig, occupied=occupied, config=config), rig, config
+        )
         exact = [picture_on_white(renderer(pose, fit_camera(c, CHECK_PX))) for pose, c in views]
 
         def bake_again(tables: PlayerTables) -> PlayerTables:
@@ -191,7 +191,7 @@ def export_field(
             FineTuningInputs(
                 tables=baked.result(), rig=rig,
                 settings={tier: QUALITY_TIERS[tier] for tier in config.tiers},
-                renderer=PictureCache(renderer), views=views, executor=executor,
+                renderer=renderer, views=views, executor=executor,
             ),
             bake_again, config.fine_tuning_pictures,
             lambda done: progress(BAKING_PROGRESS + FINE_TUNING_PROGRESS * done),

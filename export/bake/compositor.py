@@ -28,8 +28,11 @@ class VoxelCodes(NamedTuple):
     def of(cls, bricks: BrickTable) -> "VoxelCodes":
         """Take a table's codes, without the borders that bricks repeat."""
         core = bricks.voxels[:, :BRICK_SIZE, :BRICK_SIZE, :BRICK_SIZE].reshape(-1, 4)
-        codes = core.astype(np.float32)
-        return cls(np.ascontiguousarray(codes[:, 3]), np.ascontiguousarray(codes[:, :3]))
+        return cls(core[:, 3].astype(np.float32), core[:, :3].astype(np.float32, order="C"))
+
+    def chunk(self, voxels: slice) -> "VoxelCodes":
+        """Return views of some voxels' codes."""
+        return VoxelCodes(*(codes[voxels] for codes in self))
 
 
 class SirtUpdate(NamedTuple):
@@ -55,6 +58,15 @@ class SirtUpdate(NamedTuple):
         """Start a sum over rays."""
         sizes = ((voxels, 3), (voxels,), (voxels,), (voxels,))
         return cls(*(np.zeros(size, dtype=np.float32) for size in sizes))
+
+    def add(self, other: "SirtUpdate") -> None:
+        """Add the sums over other rays, in place."""
+        for total, part in zip(self, other, strict=True):
+            total += part
+
+    def chunk(self, voxels: slice) -> "SirtUpdate":
+        """Return views of some voxels' sums."""
+        return SirtUpdate(*(sums[voxels] for sums in self))
 
 
 def composite_segments(

@@ -9,8 +9,6 @@ Voxels that hardly show then share codes (`voxel_cells`), and the shared codes a
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import final
 
 import numpy as np
 from jaxtyping import Float32, Int64
@@ -23,8 +21,8 @@ from export.bake.reference_geometry import RaySegments
 from export.bake.reference_player import PlayerInputs, TracedPicture, trace_picture
 from export.bake.voxel_cells import (
     VoxelCells,
-    bricks_from_codes,
-    quantize_codes,
+    brick_chunks,
+    quantize_bricks,
     share_codes_within_budget,
 )
 from export.package.player_tables import (
@@ -46,25 +44,6 @@ RgbaPicture = Float32[np.ndarray, "height width 4"]
 """Premultiplied RGBA in [0, 1]."""
 RenderFunction = Callable[[BodyPose, Camera], RgbaPicture]
 """Renders the exact picture of the avatar."""
-
-
-@final
-class PictureCache:
-    """A renderer that draws each pose and camera once; several tiers look at the same pictures."""
-
-    def __init__(self, renderer: RenderFunction) -> None:
-        """Draw nothing yet."""
-        self._renderer = renderer
-        self._drawn: list[tuple[BodyPose, Camera, RgbaPicture]] = []
-
-    def __call__(self, pose: BodyPose, camera: Camera) -> RgbaPicture:
-        """Return the picture of this very pose and camera, objects compared by identity."""
-        for known_pose, known_camera, picture in self._drawn:
-            if known_pose is pose and known_camera is camera:
-                return picture
-        picture = self._renderer(pose, camera)
-        self._drawn.append((pose, camera, picture))
-        return picture
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -174,39 +153,46 @@ class FineTuningInputs:
     views: Sequence[PosedView]
     executor: Executor
 
-    @cached_property
-    def codes(self) -> VoxelCodes:
-        """Voxel codes of the tables' bricks."""
-        return VoxelCodes.of(self.tables.bricks)
-
     def draw_targets(
         self,
+        codes: VoxelCodes,
         views: Sequence[PosedView],
-        settings: RenderSettings,
+        tiers: Sequence[RenderSettings],
         on_picture: Callable[[], None] = lambda: None,
-    ) -> RenderTargets:
+    ) -> list[RenderTargets]:
         """Draw views with the renderer while the player's rays are traced beside it.
 
         Args:
-            views: Those, or the first of them that reach `MAX_SEGMENTS`.
-            settings: How the player draws them.
+            codes: Voxel codes of the tables' bricks.
+            views: For each tier those, or the first of them that reach `MAX_SEGMENTS`.
+            tiers: How the player draws them.
             on_picture: Called after each picture.
-        """
-        parts = list[tuple[TracedPicture, RgbaPicture]]()
-        for pose, camera in views:
-            traced = self.executor.submit(self._trace, settings, pose, camera)
-            picture = self.renderer(pose, camera)
-            parts.append((traced.result(), picture))
-            on_picture()
-            if sum(len(traced.segments.step_m) for traced, _ in parts) > MAX_SEGMENTS:
-                break
-        return _join_targets(parts)
 
-    def _trace(self, settings: RenderSettings, pose: BodyPose, camera: Camera) -> TracedPicture:
+        Returns:
+            The targets of each tier.
+        """
+        drawn = [list[tuple[TracedPicture, RgbaPicture]]() for _ in tiers]
+        for pose, camera in views:
+            waiting = [
+                (parts, self.executor.submit(self._trace, codes, settings, pose, camera))
+                for parts, settings in zip(drawn, tiers, strict=True)
+                if sum(len(traced.segments.step_m) for traced, _ in parts) <= MAX_SEGMENTS
+            ]
+            if not waiting:
+                break
+            picture = self.renderer(pose, camera)
+            for parts, traced in waiting:
+                parts.append((traced.result(), picture))
+            on_picture()
+        return [_join_targets(parts) for parts in drawn]
+
+    def _trace(
+        self, codes: VoxelCodes, settings: RenderSettings, pose: BodyPose, camera: Camera
+    ) -> TracedPicture:
         camera_from_body = camera.camera_from_world @ self.rig.world_from_body(pose)
         bones = camera_from_body @ self.rig.body_from_canonical(pose.joint_rotations)
         inputs = PlayerInputs.of(bones[:, :3].astype(np.float32), camera, settings.samples)
-        return trace_picture(self.tables, self.codes, settings, inputs)
+        return trace_picture(self.tables, codes, settings, inputs)
 
     def perturbed_views(
         self, count: int, pose_noise_rad: float, generator: np.random.Generator, longest_px: int
@@ -259,9 +245,9 @@ def is_below_target(inputs: FineTuningInputs) -> bool:
     near = inputs.perturbed_views(
         PROBE_PICTURES, POSE_NOISE_RAD, np.random.default_rng(1), VALIDATION_PX
     )
-    settings = inputs.settings["hq"]
-    targets = inputs.draw_targets(near, settings)
-    return targets.psnr(inputs.tables, settings, inputs.codes) < TARGET_DB
+    settings, codes = inputs.settings["hq"], VoxelCodes.of(inputs.tables.bricks)
+    (targets,) = inputs.draw_targets(codes, near, [settings])
+    return targets.psnr(inputs.tables, settings, codes) < TARGET_DB
 
 
 def fine_tune(
@@ -288,34 +274,36 @@ def fine_tune(
         for pose, camera in inputs.views
     ]
     tiers = list(inputs.settings.values())
-    total = len(tiers) * (len(training) + len(asked) + len(novel)) + FREE_ROUNDS + SHARED_ROUNDS
+    total = len(training) + len(asked) + len(novel) + FREE_ROUNDS + SHARED_ROUNDS
     steps = iter(range(1, total + 1))
+    codes = VoxelCodes.of(tables.bricks)
 
-    def drawn(views: list[PosedView], settings: RenderSettings) -> RenderTargets:
-        return inputs.draw_targets(views, settings, lambda: progress(next(steps) / total))
+    def drawn(views: list[PosedView]) -> list[tuple[RenderTargets, RenderSettings]]:
+        targets = inputs.draw_targets(codes, views, tiers, lambda: progress(next(steps) / total))
+        return list(zip(targets, tiers, strict=True))
 
-    judges = [(drawn(asked + novel, each), each) for each in tiers]
-    learnt = [(drawn(training, each), each) for each in tiers]
+    judges, learnt = drawn(asked + novel), drawn(training)
 
     def judge(codes: VoxelCodes) -> float:
         return float(np.mean([targets.psnr(tables, each, codes) for targets, each in judges]))
 
-    baked = inputs.codes
+    baked = codes.density.copy()
     solver = _SirtSolver(learnt=learnt, bricks=tables.bricks, baked=baked, executor=inputs.executor)
-    first = judge(baked)
-    latent, cells = baked, None
+    first = judge(codes)
+    cells = None
     pixels = sum(int(targets.pixels.sum()) for targets, _ in learnt)
     for turn in range(FREE_ROUNDS + SHARED_ROUNDS):
-        latent, update = solver.descend(latent, cells)
+        update = solver.descend(codes, cells)
         if turn == FREE_ROUNDS - 1:
             price = MIN_ERROR_SHARE * _squared_error(first, pixels)
-            cells, latent = share_codes_within_budget(tables.bricks, latent, update, baked, price)
+            cells = share_codes_within_budget(tables.bricks, codes, update, baked, price)
+        del update
         progress(next(steps) / total)
-    quantized = quantize_codes(latent, baked)
-    reached = judge(quantized)
+    tuned = quantize_bricks(tables.bricks, codes, baked)
+    reached = judge(VoxelCodes.of(tuned))
     if reached < first - MAX_LOSS_DB:
         return FineTuningResult(tables=tables, settings=inputs.settings, psnr=(first, first))
-    tables = replace(tables, bricks=bricks_from_codes(tables.bricks, quantized))
+    tables = replace(tables, bricks=tuned)
     return FineTuningResult(tables=tables, settings=inputs.settings, psnr=(first, reached))
 
 
@@ -326,21 +314,22 @@ class _SirtSolver:
     Attributes:
         learnt: The rays, and how each tier draws them.
         bricks: Which brick covers each block.
-        baked: Codes before the first round; densities stay within `MAX_DENSITY_CODE_CHANGE`.
+        baked: Density codes before the first round; they stay within `MAX_DENSITY_CODE_CHANGE`.
         executor: Runs over the tiers' rays.
     """
 
     learnt: Sequence[tuple[RenderTargets, RenderSettings]]
     bricks: BrickTable
-    baked: VoxelCodes
+    baked: Float32[np.ndarray, "voxels"]
     executor: Executor
 
-    def descend(self, codes: VoxelCodes, cells: VoxelCells | None) -> tuple[VoxelCodes, SirtUpdate]:
-        """Return the codes after a round, not rounded, and the update of single voxels.
+    def descend(self, codes: VoxelCodes, cells: Sequence[VoxelCells] | None) -> SirtUpdate:
+        """Take a round's step, in place and not rounded; return the update of single voxels.
 
         Args:
-            codes: Before the round; equal in all voxels of a cell.
-            cells: Voxels that share a code; None if each has its own.
+            codes: Equal in all voxels of a cell.
+            cells: Voxels that share a code, for each of the `brick_chunks`; None if each has its
+                own.
         """
 
         def updates(learnt: tuple[RenderTargets, RenderSettings]) -> SirtUpdate:
@@ -349,18 +338,28 @@ class _SirtSolver:
                 targets.segments, settings, self.bricks, codes, targets.target_colors
             )
 
-        parts = self.executor.map(updates, self.learnt)
-        single = SirtUpdate(*(np.sum(part, axis=0) for part in zip(*parts, strict=True)))
-        update, middle = single, self.baked.density
-        if cells is not None:
-            update, middle = cells.sum_update(single), cells.mean_density(middle)
-        color_step = update.color / (update.color_normalizer + np.float32(COLOR_DAMPING))[:, None]
-        density_step = update.density / (update.density_normalizer + np.float32(DENSITY_DAMPING))
-        low, high = middle - MAX_DENSITY_CODE_CHANGE, middle + MAX_DENSITY_CODE_CHANGE
-        color = np.clip(codes.color - color_step, 0.0, 255.0)
-        density = np.clip(np.clip(codes.density - density_step, low, high), 0.0, 255.0)
-        color[: BRICK_SIZE**3], density[: BRICK_SIZE**3] = 0.0, 0.0  # the empty brick
-        return VoxelCodes(density, color), single
+        update, *others = self.executor.map(updates, self.learnt)
+        while others:
+            update.add(others.pop())
+        for number, chunk in enumerate(brick_chunks(len(self.baked))):
+            single, middle = update.chunk(chunk), self.baked[chunk]
+            if cells is not None:
+                single = cells[number].sum_update(single)
+                middle = cells[number].mean_density(middle)
+            _take_step(codes.chunk(chunk), single, middle)
+        codes.color[: BRICK_SIZE**3], codes.density[: BRICK_SIZE**3] = 0.0, 0.0  # the empty brick
+        return update
+
+
+def _take_step(
+    codes: VoxelCodes, update: SirtUpdate, middle: Float32[np.ndarray, "voxels"]
+) -> None:
+    """Change codes, in place; densities stay within `MAX_DENSITY_CODE_CHANGE` about `middle`."""
+    color_step = update.color / (update.color_normalizer + np.float32(COLOR_DAMPING))[:, None]
+    density_step = update.density / (update.density_normalizer + np.float32(DENSITY_DAMPING))
+    low, high = middle - MAX_DENSITY_CODE_CHANGE, middle + MAX_DENSITY_CODE_CHANGE
+    codes.color[:] = np.clip(codes.color - color_step, 0.0, 255.0)
+    codes.density[:] = np.clip(np.clip(codes.density - density_step, low, high), 0.0, 255.0)
 
 
 def _squared_error(psnr: float, pixels: int) -> float:

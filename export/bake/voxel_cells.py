@@ -30,6 +30,14 @@ WEIGHT_FLOOR = 1e-3
 """Weight of a visible voxel that no ray has seen, in rays."""
 SEPARATE_CODE = -1e4
 """Density code by which empty voxels are kept apart from visible ones."""
+CHUNK_BRICKS = 64
+"""Bricks in a chunk; temporary arrays of their 32,768 voxels fit into the processor's caches."""
+
+
+def brick_chunks(voxels: int) -> list[slice]:
+    """Divide the voxels of all bricks into chunks of whole bricks."""
+    step = CHUNK_BRICKS * BRICK_SIZE**3
+    return [slice(first, first + step) for first in range(0, voxels, step)]
 
 
 def prune_octrees(
@@ -120,18 +128,18 @@ class VoxelCells:
 
 
 def choose_cells(
-    codes: VoxelCodes, update: SirtUpdate, baked: VoxelCodes, price: float
+    codes: VoxelCodes, update: SirtUpdate, baked: Float32[np.ndarray, "voxels"], price: float
 ) -> VoxelCells:
-    """Choose the voxels that share codes.
+    """Choose the voxels that share codes, of some bricks.
 
     Args:
         codes: Tuned, each voxel alone.
         update: Its normalizers tell how much each voxel shows.
-        baked: Empty voxels remain apart from others.
+        baked: Density codes before tuning; empty voxels remain apart from others.
         price: Squared error, 1/255², that one code more has to save.
     """
     weights = _error_weights(update, baked)
-    apart = np.where(baked.density > 0, codes.density, np.float32(SEPARATE_CODE))
+    apart = np.where(baked > 0, codes.density, np.float32(SEPARATE_CODE))
     return VoxelCells(
         density=prune_octrees(apart[:, None], weights.density, price),
         color=prune_octrees(codes.color, weights.color, price),
@@ -139,7 +147,10 @@ def choose_cells(
 
 
 def share_codes(
-    codes: VoxelCodes, update: SirtUpdate, baked: VoxelCodes, cells: VoxelCells
+    codes: VoxelCodes,
+    update: SirtUpdate,
+    baked: Float32[np.ndarray, "voxels"],
+    cells: VoxelCells,
 ) -> VoxelCodes:
     """Give all voxels of a cell their weighted mean; other arguments as of `choose_cells`."""
     weights = _error_weights(update, baked)
@@ -158,9 +169,9 @@ class _ErrorWeights(NamedTuple):
     color: Float32[np.ndarray, "voxels"]
 
 
-def _error_weights(update: SirtUpdate, baked: VoxelCodes) -> _ErrorWeights:
+def _error_weights(update: SirtUpdate, baked: Float32[np.ndarray, "voxels"]) -> _ErrorWeights:
     """Return the squared error, 1/255², for a change of each voxel's codes by 1."""
-    visible = baked.density > 0
+    visible = baked > 0
     floor = np.where(visible, np.float32(WEIGHT_FLOOR), np.float32(0.0))
     # normalizers of densities hold the squares on black and on white, of colors in [0, 1]
     density = update.density_normalizer * np.float32(0.5 * 255.0**2)
@@ -171,33 +182,51 @@ def _error_weights(update: SirtUpdate, baked: VoxelCodes) -> _ErrorWeights:
 
 
 def share_codes_within_budget(
-    bricks: BrickTable, codes: VoxelCodes, update: SirtUpdate, baked: VoxelCodes, price: float
-) -> tuple[VoxelCells, VoxelCodes]:
-    """Choose cells, at higher prices until bricks fit into `MAX_BRICK_BYTES`; return codes, too.
+    bricks: BrickTable,
+    codes: VoxelCodes,
+    update: SirtUpdate,
+    baked: Float32[np.ndarray, "voxels"],
+    price: float,
+) -> list[VoxelCells]:
+    """Share codes, in place, at higher prices until bricks fit into `MAX_BRICK_BYTES`.
 
     Args:
         bricks: Which brick covers each block.
-        codes, update, baked, price: As of `choose_cells`.
+        codes, update, baked, price: As of `choose_cells`, for all bricks.
+
+    Returns:
+        The cells of each of the `brick_chunks`.
     """
+    shared = VoxelCodes(np.empty_like(codes.density), np.empty_like(codes.color))
     for raised in price * PRICE_FACTOR ** np.arange(MAX_PRICES):
-        cells = choose_cells(codes, update, baked, float(raised))
-        shared = share_codes(codes, update, baked, cells)
-        stored = bricks_from_codes(bricks, quantize_codes(shared, baked))
-        if estimate_brick_bytes(stored) <= MAX_BRICK_BYTES:
+        cells = list[VoxelCells]()
+        for chunk in brick_chunks(len(baked)):
+            known = codes.chunk(chunk), update.chunk(chunk), baked[chunk]
+            cells.append(choose_cells(*known, float(raised)))
+            shared.density[chunk], shared.color[chunk] = share_codes(*known, cells[-1])
+        if estimate_brick_bytes(quantize_bricks(bricks, shared, baked)) <= MAX_BRICK_BYTES:
             break
-    return cells, shared
+    codes.density[:], codes.color[:] = shared
+    return cells
 
 
-def quantize_codes(latent: VoxelCodes, baked: VoxelCodes) -> VoxelCodes:
-    """Round codes to those that are stored; keep visible voxels visible."""
-    color = round_codes(np.round(latent.color).astype(np.uint8), COLOR_STEP, 255)
-    density = round_codes(np.round(latent.density).astype(np.uint8), DENSITY_STEP, 255)
-    density = np.where(baked.density > 0, np.maximum(density, DENSITY_STEP), density)
-    return VoxelCodes(density.astype(np.float32), color.astype(np.float32))
+def quantize_bricks(
+    bricks: BrickTable, codes: VoxelCodes, baked: Float32[np.ndarray, "voxels"]
+) -> BrickTable:
+    """Round codes to those that are stored in bricks of the same blocks; keep voxels visible.
 
-
-def bricks_from_codes(bricks: BrickTable, codes: VoxelCodes) -> BrickTable:
-    """Store rounded codes in bricks of the same blocks."""
-    core = np.concatenate([codes.color, codes.density[:, None]], axis=1).astype(np.uint8)
+    Args:
+        bricks: Which brick covers each block.
+        codes: Tuned.
+        baked: Density codes before tuning.
+    """
+    core = np.empty((len(baked), 4), dtype=np.uint8)
+    for chunk in brick_chunks(len(baked)):
+        color = np.round(codes.color[chunk]).astype(np.uint8)
+        density = np.round(codes.density[chunk]).astype(np.uint8)
+        density = round_codes(density, DENSITY_STEP, 255)
+        visible = np.maximum(density, np.uint8(DENSITY_STEP))
+        core[chunk, :3] = round_codes(color, COLOR_STEP, 255)
+        core[chunk, 3] = np.where(baked[chunk] > 0, visible, density)
     shape = (len(bricks.voxels), BRICK_SIZE, BRICK_SIZE, BRICK_SIZE, 4)
     return replace(bricks, voxels=add_border_voxels(bricks.index, core.reshape(shape)))

@@ -1,8 +1,15 @@
 import numpy as np
 import pytest
 
+from export.bake import voxel_cells
 from export.bake.compositor import SirtUpdate, VoxelCodes
-from export.bake.voxel_cells import choose_cells, prune_octrees, share_codes
+from export.bake.voxel_cells import (
+    brick_chunks,
+    choose_cells,
+    prune_octrees,
+    share_codes,
+    share_codes_within_budget,
+)
 
 VOXELS = 8**3
 """Voxels of a brick."""
@@ -72,8 +79,8 @@ def test_empty_voxels_do_not_share_codes_with_visible_ones():
     density[: VOXELS // 2 + 8] = 160.0
     codes = VoxelCodes(density, np.full((VOXELS, 3), 80.0, dtype=np.float32))
     nothing = SirtUpdate.zeros(VOXELS)  # no ray has seen anything
-    cells = choose_cells(codes, nothing, codes, price=1.0)
-    shared = share_codes(codes, nothing, codes, cells)
+    cells = choose_cells(codes, nothing, density, price=1.0)
+    shared = share_codes(codes, nothing, density, cells)
     assert np.array_equal(shared.density > 0, density > 0)
     assert shared.density[density > 0] == pytest.approx(160.0, abs=1e-3)
 
@@ -86,9 +93,28 @@ def test_shared_codes_are_means_weighted_by_what_shows():
     update = SirtUpdate.zeros(VOXELS)
     update.color_normalizer[: VOXELS // 2] = 3.0
     update.color_normalizer[VOXELS // 2 :] = 1.0
-    one = choose_cells(codes, update, codes, price=1e9)
+    one = choose_cells(codes, update, codes.density, price=1e9)
     assert not one.color.any()
-    shared = share_codes(codes, update, codes, one)
+    shared = share_codes(codes, update, codes.density, one)
     assert shared.color == pytest.approx(np.full((VOXELS, 3), 20.0), rel=1e-3)
     summed = one.sum_update(update)
     assert summed.color_normalizer == pytest.approx(np.full(VOXELS, 2.0 * VOXELS))
+
+
+def test_chunks_do_not_change_shared_codes(tables, monkeypatch):
+    given = VoxelCodes.of(tables.bricks)
+    generator = np.random.default_rng(4)
+    update = SirtUpdate.zeros(len(given.density))
+    for sums in update:
+        sums += generator.random(sums.shape).astype(np.float32)
+    results = []
+    for bricks in (1, 7, len(tables.bricks.voxels)):
+        monkeypatch.setattr(voxel_cells, "CHUNK_BRICKS", bricks)
+        codes = VoxelCodes(given.density.copy(), given.color.copy())
+        cells = share_codes_within_budget(tables.bricks, codes, update, given.density, 3e3)
+        assert len(cells) == len(brick_chunks(len(given.density)))
+        results.append(codes)
+    assert not np.array_equal(results[0].color, given.color)
+    for other in results[1:]:
+        assert np.array_equal(results[0].color, other.color)
+        assert np.array_equal(results[0].density, other.density)
