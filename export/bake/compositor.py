@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32
 
-from avatar.kernels.kernel_compiler import compile_kernel
+from avatar.kernels.kernel_compiler import NO_ALLOCATION, compile_kernel
 from export.bake.reference_geometry import RaySegments
 from export.package.player_tables import BRICK_SIZE, LOG_DENSITY_RANGE, BrickTable, RenderSettings
 
@@ -128,6 +128,7 @@ def _run_kernel(
         np.zeros(blocks + 1, dtype=np.int64),
     )  # fmt: skip
     moves = (np.zeros(most, dtype=np.float32), np.zeros(most, dtype=np.float32))
+    error_and_behind = np.zeros((2, 4), dtype=np.float32)
     _composite_rays(
         (
             segments.ray_offsets, segments.start, segments.slope, segments.step_m,
@@ -135,11 +136,12 @@ def _run_kernel(
         ),
         (F32(settings.min_transmittance), F32(settings.layer_min_transmittance)),
         (bricks.index, codes.density, codes.color), target_colors, out, sampled, gathered, moves,
-        tuple(SirtUpdate.zeros(1) if update is None else update), update is not None,
+        error_and_behind, tuple(SirtUpdate.zeros(1) if update is None else update),
+        update is not None,
     )  # fmt: skip
 
 
-@compile_kernel(nogil=True, error_model="numpy", fastmath=True)
+@compile_kernel(**NO_ALLOCATION)
 def _voxel_index(index, i, j, k):
     """Return the number of a node's voxel; 0, which is empty, where there is no brick."""
     if i >> 3 >= index.shape[0] or j >> 3 >= index.shape[1] or k >> 3 >= index.shape[2]:
@@ -148,7 +150,7 @@ def _voxel_index(index, i, j, k):
     return brick * VOXELS_PER_BRICK + ((i & 7) << 6) + ((j & 7) << 3) + (k & 7) if brick > 0 else 0
 
 
-@compile_kernel(nogil=True, error_model="numpy", fastmath=True)
+@compile_kernel(**NO_ALLOCATION)
 def _tetrahedron_weights(index, px, py, pz, voxels, shares):
     """Write the four voxels about a point of the grid and their weights; none in an empty block.
 
@@ -178,7 +180,7 @@ def _tetrahedron_weights(index, px, py, pz, voxels, shares):
     voxels[3] = _voxel_index(index, i + 1, j + 1, k + 1)
 
 
-@compile_kernel(nogil=True, error_model="numpy", fastmath=True)
+@compile_kernel(**NO_ALLOCATION)
 def _composite_ray(first, last, segments, limits, bricks, sampled, gathered):
     """Composite front to back into the scratch arrays; return the number of segments seen."""
     _, start, slope, step_m, count, layer = segments
@@ -227,7 +229,7 @@ def _composite_ray(first, last, segments, limits, bricks, sampled, gathered):
     return there
 
 
-@compile_kernel(nogil=True, error_model="numpy", fastmath=True)
+@compile_kernel(**NO_ALLOCATION)
 def _back_project_color(there, gathered, error, update):
     """Add a ray's error on black and on white to the colors that it is made of.
 
@@ -247,8 +249,8 @@ def _back_project_color(there, gathered, error, update):
             color_normalizer[voxel] += share * total
 
 
-@compile_kernel(nogil=True, error_model="numpy", fastmath=True)
-def _back_project_density(there, sampled, gathered, moves, error, update):
+@compile_kernel(**NO_ALLOCATION)
+def _back_project_density(there, sampled, gathered, moves, error, behind, update):
     """Add a ray's error on black and on white to the densities that it passes.
 
     Back to front: a sample's density adds its own color and takes away from all that is behind.
@@ -258,7 +260,7 @@ def _back_project_density(there, sampled, gathered, moves, error, update):
     # against: error × derivative; size: norm of the derivative, by which SIRT shares the error
     against, size = moves
     density, density_normalizer = update[2], update[3]
-    behind = np.zeros(4, dtype=np.float32)
+    behind[:] = F32(0)
     total = F32(0)
     for segment in range(there - 1, -1, -1):
         for sample in range(bounds[segment + 1] - 1, bounds[segment] - 1, -1):
@@ -286,11 +288,12 @@ def _back_project_density(there, sampled, gathered, moves, error, update):
             density_normalizer[voxel] += share * size[sample] * total
 
 
-@compile_kernel(nogil=True, error_model="numpy", fastmath=True)
+@compile_kernel(**NO_ALLOCATION)
 def _composite_rays(
-    segments, limits, bricks, targets, out, sampled, gathered, moves, update, back_projects
+    segments, limits, bricks, targets, out, sampled, gathered, moves, error_and_behind, update,
+    back_projects,
 ):  # fmt: skip
-    error = np.zeros(4, dtype=np.float32)
+    error, behind = error_and_behind[0], error_and_behind[1]
     for ray in range(len(out)):
         there = _composite_ray(
             segments[0][ray], segments[0][ray + 1], segments, limits, bricks, sampled, gathered
@@ -307,4 +310,4 @@ def _composite_rays(
         out[ray, 3] = alpha
         if back_projects:
             _back_project_color(there, gathered, error, update)
-            _back_project_density(there, sampled, gathered, moves, error, update)
+            _back_project_density(there, sampled, gathered, moves, error, behind, update)

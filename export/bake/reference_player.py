@@ -3,8 +3,8 @@
     traced = trace_picture(tables, codes, settings, inputs)         # rays, as segments of samples
     colors = composite_segments(traced.segments, settings, tables.bricks, codes)
 
-It is written from the tables and the settings alone, with arrays of vectors and numpy's own
-inverse, and shares no code with the graph.
+It is written from the tables and the settings alone, with arrays of vectors, and shares no code
+with the graph.
 """
 
 from dataclasses import dataclass, replace
@@ -18,16 +18,20 @@ from export.bake.compositor import VoxelCodes, composite_segments
 from export.bake.reference_geometry import (
     EMPTY_PIXEL_KEY,
     CanonicalRays,
-    PosedNodes,
     RaySegments,
     SurfelFootprints,
     compression_factor,
     fill_holes,
     invert_jacobians,
-    skin_tetrahedral,
-    skin_trilinear,
     surfel_of_key,
     z_buffer,
+)
+from export.bake.skinning_kernels import (
+    MIN_VOLUME,
+    PosedNodes,
+    invert_matrices,
+    skin_tetrahedral,
+    skin_trilinear,
 )
 from export.package.player_tables import (
     DEPTH_CODES,
@@ -268,10 +272,10 @@ def _pose_surface(
     node_camera = np.einsum("nij,nj->ni", blended[:, :, :3], nodes.positions) + blended[:, :, 3]
     there = PosedNodes(nodes, node_camera)
     splatted, edges = skin_tetrahedral(there, tables.surfels.positions)
-    volume = np.linalg.det(edges)
-    flat = np.abs(volume) < 1e-12
-    from_eye = np.linalg.solve(np.where(flat[:, None, None], np.eye(3), edges), splatted[..., None])
-    facing = np.einsum("ni,ni->n", tables.surfels.normals, from_eye[..., 0])
+    inverse, volume = invert_matrices(edges)
+    flat = np.abs(volume) < MIN_VOLUME
+    from_eye = np.einsum("nij,nj->ni", inverse, splatted)
+    facing = np.einsum("ni,ni->n", tables.surfels.normals, from_eye)
     return _PosedSurface(
         nodes=there,
         positions=splatted,

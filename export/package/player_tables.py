@@ -5,6 +5,7 @@ them.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Float32, Int8, Int32, UInt, UInt8, UInt16
@@ -181,18 +182,18 @@ class SurfelTable:
         """Number of surfels."""
         return len(self.position_codes)
 
-    @property
+    @cached_property
     def positions(self) -> Float32[np.ndarray, "surfels 3"]:
         """Canonical positions, metres."""
         step = np.float32(self.extent_m / 65535.0)
         return self.low + self.position_codes.astype(np.float32) * step
 
-    @property
+    @cached_property
     def normals(self) -> Float32[np.ndarray, "surfels 3"]:
         """Outward canonical normals, of length 1 within 5 %."""
         return self.normal_codes.astype(np.float32) / np.float32(127.0)
 
-    @property
+    @cached_property
     def thickness(self) -> Float32[np.ndarray, "surfels"]:
         """Metres along the normal."""
         return self.thickness_codes.astype(np.float32) * np.float32(THICKNESS_STEP_M)

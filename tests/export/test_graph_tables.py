@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from capture.input_error import InputError
-from export.bake.reference_geometry import PosedNodes, skin_trilinear
+from export.bake.skinning_kernels import PosedNodes, skin_trilinear
 from export.package.player_tables import RenderSettings, round_codes
 from export.player_inputs import skinning_nodes, subdivided_skinning_nodes
 

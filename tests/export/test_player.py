@@ -13,8 +13,14 @@ from avatar.evaluation.image_metrics import psnr
 from capture.input_error import InputError
 from export.bake import reference_player
 from export.bake.compositor import VoxelCodes, composite_segments
-from export.bake.reference_geometry import PosedNodes, RaySegments, skin_tetrahedral, skin_trilinear
+from export.bake.reference_geometry import RaySegments
 from export.bake.reference_player import PlayerInputs, draw_reference
+from export.bake.skinning_kernels import (
+    PosedNodes,
+    invert_matrices,
+    skin_tetrahedral,
+    skin_trilinear,
+)
 from export.graph.player_graph import build_graph
 from export.package.package_file import read_package
 from export.package.player_tables import RenderSettings
@@ -325,6 +331,15 @@ def test_skin_in_tetrahedra_gives_its_nodes_and_linear_maps_back(tables):
         moved, derivative = carry(posed, points)
         np.testing.assert_allclose(moved, points @ matrix.T, atol=1e-5)
         np.testing.assert_allclose(derivative, np.broadcast_to(matrix, derivative.shape), atol=1e-4)
+
+
+def test_matrices_are_inverted_unless_they_are_flat(rng):
+    matrices = rng.normal(size=(50, 3, 3)).astype(np.float32)
+    matrices[0] = 0.0
+    inverse, volume = invert_matrices(matrices)
+    np.testing.assert_allclose(volume, np.linalg.det(matrices.astype(float)), atol=1e-6)
+    np.testing.assert_allclose(inverse[1:] @ matrices[1:], np.eye(3)[None].repeat(49, 0), atol=1e-3)
+    np.testing.assert_array_equal(inverse[0], np.eye(3))
 
 
 def test_golden_frames_are_drawn_again_without_a_difference(exported):
