@@ -21,17 +21,21 @@ from jaxtyping import Bool, Float, Float32, Int64
 from avatar.kernels import numba_pose
 from avatar.kernels.kernel_compiler import FAST_MATH, compile_kernel
 
-MIN_NEIGHBOR_PAIRS = 12
-"""Neighbor pairs below which their correlation cannot be measured."""
+MIN_NEIGHBOR_TRIPLES = 12
+"""Frames between two neighbors below which nothing is known about neighbors' errors."""
 MAX_FRAME_GAP = 6
 """Distance in frames beyond which neighbors are ignored."""
 MIN_CORRELATION = 0.1
-"""Correlation of neighbors' errors up to which they are ignored."""
+"""Correlation of neighbors' estimates up to which they are ignored."""
 FULL_CORRELATION = 0.3
-"""Correlation of neighbors' errors from which they have their full precision."""
-NEIGHBOR_PRECISION = 32.0
-"""Precision of all neighbors together, relative to that of the tracker's pose. With 8, poses drift
-from the truth: rays err alike, and turn joints about axes that hardly show."""
+"""Correlation of neighbors' estimates from which they have their full precision."""
+NEIGHBOR_PRECISION = 16.0
+"""Precision of all neighbors together, relative to that of the tracker's pose, where the noise of
+an estimate is as large as the error that neighbors leave unknown."""
+MIN_NOISE_SHARE = 0.1
+"""Least share of noise in the estimates' power."""
+MAX_PERSISTENCE = 0.9
+"""Largest correlation of neighbors' errors that is believed."""
 
 
 class PosePrior(NamedTuple):
@@ -77,37 +81,68 @@ class TemporalPosePrior:
         row = self._is_sequential
         if not row[slot]:
             return UNINFORMATIVE_PRIOR
-        alike = neighbor_correlation(self._frames, self._unregularized, self._has_estimate)
-        return prior_from_neighbors(int(self._frames[slot]), self._frames, corrections, row, alike)
+        precision = neighbor_precision(self._frames, self._unregularized, self._has_estimate)
+        frame = int(self._frames[slot])
+        return prior_from_neighbors(frame, self._frames, corrections, row, precision)
 
 
 @compile_kernel(**FAST_MATH)
-def neighbor_correlation(
+def neighbor_correlations(
     frames: Int64[np.ndarray, "frames"],
     estimates: Float[np.ndarray, "frames 25 3"],
     known: Bool[np.ndarray, "frames"],
-) -> float:
-    """How alike the errors of neighboring frames are, in [-1, 1]; 0 if too few tell.
+) -> tuple[float, float]:
+    """How alike estimates are one frame apart, and two, in [-1, 1]; zeros if too few tell.
 
     Args:
-        frames: Indices of the frames, in any order.
+        frames: Indices of the frames, in any order; the next known one counts as one apart.
         estimates: Correction of each frame by its rays alone, in any unit.
         known: Which frames have an estimate.
     """
     order = np.argsort(frames)
-    pairs, product, power, before = 0, 0.0, 0.0, -1
-    for here in order:
-        if not known[here]:
+    triples, power, one_apart, two_apart, first, middle = 0, 0.0, 0.0, 0.0, -1, -1
+    for last in order:
+        if not known[last]:
             continue
-        if before >= 0 and 0 < frames[here] - frames[before] <= MAX_FRAME_GAP:
-            pairs += 1
+        if middle >= 0 and frames[last] - frames[middle] > MAX_FRAME_GAP:
+            middle = -1
+        if middle >= 0 and first >= 0:
+            triples += 1
             for j in range(25):
                 for a in range(3):
-                    one, other = estimates[before, j, a], estimates[here, j, a]
-                    product += one * other
-                    power += 0.5 * (one * one + other * other)
-        before = here
-    return product / max(power, 1e-12) if pairs >= MIN_NEIGHBOR_PAIRS else 0.0
+                    x, y, z = estimates[first, j, a], estimates[middle, j, a], estimates[last, j, a]
+                    power += (x * x + y * y + z * z) / 3.0
+                    one_apart += 0.5 * y * (x + z)
+                    two_apart += x * z
+        first, middle = middle, last
+    if triples < MIN_NEIGHBOR_TRIPLES:
+        return 0.0, 0.0
+    return one_apart / max(power, 1e-12), two_apart / max(power, 1e-12)
+
+
+def neighbor_precision(
+    frames: Int64[np.ndarray, "frames"],
+    estimates: Float[np.ndarray, "frames 25 3"],
+    known: Bool[np.ndarray, "frames"],
+) -> float:
+    """Precision of what neighbors tell about a frame's error, relative to the tracker's pose's.
+
+    An estimate is the error of a pose and the noise of its rays. Noise differs from frame to frame,
+    while errors change gradually, in the simplest case with correlations r, r² at one, two frames
+    apart. So r is the ratio of the estimates' correlations, the share of noise is what is missing
+    to 1 at distance 0, and neighbors leave (1 - r²) / (1 + r²) of the errors' power unknown.
+
+    Args:
+        frames, estimates, known: As in `neighbor_correlations`.
+    """
+    one_apart, two_apart = neighbor_correlations(frames, estimates, known)
+    share = (one_apart - MIN_CORRELATION) / (FULL_CORRELATION - MIN_CORRELATION)
+    if share <= 0.0:
+        return 0.0
+    persistence = min(max(two_apart / one_apart, one_apart), MAX_PERSISTENCE)
+    errors = one_apart / persistence
+    unknown = errors * (1.0 - persistence**2) / (1.0 + persistence**2)
+    return min(share, 1.0) * NEIGHBOR_PRECISION * max(1.0 - errors, MIN_NOISE_SHARE) / unknown
 
 
 @compile_kernel(**FAST_MATH)
@@ -129,7 +164,7 @@ def prior_from_neighbors(
     frames: Int64[np.ndarray, "frames"],
     corrections: Float[np.ndarray, "frames 25 3"],
     held: Bool[np.ndarray, "frames"],
-    error_correlation: float,
+    precision: float,
 ) -> PosePrior:
     """Prior of a correction: the mean of neighboring frames' corrections, weighted by nearness.
 
@@ -137,17 +172,13 @@ def prior_from_neighbors(
         frame: Index of the frame.
         frames, corrections: Indices and corrections of all frames; its own is ignored.
         held: Which of these count.
-        error_correlation: Correlation of neighboring frames' errors.
+        precision: Precision of all neighbors together, relative to that of the tracker's pose.
     """
-    share = min(
-        max((error_correlation - MIN_CORRELATION) / (FULL_CORRELATION - MIN_CORRELATION), 0.0), 1.0
-    )
     total = np.zeros((25, 3))
     weights = _add_up_neighbors(frame, frames, corrections, held, total)
-    if share == 0.0 or weights == 0.0:
+    if precision == 0.0 or weights == 0.0:
         return UNINFORMATIVE_PRIOR
-    worth = share * NEIGHBOR_PRECISION
-    return PosePrior(worth / (1.0 + worth) / weights * total, 1.0 + worth)
+    return PosePrior(precision / (1.0 + precision) / weights * total, 1.0 + precision)
 
 
 def interpolate_correction(
@@ -163,8 +194,8 @@ def interpolate_correction(
         return UNINFORMATIVE_PRIOR.mean
     frames, found = np.array(list(corrections)), np.array(list(corrections.values()))
     held = np.ones(len(frames), dtype=bool)
-    alike = neighbor_correlation(frames, found, held)
-    return prior_from_neighbors(frame, frames, found, held, alike).mean
+    precision = neighbor_precision(frames, found, held)
+    return prior_from_neighbors(frame, frames, found, held, precision).mean
 
 
 PRIOR_SIGMA_RAD = 0.05
