@@ -6,9 +6,9 @@ their sum: errors of the field point each ray's gradient another way, an error o
 them all one way.
 
 A tracker's error changes slowly from frame to frame. Where a frame's own rays leave its pose
-undetermined, the corrections of neighboring frames are a better guess than none. Whether that holds
-is measured on the corrections that the rays alone would make: if neighbors are uncorrelated,
-nothing is shared.
+undetermined, the corrections of neighboring frames are a better guess than none. How good a guess
+is measured on the corrections that the rays alone would make: how alike they are in neighboring
+frames, and how fast that fades, tells the noise of the rays from errors that change.
 """
 
 import math
