@@ -7,6 +7,7 @@ all frames and found by linear least squares from running sums. The field and th
 neutral colors.
 """
 
+import math
 from dataclasses import dataclass
 from typing import final
 
@@ -26,6 +27,7 @@ from avatar.kernels.backend_protocol import (
     RayBatch,
     RaySamples,
 )
+from avatar.kernels.numba_shading import add_light, light_factors
 from avatar.kernels.torch_reference import activate
 from avatar.occupancy_grid import OccupancyGrid, in_occupied_cells
 from avatar.radiance_field import RadianceField
@@ -72,13 +74,9 @@ class OrientationShading:
             torch.from_numpy(rig.box_low).to(device),
             torch.from_numpy(rig.cells_per_m).to(device),
         )
-        self._gram: Float64[Tensor, "harmonics harmonics"] = torch.zeros(
-            HARMONICS, HARMONICS, dtype=torch.float64, device=device
-        )
-        self._moments = torch.zeros_like(self._gram[0])
-        self._power, self._rays = self._moments[0].clone(), self._moments[0].clone()
-        self.coefficients = self._gram[0].float()
-        self.coefficients[0] = 1.0
+        self._sums: Float64[np.ndarray, "5 5"] = np.zeros((HARMONICS + 1, HARMONICS + 1))
+        self._rays = 0.0
+        self.coefficients = torch.tensor([1.0, 0.0, 0.0, 0.0], device=device)
         self.is_neutral = True
         self._steps = 1  # not an observation's turn, where none is ever asked for
 
@@ -100,13 +98,17 @@ class OrientationShading:
             return torch.zeros(len(rays.slots), 3, device=raw.device)
         return backend.mean_normals(raw, samples, step_m, rays.slots, cells, self._normals)
 
-    def factor(self, normals: Float32[Tensor, "rays 3"]) -> Float32[Tensor, "rays 1"]:
-        """Factor of the neutral color of surfaces with these world normals; 1 without one."""
-        length = normals.norm(dim=1, keepdim=True)
-        shade = _harmonics(normals / length.clamp(min=1e-6)) @ self.coefficients[:, None]
-        return torch.where(
-            length > MIN_NORMAL_LENGTH, shade.clamp(MIN_FACTOR, MAX_FACTOR), torch.ones_like(shade)
-        )
+    def factors(self, normals: Float32[Tensor, "rays 3"]) -> PremultipliedPixels:
+        """Factors of the neutral color, and of alpha (1), where surfaces have these world normals.
+
+        All are 1 where there is no surface.
+        """
+        factors = np.empty((len(normals), 4), dtype=np.float32)
+        light_factors(
+            normals.cpu().numpy(), self.coefficients.cpu().numpy(), MIN_NORMAL_LENGTH,
+            (MIN_FACTOR, MAX_FACTOR), factors,
+        )  # fmt: skip
+        return torch.from_numpy(factors).to(normals)
 
     def restore(self, coefficients: Float32[Tensor, "harmonics"]) -> None:
         """Continues from coefficients that were found earlier."""
@@ -129,40 +131,27 @@ class OrientationShading:
         self._steps += 1
         if (self._steps - 1) % OBSERVATION_INTERVAL:
             return
-        length = normals.norm(dim=1, keepdim=True)
-        alpha = torch.minimum(target[:, 3:], rendered[:, 3:])
-        counts = (alpha > MIN_ALPHA) & (length > MIN_NORMAL_LENGTH)
-        basis = (_harmonics(normals / length.clamp(min=1e-6)) * counts).double()
-        before = (rendered[:, :3].mean(dim=1, keepdim=True) / self.factor(normals)).double()
-        after = (target[:, :3].mean(dim=1, keepdim=True) * counts).double()
-        basis, rays = basis * before, counts.sum()
-        kept = torch.exp(-rays / MEMORY_RAYS)
-        self._gram = kept * self._gram + basis.T @ basis
-        self._moments = kept * self._moments + (basis.T @ after)[:, 0]
-        self._power = kept * self._power + after.square().sum()
-        self._rays = kept * self._rays + rays
-        if float(self._rays) > MIN_RAYS:
-            self.restore(self._solve().float())
+        rays = add_light(
+            normals.cpu().numpy(), target.cpu().numpy(), rendered.cpu().numpy(),
+            self.coefficients.cpu().numpy(), MIN_ALPHA, MIN_NORMAL_LENGTH,
+            (MIN_FACTOR, MAX_FACTOR), MEMORY_RAYS, self._sums,
+        )  # fmt: skip
+        self._rays = math.exp(-rays / MEMORY_RAYS) * self._rays + rays
+        if self._rays > MIN_RAYS:
+            self.restore(torch.from_numpy(self._solve()))
 
-    def _solve(self) -> Float64[Tensor, "harmonics"]:
+    def _solve(self) -> Float32[np.ndarray, "harmonics"]:
         """Coefficients of least squares, drawn to 1; their mean over the rays is 1."""
-        unit = torch.zeros_like(self._moments)
-        unit[0] = 1.0
-        ridge = RIDGE * self._gram[0, 0] * torch.eye(HARMONICS, device=unit.device)
-        ridge[0, 0] = 0.0
-        found = torch.linalg.solve(self._gram + ridge, self._moments)
-        level = self._moments[0] / self._gram[0, 0]
-        constant = self._power - level * self._moments[0]
-        rest = self._power - 2.0 * found @ self._moments + found @ self._gram @ found
-        explained = 1.0 - rest / constant.clamp(min=1e-12)
+        gram, moments, power = self._sums[:-1, :-1], self._sums[:-1, -1], self._sums[-1, -1]
+        unit = np.eye(HARMONICS)[0]
+        ridge = RIDGE * gram[0, 0] * (np.eye(HARMONICS) - np.outer(unit, unit))
+        found = np.linalg.solve(gram + ridge, moments)
+        constant = power - moments[0] ** 2 / gram[0, 0]
+        rest = power - 2.0 * found @ moments + found @ gram @ found
+        explained = 1.0 - rest / max(constant, 1e-12)
         belief = (explained - UNEXPLAINED_SHARE) / (EXPLAINED_SHARE - UNEXPLAINED_SHARE)
-        found = found / ((self._gram[0] @ found) / self._gram[0, 0])
-        return unit + belief.clamp(0.0, 1.0) * (found - unit)
-
-
-def _harmonics(normals: Float32[Tensor, "rays 3"]) -> Float32[Tensor, "rays 4"]:
-    """Spherical harmonics up to the first order, not normalized."""
-    return torch.cat([torch.ones_like(normals[:, :1]), normals], dim=1)
+        found /= (gram[0] @ found) / gram[0, 0]
+        return (unit + min(max(belief, 0.0), 1.0) * (found - unit)).astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -136,7 +136,7 @@ class PosedAvatar:
         )  # fmt: skip
         if shading is not None:
             rotation = torch.from_numpy(self.world_from_body[:3, :3]).to(normals)
-            colors[:, :3] *= shading.factor(normals @ rotation.T)
+            colors *= shading.factors(normals @ rotation.T)
         return colors.cpu().numpy()
 
 

@@ -126,7 +126,7 @@ MECHANISMS = [
     Mechanism(
         name="room light",
         off={"estimate_shading": False},
-        code=("avatar.avatar_model.OrientationShading",),
+        code=("avatar.avatar_model.OrientationShading", "avatar.kernels.numba_shading"),
     ),
     Mechanism(
         name="more rays for the head", patched={"avatar.training.replay_buffer.HEAD_RAY_SHARE": 0.0}

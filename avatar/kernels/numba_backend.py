@@ -7,7 +7,13 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Int32, Int64
 
-from avatar.kernels import numba_correspondence, numba_hash_grid, numba_pose, numba_rendering
+from avatar.kernels import (
+    numba_correspondence,
+    numba_hash_grid,
+    numba_pose,
+    numba_rendering,
+    numba_shading,
+)
 from avatar.kernels.backend_protocol import (
     Backend,
     HashLevels,
@@ -136,7 +142,7 @@ class NumbaBackend(Backend):
 
     def mean_normals(self, raw, samples, step_m, slots, cells, volume):
         mean = torch.empty(len(slots), 3)
-        numba_rendering.mean_normals(
+        numba_shading.mean_normals(
             raw.numpy(), samples.points.numpy(), samples.offsets.numpy(), samples.counts.numpy(),
             samples.root_rows.numpy(), slots.numpy(), cells.roots.numpy(), np.float32(step_m),
             *(part.numpy() for part in volume), mean.numpy(),

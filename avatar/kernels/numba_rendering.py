@@ -10,7 +10,6 @@ from avatar.kernels.torch_reference import (
     COLOR_HUBER_DELTA,
     DARK_GRAY,
     MAX_LOG_DENSITY,
-    MIN_NORMAL_DEPTH,
     OPAQUE_DEPTH,
 )
 
@@ -28,7 +27,7 @@ def nonzero(x):
 
 
 @compile_kernel(inline="always", **FAST_MATH)
-def _cell_index(g, count):
+def cell_index_at(g, count):
     """Cell along one axis of a position, in cells, that is inside except for rounding."""
     return U32(min(max(I32(g), I32(0)), count - I32(1)))
 
@@ -124,8 +123,8 @@ def _fetch_cells(
     nx, ny, nz = shape[slot, 0], shape[slot, 1], shape[slot, 2]
     slot_roots = cell_roots[slot]
     while t < leave:
-        i, j = _cell_index(ox + t * dx, nx), _cell_index(oy + t * dy, ny)
-        flat = (i * U32(ny) + j) * U32(nz) + _cell_index(oz + t * dz, nz)
+        i, j = cell_index_at(ox + t * dx, nx), cell_index_at(oy + t * dy, ny)
+        flat = (i * U32(ny) + j) * U32(nz) + cell_index_at(oz + t * dz, nz)
         if not roots:
             prefetch(cell_index, slot, flat)
         else:
@@ -178,7 +177,7 @@ def march(
                 if t >= leave:
                     break
                 gx, gy, gz = ox + t * dx, oy + t * dy, oz + t * dz
-                i, j, k = _cell_index(gx, nx), _cell_index(gy, ny), _cell_index(gz, nz)
+                i, j, k = cell_index_at(gx, nx), cell_index_at(gy, ny), cell_index_at(gz, nz)
                 packed = cell_index[slot, (i * U32(ny) + j) * U32(nz) + k]
                 way_x, way_y = (F32(i) + wx - gx) * ix, (F32(j) + wy - gy) * iy
                 way = min(min(way_x, way_y), (F32(k) + wz - gz) * iz)
@@ -284,41 +283,6 @@ def composite(raw, offsets, counts, sample_step_m, rendered):
         rendered[ray, 1] = green
         rendered[ray, 2] = blue
         rendered[ray, 3] = F32(1) - through
-
-
-@compile_kernel(parallel=True, **NO_ALLOCATION)
-def mean_normals(
-    raw, points, offsets, counts, rows, slots, cell_roots, sample_step_m,
-    normals, low, cells_per_m, mean,
-):  # fmt: skip
-    """Normals at each ray's samples, in the body frame, composited front to back."""
-    nx, ny, nz, _ = normals.shape
-    for ray in prange(offsets.shape[0]):
-        slot, through = slots[ray], F32(1)
-        x, y, z = F32(0), F32(0), F32(0)
-        for i in range(offsets[ray], offsets[ray] + counts[ray]):
-            optical = np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * sample_step_m
-            before = through
-            through *= np.exp(-optical)
-            if optical <= F32(MIN_NORMAL_DEPTH):
-                continue
-            a = _cell_index((points[i, 0] - low[0]) * cells_per_m[0], I32(nx))
-            b = _cell_index((points[i, 1] - low[1]) * cells_per_m[1], I32(ny))
-            c = _cell_index((points[i, 2] - low[2]) * cells_per_m[2], I32(nz))
-            n = U32(rows[i])
-            p, q, r = normals[a, b, c, 0], normals[a, b, c, 1], normals[a, b, c, 2]
-            u = cell_roots[slot, n, 3] * p + cell_roots[slot, n, 6] * q + cell_roots[slot, n, 9] * r
-            v = (
-                cell_roots[slot, n, 4] * p + cell_roots[slot, n, 7] * q
-                + cell_roots[slot, n, 10] * r
-            )  # fmt: skip
-            w = (
-                cell_roots[slot, n, 5] * p + cell_roots[slot, n, 8] * q
-                + cell_roots[slot, n, 11] * r
-            )  # fmt: skip
-            weight = (before - through) / max(np.sqrt(u * u + v * v + w * w), F32(1e-12))
-            x, y, z = x + weight * u, y + weight * v, z + weight * w
-        mean[ray, 0], mean[ray, 1], mean[ray, 2] = x, y, z
 
 
 @compile_kernel(inline="always")

@@ -31,8 +31,8 @@ ALPHA_DEAD_ZONE = 1e-3
 """Error of alpha up to which the L1 loss on alpha is zero."""
 OPAQUE_DEPTH = 12.0
 """Optical depth, by cached densities, at which a training ray counts as opaque."""
-MIN_NORMAL_DEPTH = 0.02
-"""Optical depth of a sample below which its normal does not count."""
+MIN_NORMAL_WEIGHT = 1e-3
+"""Weight of a sample in its ray up to which its normal does not count."""
 
 
 def encode(
@@ -134,13 +134,13 @@ def mean_normals(
     slot = torch.repeat_interleave(slots.long(), samples.counts.long())
     warp = cells.roots[slot, samples.root_rows.long(), 3:].unflatten(1, (3, 3))
     normals = torch.nn.functional.normalize((warp * normals[:, :, None]).sum(dim=1), dim=1)
-    normals = normals * (raw[:, 3:] > math.log(MIN_NORMAL_DEPTH / step_m))
     optical = torch.exp(raw[:, 3].double().clamp(max=MAX_LOG_DENSITY)) * step_m
     until = torch.cumsum(optical, dim=0)
     ray = torch.arange(len(slots), device=raw.device).repeat_interleave(samples.counts)
     before = until - optical
     before = before - torch.cat([before, before.new_zeros(1)])[samples.offsets][ray]
     weight = torch.exp(-before) * (1.0 - torch.exp(-optical))
+    weight = weight * (weight > MIN_NORMAL_WEIGHT)
     mean = normals.new_zeros(len(slots), 3)
     return mean.index_add_(0, ray, weight.to(mean)[:, None] * normals)
 

@@ -6,18 +6,18 @@ poses or masks were wrong, and lost 0.3 dB.
 """
 
 from dataclasses import replace
-from typing import Any, NamedTuple, final
+from typing import NamedTuple, final
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int32, Int64, UInt8
+from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
 from avatar.correspondence_grid import CORRESPONDENCE_CELL_M, CorrespondenceGrid
 from avatar.kernels.backend_protocol import CorrespondenceTables, RayBatch
+from avatar.kernels.numba_drawing import SIGHT_SPACING_PX, draw_rays
 from avatar.rig import Rig
 from avatar.training.frame_stream import (
-    PixelRuns,
     RayView,
     TrainingFrame,
     camera_in_body,
@@ -32,8 +32,9 @@ NEAR_PERSON_RAY_SHARE = 0.9
 HEAD_RAY_SHARE = 0.15
 """Share of the rays near the person that are drawn from the rows of the head alone, where people
 look; the others are drawn from all rows."""
-PIXEL_KEYS_PER_SLOT = 1 << 32
-"""Distance of the slots' keys in the search for a pixel's run; no image has as many pixels."""
+DRAWS_PER_RAY = 5
+"""Random numbers that decide a ray: its frame, near the person or not, its pixel, the head or not,
+where its samples begin."""
 
 
 class ReplayFrame(NamedTuple):
@@ -66,18 +67,6 @@ class TrainingBatch(NamedTuple):
     world_from_body: Float32[Tensor, "rays 3 3"]
 
 
-class _RunTable(NamedTuple):
-    """Runs of pixels of all slots, one after the other.
-
-    Attributes:
-        ends: `PixelRuns.ends` plus the slot's multiple of `PIXEL_KEYS_PER_SLOT`: rising.
-        shifts: `PixelRuns.shifts`.
-    """
-
-    ends: Int64[np.ndarray, "runs"]
-    shifts: Int32[np.ndarray, "runs"]
-
-
 @final
 class ReplayBuffer:
     """Bounded buffer of prepared frames with distinct views and poses, one slot each.
@@ -94,21 +83,16 @@ class ReplayBuffer:
         self._poses_and_views: list[tuple[BodyPose, RayView]] = []
         self._descriptors = np.zeros((capacity, 3 + 69))
         self._descriptor_distances = np.full((capacity, capacity), np.inf)
-        self._near = torch.zeros(capacity, dtype=torch.int64, device=device)
-        self._far = torch.zeros(capacity, dtype=torch.int64, device=device)
-        self._head = torch.zeros(capacity, 2, dtype=torch.int64, device=device)
+        self._pixels = np.zeros((capacity, 6), dtype=np.int64)
+        self._runs = torch.zeros(capacity, 1, 2, dtype=torch.int32)
+        self._sights = torch.zeros(capacity, 1, 2)
+        self._colors = torch.zeros(capacity, 1, 4, dtype=torch.uint8)
         self._given_origins = np.zeros((capacity, 3))
-        self._origins = torch.zeros(capacity, 3, device=device)
+        self._origins = np.zeros((capacity, 3), dtype=np.float32)
         self._body_from_camera = np.zeros((capacity, 3, 3))
-        self._turns = torch.zeros(capacity, 3, 3, device=device)
-        self._world_from_camera = torch.zeros(capacity, 3, 3, device=device)
+        self._turns = np.zeros((capacity, 3, 3), dtype=np.float32)
+        self._world_from_camera = np.zeros((capacity, 3, 3), dtype=np.float32)
         self.clear_correspondences()
-        self._lenses: list[Camera] = []
-        self._lens_numbers: dict[tuple[Any, ...], int] = {}
-        self._lens = np.zeros(capacity, dtype=np.int64)
-        self._runs: list[PixelRuns] = []
-        self._run_table: _RunTable | None = None
-        self._colors = torch.zeros(capacity, 1, 4, dtype=torch.uint8, device=device)
 
     def __len__(self) -> int:
         """Number of frames that are held."""
@@ -143,7 +127,7 @@ class ReplayBuffer:
         """The frames as they are saved, for training on them again."""
         kept = []
         for slot, (pose, view) in enumerate(self._poses_and_views):
-            colors = self._colors[slot, : int(self._near[slot])].cpu().numpy().copy()
+            colors = self._colors[slot, : self._pixels[slot, 0]].numpy().copy()
             kept.append(ReplayFrame(self.frame_indices[slot], pose, view, colors))
         return kept
 
@@ -178,8 +162,8 @@ class ReplayBuffer:
         origin = correction.pivot + turn @ (
             self._given_origins[slot] - correction.pivot - correction.shift
         )
-        self._origins[slot] = torch.from_numpy(origin).to(self._origins)
-        self._turns[slot] = torch.from_numpy(turn @ self._body_from_camera[slot]).to(self._turns)
+        self._origins[slot] = origin
+        self._turns[slot] = turn @ self._body_from_camera[slot]
 
     def sample_rays(self, count: int, generator: torch.Generator) -> TrainingBatch:
         """Draws rays from the kept frames.
@@ -188,73 +172,36 @@ class ReplayBuffer:
             count: How many.
             generator: On the store's device.
         """
+        chances = torch.rand(DRAWS_PER_RAY, count, generator=generator, device=generator.device)
+        slots = np.empty(count, dtype=np.int32)
+        origins, directions = np.empty((2, count, 3), dtype=np.float32)
+        targets = np.empty((count, 4), dtype=np.float32)
+        world_from_body = np.empty((count, 3, 3), dtype=np.float32)
+        draw_rays(
+            chances.cpu().numpy(), len(self), (NEAR_PERSON_RAY_SHARE, HEAD_RAY_SHARE),
+            self._pixels, self._runs.numpy(), self._sights.numpy(), self._colors.numpy(),
+            self._origins, self._turns, self._world_from_camera,
+            slots, origins, directions, targets, world_from_body,
+        )  # fmt: skip
 
-        def uniform(*shape: int) -> Tensor:
-            return torch.rand(*shape, generator=generator, device=self.device)
+        def here(values: np.ndarray) -> Tensor:
+            return torch.from_numpy(values).to(self.device)
 
-        slot = torch.randint(len(self), (count,), generator=generator, device=self.device).sort()[0]
-        near, far = self._near[slot], self._far[slot]
-        wants_near = (uniform(count) < NEAR_PERSON_RAY_SHARE) | (far == 0)
-        place = uniform(count)
-        first, last = self._head[slot].unbind(dim=1)
-        wants_head = wants_near & (last > first) & (uniform(count) < HEAD_RAY_SHARE)
-        pixel = torch.where(wants_near, (place * near).long(), near + (place * far).long())
-        pixel = torch.where(wants_head, first + (place * (last - first)).long(), pixel)
-        pixel = torch.minimum(pixel, near + far - 1)
-        rays = RayBatch(
-            self._origins[slot],
-            (self._turns[slot] @ self._camera_directions(slot, pixel)[..., None])[..., 0],
-            slot.int(),
-            uniform(count),
-        )
-        color = self._colors[slot, torch.minimum(pixel, near - 1)].float() / 255.0
-        world_from_body = self._world_from_camera[slot] @ self._turns[slot].transpose(1, 2)
-        return TrainingBatch(rays, color * (pixel < near)[:, None], world_from_body)
-
-    def _camera_directions(
-        self, slot: Int64[Tensor, "rays"], pixel: Int64[Tensor, "rays"]
-    ) -> Float32[Tensor, "rays 3"]:
-        """Unit directions of numbered pixels in the axes of their slots' cameras."""
-        if self._run_table is None:
-            keys = PIXEL_KEYS_PER_SLOT * np.arange(len(self))
-            ends = [runs.ends + key for runs, key in zip(self._runs, keys, strict=True)]
-            shifts = [runs.shifts for runs in self._runs]
-            self._run_table = _RunTable(np.concatenate(ends), np.concatenate(shifts))
-        slots, pixels = slot.cpu().numpy(), pixel.cpu().numpy()
-        run = self._run_table.ends.searchsorted(pixels + slots * PIXEL_KEYS_PER_SLOT, side="right")
-        flat, lens = pixels + self._run_table.shifts[run], self._lens[slots]
-        directions = np.empty((len(flat), 3), dtype=np.float32)
-        for number in np.unique(lens):
-            mine, camera = lens == number, self._lenses[number]
-            row, column = np.divmod(flat[mine], camera.size_px[0])
-            directions[mine] = camera.ray_directions(np.stack([column, row], axis=-1) + 0.5)
-        return torch.from_numpy(directions).to(self.device)
-
-    def _lens_number(self, camera: Camera) -> int:
-        """The number of a camera's lens; cameras that only move share one."""
-        lens = camera.focal_px, camera.center_px, camera.size_px, camera.distortion
-        number = self._lens_numbers.setdefault(lens, len(self._lenses))
-        if number == len(self._lenses):
-            self._lenses.append(replace(camera, camera_from_world=np.eye(4)))
-        return number
+        rays = RayBatch(here(origins), here(directions), here(slots), chances[-1].to(self.device))
+        return TrainingBatch(rays, here(targets), here(world_from_body))
 
     def _store_frame(self, slot: int, frame: TrainingFrame) -> None:
         self.set_correspondences(slot, frame.correspondences)
-        self._lens[slot] = self._lens_number(frame.view.camera)
-        self._runs[slot:] = [frame.pixels, *self._runs[slot + 1 :]]
-        self._run_table = None
+        camera, pixels = frame.view.camera, frame.pixels
+        runs = np.stack([pixels.ends, pixels.shifts], axis=1)
+        self._runs = self._store_rows(self._runs, slot, runs)
+        self._sights = self._store_rows(self._sights, slot, _sights_on_a_grid(camera))
         self._colors = self._store_rows(self._colors, slot, frame.colors)
-        self._given_origins[slot] = frame.origin
-        self._origins[slot] = torch.from_numpy(frame.origin).to(self.device)
-        self._body_from_camera[slot] = frame.body_from_camera
-        self._turns[slot] = torch.from_numpy(frame.body_from_camera).to(self.device)
-        camera_from_world = frame.view.camera.camera_from_world[:3, :3]
-        self._world_from_camera[slot] = torch.from_numpy(camera_from_world.T.copy()).to(
-            self._world_from_camera
-        )
-        self._near[slot] = frame.pixels.near_count
-        self._far[slot] = frame.pixels.count - frame.pixels.near_count
-        self._head[slot] = torch.tensor(frame.head_pixels)
+        counts = pixels.near_count, pixels.count, *frame.head_pixels
+        self._pixels[slot] = *counts, camera.size_px[0], len(runs)
+        self._given_origins[slot] = self._origins[slot] = frame.origin
+        self._body_from_camera[slot] = self._turns[slot] = frame.body_from_camera
+        self._world_from_camera[slot] = camera.camera_from_world[:3, :3].T
 
     def _store_rows(self, store: Tensor, slot: int, values: np.ndarray) -> Tensor:
         """Writes one slot; a store that is too narrow becomes a quarter wider than needed."""
@@ -262,13 +209,10 @@ class ReplayBuffer:
         if needed > store.shape[1]:
             width = needed + needed // 4
             # untouched memory costs nothing: pages are committed when they are written
-            wider = torch.empty(
-                self.capacity, width, *store.shape[2:], dtype=store.dtype, device=self.device
-            )
-            held = len(self)
+            wider, held = store.new_empty(self.capacity, width, *store.shape[2:]), len(self)
             wider[:held, : store.shape[1]] = store[:held]
             store = wider
-        store[slot, :needed] = torch.from_numpy(values).to(self.device)
+        store[slot, :needed] = torch.from_numpy(values).to(store)
         return store
 
     def _update_distances(self, slot: int, descriptor: Float[np.ndarray, " 72"]) -> None:
@@ -287,3 +231,12 @@ class ReplayBuffer:
         pair = self._descriptor_distances[[first, second]]
         pair[:, [first, second]] = np.inf
         return int((first, second)[int(pair.min(axis=1).argmin())])
+
+
+def _sights_on_a_grid(camera: Camera) -> Float32[np.ndarray, "nodes 2"]:
+    """Points of the plane at depth 1 that every `SIGHT_SPACING_PX`-th pixel sees, row by row."""
+    width, height = camera.size_px
+    nodes = (SIGHT_SPACING_PX * np.arange(side // SIGHT_SPACING_PX + 2) for side in (width, height))
+    pixels = np.stack(np.meshgrid(*nodes), axis=-1).reshape(-1, 2) + 0.5
+    sights = replace(camera, camera_from_world=np.eye(4)).ray_directions(pixels)
+    return (sights[:, :2] / sights[:, 2:]).astype(np.float32)

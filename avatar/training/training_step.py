@@ -2,6 +2,7 @@
 
 from typing import NamedTuple, Protocol, final, runtime_checkable
 
+import numpy as np
 import torch
 from jaxtyping import Float32, Int32, Int64
 from torch import Tensor
@@ -17,6 +18,7 @@ from avatar.kernels.backend_protocol import (
     RayBatch,
     RaySamples,
 )
+from avatar.kernels.numba_drawing import draw_strong_gradients
 from avatar.occupancy_grid import OccupancyGrid
 from avatar.radiance_field import RadianceField
 from avatar.training.pose_optimizer import PoseOptimizer
@@ -125,8 +127,7 @@ def compute_gradients(
         field.backend, batch.rays, samples, raw, correspondences, config.sample_step_m
     )
     normals = (batch.world_from_body @ normals[..., None])[..., 0]
-    shade = learner.shading.factor(normals)
-    lit = torch.cat([shade.expand(-1, 3), torch.ones_like(shade)], dim=1)
+    lit = learner.shading.factors(normals)
     rendered, loss, grad = field.backend.composite_loss(
         raw, samples, config.sample_step_m, batch.target / lit,
         config.alpha_weight, config.hard_surface_weight * hard_surface_share,
@@ -225,11 +226,13 @@ def draw_by_strength(
     """
     if not faint_share:
         return torch.arange(len(grads), device=grads.device), grads
-    strength = grads.abs().sum(dim=1)
-    chance = (strength / (faint_share * strength.mean() + 1e-30)).clamp(max=1.0)
-    drawn = torch.rand(len(chance), generator=generator, device=generator.device) < chance
-    points = drawn.nonzero()[:, 0]
-    return points, grads[points] / chance[points, None]
+    chances = torch.rand(len(grads), generator=generator, device=generator.device)
+    points, drawn = np.empty(len(grads), dtype=np.int64), np.empty(grads.shape, dtype=np.float32)
+    count = draw_strong_gradients(
+        grads.cpu().numpy(), faint_share, chances.cpu().numpy(), points, drawn
+    )
+    device = grads.device
+    return torch.from_numpy(points[:count]).to(device), torch.from_numpy(drawn[:count]).to(device)
 
 
 def _accumulate_pose_gradients(

@@ -28,7 +28,7 @@ def observe(shading, generator, light, *, steps=160):
         target = neutral * (1.0 + normals @ light)[:, None]
         target += 0.05 * torch.randn(1000, 4, generator=generator)
         target[:, 3] = 1.0
-        rendered = torch.cat([neutral[:, :3] * shading.factor(normals), neutral[:, 3:]], dim=1)
+        rendered = neutral * shading.factors(normals)
         shading.observe(normals, target, rendered)
 
 
@@ -37,14 +37,14 @@ def test_the_light_of_the_room_is_found(shading, generator):
     observe(shading, generator, light)
     assert not shading.is_neutral
     assert (shading.coefficients - torch.tensor([1.0, *light])).abs().max() < 0.02
-    assert torch.equal(shading.factor(torch.zeros(2, 3)), torch.ones(2, 1))
+    assert torch.equal(shading.factors(torch.zeros(2, 3)), torch.ones(2, 4))
 
 
 def test_even_light_leaves_every_factor_at_one(shading, generator):
     observe(shading, generator, torch.tensor([0.01, -0.01, 0.0]))
     assert shading.is_neutral
     normals = torch.eye(3)
-    assert torch.equal(shading.factor(normals), torch.ones(3, 1))
+    assert torch.equal(shading.factors(normals), torch.ones(3, 4))
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,143 @@
+"""Random draws of a training step, compiled for the CPU: rays, and gradients to propagate.
+
+In torch and numpy the rays are fifty operations on small arrays, 1.5 core-ms a step.
+"""
+
+import numpy as np
+
+from avatar.kernels.kernel_compiler import FAST_MATH, compile_kernel
+
+F32, I32 = np.float32, np.int32
+SIGHT_SPACING_PX = 8
+"""Distance of the pixels whose directions are kept, px; others are interpolated: exact but for
+rounding for a lens without distortion, to about 0.02 px for a strongly bent one."""
+
+
+@compile_kernel(inline="always", **FAST_MATH)
+def _sight(sights, slot, width, flat):
+    """Unit direction of a pixel in its camera's axes, between the four kept ones about it."""
+    row, column = flat // width, flat % width
+    columns = width // SIGHT_SPACING_PX + 2
+    i, j = row // SIGHT_SPACING_PX, column // SIGHT_SPACING_PX
+    b = F32(row - i * SIGHT_SPACING_PX) * F32(1.0 / SIGHT_SPACING_PX)
+    a = F32(column - j * SIGHT_SPACING_PX) * F32(1.0 / SIGHT_SPACING_PX)
+    n = i * columns + j
+    m = n + columns
+    p, q, r, s = (F32(1) - a) * (F32(1) - b), a * (F32(1) - b), (F32(1) - a) * b, a * b
+    x = (
+        p * sights[slot, n, 0] + q * sights[slot, n + 1, 0]
+        + r * sights[slot, m, 0] + s * sights[slot, m + 1, 0]
+    )  # fmt: skip
+    y = (
+        p * sights[slot, n, 1] + q * sights[slot, n + 1, 1]
+        + r * sights[slot, m, 1] + s * sights[slot, m + 1, 1]
+    )  # fmt: skip
+    z = F32(1) / np.sqrt(x * x + y * y + F32(1))
+    return x * z, y * z, z
+
+
+@compile_kernel(inline="always")
+def _find_runs(runs, pixels, slots, numbers, found):
+    """The run that holds each ray's pixel: binary searches, a step of all rays at a time.
+
+    Each step waits for memory; steps of different rays wait together.
+    """
+    step, most = 1, 1
+    for slot in range(pixels.shape[0]):
+        most = max(most, pixels[slot, 5])
+    while 2 * step < most:
+        step *= 2
+    found[:] = 0
+    while step > 0:
+        for ray in range(slots.shape[0]):
+            slot, run = slots[ray], found[ray] + step
+            if run < pixels[slot, 5] and runs[slot, run - 1, 0] <= numbers[ray]:
+                found[ray] = run
+        step //= 2
+
+
+@compile_kernel(nogil=True, error_model="numpy")
+def draw_rays(
+    chances, frames, shares, pixels, runs, sights, colors, all_origins, turns, world_from_camera,
+    slots, origins, directions, targets, world_from_body,
+):  # fmt: skip
+    """Draws rays uniformly from the frames, in their order; the last five arguments are written.
+
+    Args:
+        chances: Random numbers in [0, 1) (5, rays): frame, near the person or not, pixel, head or
+            not; the last row is not read.
+        frames: Number of frames, whose slots are the first.
+        shares: Share of the rays near the person, and of these, of those in the head's rows.
+        pixels: Of each slot: numbers of pixels near the person and of all, number of the head's
+            first pixel and of the first behind them; width of the picture, number of runs
+            (slots, 6).
+        runs: `PixelRuns.ends` and `shifts` (slots, runs, 2).
+        sights: Points of the plane at depth 1 seen by every `SIGHT_SPACING_PX`-th pixel
+            (slots, nodes, 2).
+        colors: Premultiplied RGBA of the pixels near the person (slots, pixels, 4).
+        all_origins, turns: Origin of the rays and body-from-camera rotation of each slot.
+        world_from_camera: Rotation of each slot's camera.
+        slots, origins, directions, targets, world_from_body: Of each ray.
+    """
+    rays, stop = slots.shape[0], 0
+    drawn, numbers, found = np.zeros(frames, I32), np.empty(rays, np.int64), np.empty(rays, I32)
+    for n in range(rays):
+        drawn[min(I32(chances[0, n] * F32(frames)), frames - 1)] += 1
+    for slot in range(frames):
+        near, count, first, last = (
+            pixels[slot, 0],
+            pixels[slot, 1],
+            pixels[slot, 2],
+            pixels[slot, 3],
+        )
+        start, stop = stop, stop + drawn[slot]
+        for ray in range(start, stop):
+            place, far = chances[2, ray], count - near
+            number = near + np.int64(place * F32(far))
+            if chances[1, ray] < F32(shares[0]) or far == 0:
+                number = np.int64(place * F32(near))
+                if last > first and chances[3, ray] < F32(shares[1]):
+                    number = first + np.int64(place * F32(last - first))
+            slots[ray], numbers[ray] = slot, min(number, count - 1)
+    _find_runs(runs, pixels[:frames], slots, numbers, found)
+    for ray in range(rays):
+        slot, number = slots[ray], numbers[ray]
+        turn, camera = turns[slot], world_from_camera[slot]
+        flat = number + runs[slot, found[ray], 1]
+        x, y, z = _sight(sights, slot, pixels[slot, 4], flat)
+        for q in range(4):
+            color = colors[slot, number, q] if number < pixels[slot, 0] else 0
+            targets[ray, q] = F32(color) / F32(255)
+        for i in range(3):
+            origins[ray, i] = all_origins[slot, i]
+            directions[ray, i] = turn[i, 0] * x + turn[i, 1] * y + turn[i, 2] * z
+            for k in range(3):
+                world_from_body[ray, i, k] = (
+                    camera[i, 0] * turn[k, 0] + camera[i, 1] * turn[k, 1]
+                    + camera[i, 2] * turn[k, 2]
+                )  # fmt: skip
+
+
+@compile_kernel(**FAST_MATH)
+def draw_strong_gradients(grads, faint_share, chances, points, drawn):
+    """Draws points by the strength of their gradients; returns how many.
+
+    Args:
+        grads: Gradients (points, 4).
+        faint_share: Strength, as a share of the mean, below which a gradient is drawn by chance.
+        chances: Random numbers in [0, 1).
+        points: The points that were drawn; written, as far as there are any.
+        drawn: Their gradients, divided by the chance of each; written.
+    """
+    mean, count = 0.0, 0
+    for n in range(grads.shape[0]):
+        mean += abs(grads[n, 0]) + abs(grads[n, 1]) + abs(grads[n, 2]) + abs(grads[n, 3])
+    faint = F32(faint_share * mean / grads.shape[0] + 1e-30)
+    for n in range(grads.shape[0]):
+        strength = abs(grads[n, 0]) + abs(grads[n, 1]) + abs(grads[n, 2]) + abs(grads[n, 3])
+        if chances[n] * faint < strength:
+            points[count] = n
+            for q in range(4):
+                drawn[count, q] = grads[n, q] * max(faint / strength, F32(1))
+            count += 1
+    return count
