@@ -208,8 +208,9 @@ class ReplayBuffer:
         needed = len(values)
         if needed > store.shape[1]:
             width = needed + needed // 4
-            # untouched memory costs nothing: pages are committed when they are written
-            wider, held = store.new_empty(self.capacity, width, *store.shape[2:]), len(self)
+            # untouched pages cost nothing; numpy, not torch, asks for those of 2 MiB
+            room = np.empty((self.capacity, width, *store.shape[2:]), dtype=values.dtype)
+            wider, held = torch.from_numpy(room).to(store), len(self)
             wider[:held, : store.shape[1]] = store[:held]
             store = wider
         store[slot, :needed] = torch.from_numpy(values).to(store)
