@@ -48,8 +48,6 @@ class Activations(NamedTuple):
 
 HAS_ONEDNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
 """Whether torch's matrix products on the CPU can be oneDNN's."""
-
-
 ROWS_PER_PRODUCT = 1024
 """Rows are padded to a multiple of this number, because oneDNN compiles a kernel for each size."""
 
@@ -67,7 +65,7 @@ def _linear(
 ) -> Float32[Tensor, "points outputs"]:
     """A layer of the network, or its transpose; on the CPU by oneDNN.
 
-    torch takes MKL for single precision, which needs twice the time on AMD's processors.
+    torch takes MKL for single precision, which takes twice as long on AMD's processors.
     """
     if HAS_ONEDNN and values.device.type == "cpu":
         product: Tensor = torch.ops.mkldnn._linear_pointwise(

@@ -84,12 +84,8 @@ def draw_rays(
     for n in range(rays):
         drawn[min(I32(chances[0, n] * F32(frames)), frames - 1)] += 1
     for slot in range(frames):
-        near, count, first, last = (
-            pixels[slot, 0],
-            pixels[slot, 1],
-            pixels[slot, 2],
-            pixels[slot, 3],
-        )
+        near, count = pixels[slot, 0], pixels[slot, 1]
+        first, last = pixels[slot, 2], pixels[slot, 3]
         start, stop = stop, stop + drawn[slot]
         for ray in range(start, stop):
             place, far = chances[2, ray], count - near

@@ -113,7 +113,9 @@ def one_step(trainer, backend):
 
 
 @pytest.mark.parametrize("backend", [NumbaBackend(), TorchBackend()], ids=["numba", "torch"])
-def test_the_steps_gradient_is_that_of_autograd(trainer, backend):
+@pytest.mark.parametrize("has_onednn", [radiance_field.HAS_ONEDNN, False])
+def test_the_steps_gradient_is_that_of_autograd(trainer, backend, has_onednn, monkeypatch):
+    monkeypatch.setattr(radiance_field, "HAS_ONEDNN", has_onednn)
     grads, drawn = one_step(trainer, backend)
     parameters = [p.detach().clone().requires_grad_() for p in trainer.avatar.field.parameters()]
     expected = torch.autograd.grad(mean_loss(trainer, parameters, *drawn), parameters)
