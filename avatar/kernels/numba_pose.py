@@ -34,6 +34,9 @@ MIN_PULL_SHARE = 1e-3
 PADDED = 80
 """Length of a row of 75 numbers that is a multiple of a register's; the last five are zero."""
 JOINTS = 24
+MIN_RIDGE = 1e-6
+"""Least stiffness, as a share of the largest curvature. Below, where one ray outweighs all others,
+sums in single precision are not positive definite."""
 
 
 @compile_kernel(inline="always", **FAST_MATH)
@@ -266,19 +269,21 @@ def solve_with_prior(curvature, gradient, stiffness, back, factor, found):
     """Solves (curvature + stiffness) found = gradient + stiffness back by Cholesky's method.
 
     Args:
-        curvature: Positive semidefinite (n, n or more).
+        curvature: Positive semidefinite but for rounding (n, n or more).
         gradient: (n).
         stiffness: Of the prior in each direction; positive.
         back: Distance to the prior's mean (n).
         factor: Scratch (n, n).
         found: (n), written.
     """
-    n = found.shape[0]
+    n, ridge = found.shape[0], stiffness
+    for i in range(n):
+        ridge = max(ridge, MIN_RIDGE * curvature[i, i])
     for i in range(n):
         for j in range(i + 1):
             s = np.float64(curvature[i, j])
             if i == j:
-                s += stiffness
+                s += ridge
             for k in range(j):
                 s -= factor[i, k] * factor[j, k]
             factor[i, j] = math.sqrt(s) if i == j else s / factor[j, j]

@@ -163,3 +163,11 @@ def test_a_pose_that_remembers_its_rays_is_moved_less_by_their_noise(slopes, rng
             sizes.append(float(np.linalg.norm(correction / SCALE)))
         wander[decay] = float(np.mean(sizes[10:]))
     assert wander[0.85] < 0.6 * wander[0.0]
+
+
+@pytest.mark.parametrize("times", [1e3, 1e6])
+def test_the_step_is_finite_where_one_ray_outweighs_all_others(slopes, rng, times):
+    gradients, loss = pulls_of(slopes, rng.normal(size=(25, 3)) * SCALE * 0.3)
+    gradients[0] *= times
+    step = gauss_newton_step(summed(gradients, loss), NONE, np.inf)
+    assert np.isfinite(step.change).all() and step.change.any()
