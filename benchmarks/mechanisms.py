@@ -295,8 +295,7 @@ def measured_scores(
         folder: Capture.
         kept: File of the scores, JSON.
         size_px: Longer side, pixels.
-        steps: Of training.
-        seed: Of training.
+        steps, seed: Of training.
         frames: How few of its frames are used, to leave out few-frame priors; all if None.
         dance: File of the poses in which the exported player is compared with the renderer.
     """
@@ -326,8 +325,7 @@ def score_mechanisms(
     Args:
         compared: What is trained and scored on.
         mechanisms: Rows.
-        steps: Of training.
-        seed: Of training.
+        steps, seed: Of training.
         dance: Poses in which the exported player is compared with the renderer, if it is.
     """
     limit_threads(1)
