@@ -207,6 +207,7 @@ def _bent_tube() -> tuple[Rig, Float32[np.ndarray, "24 12"]]:
         skin_distance=np.abs(off_axis - 0.05).astype(np.float32), inside_skin=off_axis < 0.05,
         seeds=seeds.astype(np.float32),
         seed_parts=(seeds[:, 0] > 0.0).astype(np.int32),
+        seed_normals=(seeds * (0.0, 20.0, 20.0)).astype(np.float32),
     )  # fmt: skip
     bones = np.tile(np.eye(4)[:3], (24, 1, 1))
     bones[1, :2, :2] = [[math.cos(0.5), -math.sin(0.5)], [math.sin(0.5), math.cos(0.5)]]

@@ -1,31 +1,25 @@
 """The training configuration, and how it follows from the time budget and the image size."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 COARSEST_M = 0.13
 """Cell size of the coarsest hash level, metres: 16 cells along a two-metre box."""
-FULL_DETAIL_FRAMES = 24
-"""Frames, all round, from which the pixels' full detail can be reconstructed."""
-FEW_FRAMES = 12
-"""Frames below which pose error and body shape cannot be told apart, and the few-frame priors
-apply. With twelve frames in exact poses the priors cost 0.5 dB."""
-MAX_DETAIL_SHORTAGE = 4.0
-"""Largest ratio `FULL_DETAIL_FRAMES / frames` that scales the total variation."""
-MAX_FRAME_SHORTAGE = 1.5
-"""Largest ratio `FEW_FRAMES / frames` that scales the few-frame priors."""
-FEW_FRAMES_DOUBLE_WELL_WEIGHT = 1.5
-"""Few-frame weight of the double well, before the factor `1 - frames / FEW_FRAMES`."""
-FEW_FRAMES_INTERIOR_WEIGHT = 0.15
-"""Few-frame weight of the interior loss, before the same factor."""
-FEW_FRAMES_SLOPE_WEIGHT = 0.15
-"""Few-frame weight of the density slope, before the same factor."""
-FEW_FRAMES_COLOR_TV_WEIGHT = 0.3
-"""Few-frame weight of the color variation, before the same factor."""
-FEW_FRAMES_MIN_DENSITY = 180.0
-"""Few-frame minimum density of an occupied cell, 1/m, before the same factor."""
-FEW_FRAMES_INNER_LEG_WEIGHT = 0.1
-"""Few-frame weight of the inner-leg loss, before the same factor."""
+DETAIL_PIXELS = 1.0
+"""Cell size of the finest level where poses are exact, in pixels on the body."""
+ESTIMATED_DETAIL_PIXELS = 1.55
+"""The same where poses are estimates: finer cells learn their errors, which costs 0.1 to 1.6 dB in
+new poses."""
+ESTIMATED_POSE_PRIORS: Mapping[str, float] = {
+    "double_well_weight": 0.25, "interior_weight": 0.025, "density_slope_weight": 0.04,
+    "color_tv_weight": 0.05, "min_occupied_density": 150.0, "off_skin_weight": 0.05,
+}  # fmt: skip
+"""Priors of firm and smooth surfaces where poses are estimates; they grow with the uncertainty. Fog
+imitates views in poses that are off: together they cost an exact actor 0.8 to 1.4 dB in new poses,
+and give phone-like ones 0.1 to 0.6 dB, half of the samples and whole surfaces."""
+MIN_ESTIMATED_UNCERTAINTY = 0.5
+"""Uncertainty from which every pose is corrected, not only those that their rays agree on."""
 MAX_LOG_DENSITY_STEP = 4.0
 """Largest unpenalised change of log density across a finest cell."""
 NOMINAL_STEPS_PER_S = 50.0
@@ -76,11 +70,9 @@ class TrainConfig:
     """Points per step at which that opacity is penalised."""
     density_tv_weight: float = 0.025
     """Weight of the total variation of opacity; 0 turns the term off."""
-    initial_density_tv_factor: float = 1.0
-    """Initial factor of that weight; it falls to 1 with the learning rate."""
     double_well_weight: float = 0.0
-    """Final weight of the double well of opacity, which grows as the learning rate falls; it keeps
-    surfaces from turning into fog under a strong total variation."""
+    """Final weight of the double well of opacity, which grows as the learning rate falls; it makes
+    surfaces firm from all sides, at a small loss in the filmed views."""
     interior_weight: float = 0.0
     """Weight of the loss that makes the body's interior opaque; 0 turns the term off."""
     density_slope_weight: float = 0.0
@@ -92,21 +84,25 @@ class TrainConfig:
     """Pairs of close points per step at which slope and color variation are penalised."""
     min_occupied_density: float = 0.0
     """Density below which a cell counts as empty at the end, 1/m; removes haze."""
-    inner_leg_weight: float = 0.0
-    """Weight of log density off the skin between the legs, where rays may not reach; 0: off."""
-    inner_leg_points: int = 128
+    off_skin_weight: float = 0.0
+    """Weight of log density off the skin, which vanishes where no ray needs it; 0: off."""
+    off_skin_points: int = 128
     """Points per step at which that log density is penalised."""
     interior_points: int = 128
     """Points per step at which the interior's opacity is measured."""
     density_tv_pairs: int = 128
     """Pairs of points per step at which the total variation is measured."""
+    unseen_weight: float = 0.03
+    """Weight of the loss that draws unseen skin to its source (`avatar.training.unseen_skin`)."""
+    unseen_points: int = 256
+    """Points per step at which unseen skin is drawn to its source."""
     occupancy_interval: int = 16
     """Steps between updates of the occupancy grid."""
     refine_poses: bool = True
     """Whether the frames' poses are corrected during training."""
-    poses_may_be_exact: bool = True
-    """Whether a pose is corrected only where its rays agree that it is wrong. Poses that are known
-    to be estimates are always corrected."""
+    pose_uncertainty: float = 0.0
+    """How far the poses are estimates, in [0, 1]. The priors that keep a surface firm and smooth
+    grow with it: fog imitates views in poses that are off, and exact poses need none."""
     estimate_shading: bool = True
     """Whether the light of the room is separated from the colors of the person who turns in it."""
     estimate_exposures: bool = True
@@ -124,6 +120,11 @@ class TrainConfig:
             object.__setattr__(self, "seconds", self.steps / NOMINAL_STEPS_PER_S)
 
     @property
+    def poses_may_be_exact(self) -> bool:
+        """Whether a pose is corrected only where its rays agree that it is wrong."""
+        return self.pose_uncertainty < MIN_ESTIMATED_UNCERTAINTY
+
+    @property
     def max_log_density_slope_per_m(self) -> float:
         """Largest unpenalised slope of the log density, 1/m."""
         return MAX_LOG_DENSITY_STEP / self.finest_m
@@ -133,10 +134,6 @@ class TrainConfig:
         factor = 1.0 + (self.initial_step_factor - 1.0) * (1.0 - detail_share)
         return max(min(factor * self.sample_step_m, MAX_SAMPLE_STEP_M), self.sample_step_m)
 
-    def density_tv_weight_at(self, surface_share: float) -> float:
-        """Weight of the total variation at a progress towards firm surfaces, in [0, 1]."""
-        return self.density_tv_weight * self.initial_density_tv_factor ** (1.0 - surface_share)
-
     @classmethod
     def for_budget(
         cls,
@@ -144,50 +141,36 @@ class TrainConfig:
         *,
         steps: int | None = None,
         footprint_m: float,
-        frames: int | None = None,
+        pose_uncertainty: float = 0.0,
         seed: int = 0,
         held_out_stride: int = HELD_OUT_STRIDE,
     ) -> "TrainConfig":
         """Derives the configuration from a budget and the size of a pixel on the body.
 
-        Few frames in slightly wrong poses leave the finest detail undetermined, and the noise in it
-        would keep poses from being refined. Below `FULL_DETAIL_FRAMES` detail is therefore coarser
-        and the total variation stronger; below `FEW_FRAMES` the few-frame priors are added.
-
         Args:
             seconds: Time budget, seconds; 60 if neither budget is given.
             steps: Number of training steps instead of `seconds`.
             footprint_m: Size of a pixel on the body, metres.
-            frames: Number of frames, if known.
+            pose_uncertainty: How far the poses are estimates, in [0, 1].
             seed: Seed of all random numbers.
             held_out_stride: Stride between held-out frames.
         """
         if seconds is None:
             seconds = 60.0 if steps is None else steps / NOMINAL_STEPS_PER_S
-        detail_shortage = 1.0 if frames is None else max(1.0, FULL_DETAIL_FRAMES / max(frames, 1))
-        footprint_m *= detail_shortage**0.5
-        few = min(detail_shortage, MAX_DETAIL_SHORTAGE)
-        scant = 1.0 if frames is None else FEW_FRAMES / max(frames, 1)
-        scant = min(max(scant, 1.0), MAX_FRAME_SHORTAGE)
-        missing_share = 1.0 - 1.0 / scant
-        finest_m = min(max(footprint_m, 0.002), COARSEST_M / 2)
+        coarser = (ESTIMATED_DETAIL_PIXELS - DETAIL_PIXELS) * pose_uncertainty
+        detail_m = (DETAIL_PIXELS + coarser) * footprint_m
+        finest_m = min(max(detail_m, 0.002), COARSEST_M / 2)
         # about four times as many entries as the skin has cells, within what a cache can hold
         entries = 4.0 * 2.0 / finest_m**2
-        size = 1 << min(max(round(math.log2(entries)), 15), 19 if seconds > 120 else 17)
-        return cls(
+        config = cls(
             seconds=seconds,
             steps=steps,
-            sample_step_m=min(max(1.2 * footprint_m, 0.004), MAX_SAMPLE_STEP_M),
+            sample_step_m=min(max(1.2 * detail_m, 0.004), MAX_SAMPLE_STEP_M),
             finest_m=finest_m,
-            table_size=size,
-            density_tv_weight=cls.density_tv_weight * few * scant**3,
-            initial_density_tv_factor=scant**3,
-            double_well_weight=FEW_FRAMES_DOUBLE_WELL_WEIGHT * missing_share,
-            interior_weight=FEW_FRAMES_INTERIOR_WEIGHT * missing_share,
-            density_slope_weight=FEW_FRAMES_SLOPE_WEIGHT * missing_share,
-            color_tv_weight=FEW_FRAMES_COLOR_TV_WEIGHT * missing_share,
-            min_occupied_density=FEW_FRAMES_MIN_DENSITY * missing_share,
-            inner_leg_weight=FEW_FRAMES_INNER_LEG_WEIGHT * missing_share,
+            table_size=1 << min(max(round(math.log2(entries)), 15), 19 if seconds > 120 else 17),
+            pose_uncertainty=pose_uncertainty,
             seed=seed,
             held_out_stride=held_out_stride,
         )
+        priors = {name: pose_uncertainty * full for name, full in ESTIMATED_POSE_PRIORS.items()}
+        return replace(config, **priors)

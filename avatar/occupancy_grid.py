@@ -6,14 +6,12 @@ evaluation of the field per frame.
 """
 
 from collections.abc import Callable
-from functools import cached_property
 from typing import final
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int64, UInt8
+from jaxtyping import Bool, Float32, Int64, UInt8
 from scipy.ndimage import label
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from avatar.kernels.backend_protocol import DensityGrid
@@ -34,6 +32,8 @@ NEAR_SKIN_M = 0.03
 """Distance from the skin within which a component's cells count towards its size, metres."""
 INTERIOR_DEPTH_M = 0.015
 """Depth under the skin from which the body is solid even if its shape fits badly, metres."""
+OFF_SKIN_M = 0.03
+"""Distance from the skin within which clothes are spared, metres."""
 MIN_COMPONENT_SHARE = 0.003
 """Size, relative to the largest component, below which a component is a floater."""
 FLOATER_INTERVAL = 4
@@ -64,8 +64,9 @@ class OccupancyGrid:
             rig.inside_skin & (rig.skin_distance > INTERIOR_DEPTH_M)
         ).to(device)
         self._interior_cells = self._interior_cells.flatten().nonzero()[:, 0]
+        off_skin = torch.from_numpy(~rig.inside_skin & (rig.skin_distance > OFF_SKIN_M)).to(device)
+        self._off_skin_cells = (band & off_skin).flatten().nonzero()[:, 0]
         self._near_skin = rig.skin_distance <= NEAR_SKIN_M
-        self._rig = rig
         self._cached_empty_cells: tuple[int, Tensor] | None = None
         self._floaters, self._updates = torch.zeros_like(self._in_band), 0
 
@@ -137,12 +138,12 @@ class OccupancyGrid:
             self._draw_cells(self._empty_cells(), count, generator), generator
         )
 
-    def sample_inner_leg(
+    def sample_off_skin(
         self, count: int, generator: torch.Generator
     ) -> Float32[Tensor, "points 3"]:
-        """Random points off the skin between the legs, at most `count`."""
+        """Random points of the band that lie off the skin, at most `count`."""
         return self._jittered_points(
-            self._draw_cells(self._inner_leg_cells, count, generator), generator
+            self._draw_cells(self._off_skin_cells, count, generator), generator
         )
 
     def sample_interior(
@@ -152,12 +153,6 @@ class OccupancyGrid:
         return self._jittered_points(
             self._draw_cells(self._interior_cells, count, generator), generator
         )
-
-    @cached_property
-    def _inner_leg_cells(self) -> Int64[Tensor, "cells"]:
-        """Cells of the band between the legs."""
-        between = inner_leg_cells(self._rig, self.band_cells.cpu().numpy())
-        return self.band_cells[torch.from_numpy(between).to(self.band_cells.device)]
 
     def _empty_cells(self) -> Int64[Tensor, "cells"]:
         """Unoccupied cells of the band, cached until the occupancy changes."""
@@ -229,48 +224,3 @@ def find_floaters(
         return dilate(dilate(torch.from_numpy(cells.astype(np.uint8)).to(solid.device)))
 
     return about((pieces > 0) & ~kept[pieces]) & (1 - about(kept[pieces]))
-
-
-OFF_SKIN_M = 0.02
-"""Distance from the skin within which clothes are spared, metres."""
-MAX_LEG_DISTANCE_M = 0.3
-"""Distance beyond which a leg is ignored, metres."""
-MAX_DIRECTION_COSINE = 0.5
-"""Cosine of the smallest angle (60°) between the directions to both legs from a place between."""
-LEFT_LEG_PARTS = (1, 3, 5)
-"""Body parts of the left leg (`avatar.rig.PART_OF_JOINT`)."""
-RIGHT_LEG_PARTS = (2, 4, 6)
-"""Body parts of the right leg."""
-
-
-def inner_leg_cells(rig: Rig, cells: Int64[np.ndarray, "cells"]) -> Bool[np.ndarray, "cells"]:
-    """Which occupancy cells lie off the skin between the legs.
-
-    Where the thighs touch in every photograph, skinning folds the canonical space between them into
-    the thighs. No ray reaches it, and density left there becomes a web once the legs part.
-
-    Args:
-        rig: Rig of the person.
-        cells: Flat indices of cells of `rig.skin_distance`.
-    """
-    found = np.zeros(len(cells), dtype=bool)
-    away = (rig.skin_distance.reshape(-1)[cells] > OFF_SKIN_M) & ~rig.inside_skin.reshape(-1)[cells]
-    off = np.flatnonzero(away)
-    place = np.stack(np.unravel_index(cells[off], rig.skin_distance.shape), axis=1) + 0.5
-    points = rig.box_low + place * (rig.box_high - rig.box_low) / rig.skin_distance.shape
-    to_left, left_m = _nearest_leg_seed(rig, LEFT_LEG_PARTS, points)
-    to_right, right_m = _nearest_leg_seed(rig, RIGHT_LEG_PARTS, points)
-    apart = (to_left * to_right).sum(axis=1) < MAX_DIRECTION_COSINE
-    found[off] = apart & (np.maximum(left_m, right_m) < MAX_LEG_DISTANCE_M)
-    return found
-
-
-def _nearest_leg_seed(
-    rig: Rig, parts: tuple[int, ...], points: Float[np.ndarray, "points 3"]
-) -> tuple[Float[np.ndarray, "points 3"], Float[np.ndarray, "points"]]:
-    """Direction to the nearest seed of some body parts, and its distance, metres."""
-    seeds = rig.seeds[np.isin(rig.seed_parts, parts)]
-    if not len(seeds):
-        return np.zeros_like(points), np.full(len(points), np.inf)
-    distance, index = KDTree(seeds).query(points)
-    return (seeds[index] - points) / np.maximum(distance, 1e-9)[:, None], distance

@@ -188,6 +188,8 @@ MAX_USEFUL_LOG_DENSITY = 6.0
 """Log density above which density is excess (400 per metre: opacity 0.5 in two millimetres)."""
 EXCESS_DENSITY_FACTOR = 0.4
 """Weight of excess density relative to the slope penalty."""
+SOURCE_STEEPNESS = 3.0
+"""Factor of a source's opacity about one half."""
 VISIBLE_LOG_DENSITY = 2.0
 """Log density from which one point of a pair makes the pair's colors visible."""
 
@@ -236,8 +238,8 @@ def log_density_l1_gradient(
 def sample_tv_pairs(
     points: Float32[Tensor, "samples 3"], config: TrainConfig, generator: torch.Generator
 ) -> Float32[Tensor, "points 3"]:
-    """Random samples followed by one neighbor of each; empty if the weight is zero."""
-    count = config.density_tv_pairs if config.density_tv_weight else 0
+    """Random samples followed by one neighbor of each; empty if neither pair prior is on."""
+    count = config.density_tv_pairs if config.density_tv_weight or config.double_well_weight else 0
     return _sample_pairs(points, count, TV_PAIR_SIGMA_M, generator)
 
 
@@ -335,6 +337,30 @@ def color_tv_gradient(
     pull = weight / max(count, 1) * seen * torch.sign(color[:count] - color[count:])
     grad = torch.zeros_like(raw)
     grad[:, :3] = torch.cat([pull, -pull]) * color * (1.0 - color)
+    return grad
+
+
+def source_gradient(
+    raw: Float32[Tensor, "points 4"], weights: Float32[Tensor, "pairs"], weight: float
+) -> Float32[Tensor, "points 4"]:
+    """Gradient of the mean cross-entropy of points to their sources, in opacity and in color.
+
+    Cross-entropy acts where a point is empty and its source is not, too. The sources stand still.
+    Their opacity is steepened about one half, so that the copy of a soft surface is firm; their
+    color counts as far as they are opaque.
+
+    Args:
+        raw: Raw outputs at the points, then at their sources.
+        weights: Weight of each pair, in [0, 1].
+        weight: Weight of the term.
+    """
+    count, color = len(weights), torch.sigmoid(raw[:, :3])
+    opacity = OpacityWithSlope.of(raw).value
+    scale = weight / max(count, 1) * weights
+    source = (0.5 + SOURCE_STEEPNESS * (opacity[count:] - 0.5)).clamp(0.0, 1.0)
+    grad = torch.zeros_like(raw)
+    grad[:count, :3] = (scale * opacity[count:])[:, None] * (color[:count] - color[count:])
+    grad[:count, 3] = scale * (opacity[:count] - source)
     return grad
 
 

@@ -71,6 +71,7 @@ class Rig:
         seeds: Canonical points of the skin at which root finding starts, metres; one per voxel of
             `SEED_SPACING_M` and body part.
         seed_parts: The body part of each seed.
+        seed_normals: Outward unit normals of the skin at the seeds, canonical.
     """
 
     rest_joints: Float[np.ndarray, "24 3"]
@@ -83,6 +84,7 @@ class Rig:
     inside_skin: Bool[np.ndarray, "cx cy cz"]
     seeds: Float32[np.ndarray, "seeds 3"]
     seed_parts: Int32[np.ndarray, "seeds"]
+    seed_normals: Float32[np.ndarray, "seeds 3"]
 
     @classmethod
     def from_shaped_body(cls, shaped: ShapedBody) -> "Rig":
@@ -111,6 +113,7 @@ class Rig:
             inside_skin=inside,
             seeds=vertices[seeds].astype(np.float32),
             seed_parts=PART_OF_JOINT[body.weights[seeds].argmax(axis=1)].astype(np.int32),
+            seed_normals=normals[seeds].astype(np.float32),
         )
 
     @property

@@ -227,7 +227,7 @@ def _train_method(
             "steps": system.steps,
             "training_frames": len(data.frames),
             "picture_px": data.held_out[0].observation.camera.size_px,
-            "poses": "estimated" if data.capture.has_estimated_poses else "exact",
+            "poses": "estimated" if data.capture.pose_uncertainty > 0.5 else "exact",
             "curve": curve,
             **score_all(system, data, folder),
             "scoring_core_seconds": time.process_time() - began,

@@ -129,10 +129,14 @@ class Capture:
         return str(source.path.resolve())
 
     @property
-    def has_estimated_poses(self) -> bool:
-        """Whether poses are known to be inexact: tracked here, or changed by a fit to the masks."""
-        tracked = isinstance(self.live, LiveTracking) or self.motion.proportions is not None
-        return tracked or (self.fit is not None and self.fit.taken)
+    def pose_uncertainty(self) -> float:
+        """How far the poses are estimates, in [0, 1]: 1 if they were tracked here.
+
+        Given poses are as uncertain as the fit to the masks had to change them beyond its noise.
+        """
+        if isinstance(self.live, LiveTracking) or self.motion.proportions is not None:
+            return 1.0
+        return 0.0 if self.fit is None else self.fit.share
 
     def check(self) -> None:
         """Whether the parts fit together; no frame is read.

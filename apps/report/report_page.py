@@ -133,6 +133,9 @@ def report_page(
             f"<h1>{escape(name)}</h1>",
             f'<p class="lead">{escape(_summary(report))}</p>',
             f'<p class="failure">{escape(failure)}</p>' if failure else "",
+            f'<p class="advice">{escape(report.all_round.advice)}</p>'
+            if report.all_round.advice
+            else "",
             _tiles(report),
             html_section("Learning curve", _curve(report)),
             html_section("Earlier videos", _earlier_videos(report)),
@@ -188,7 +191,7 @@ def _earlier_videos(report: Report) -> str:
 def _tiles(report: Report) -> str:
     held, package = report.held_out, report.package
     tiles = [
-        (report.verdict or "not scored", "verdict"),
+        (report.verdict or "not scored", "verdict, from all sides"),
         (_format_value(held.psnr, "dB"), _with_verdict("held-out PSNR, on white", held.verdict)),
         (_format_value(held.psnr_mask, "dB"), "PSNR inside mask"),
         (_format_value(held.ssim, "", digits=3), "SSIM"),

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from apps.report.report_figures import CurvePoint
+from avatar.evaluation.all_round_verdict import AllRoundVerdict
 from avatar.evaluation.coverage import Coverage, coverage_advice
 from avatar.evaluation.image_metrics import (
     SharpnessVerdict,
-    better_verdict,
     median_blur,
     median_overlap,
     overall_verdict,
@@ -286,6 +286,7 @@ class Report:
     curve: tuple[CurvePoint, ...]
     stream: StreamStats
     package: PackageStats | None
+    all_round: AllRoundVerdict
     held_out_refined: HeldOutStats | None = None
     coverage: CoverageStats | None = None
     earlier_videos: ForgettingStats | None = None
@@ -295,15 +296,22 @@ class Report:
 
     @property
     def verdict(self) -> SharpnessVerdict | None:
-        """Verdict on the avatar: the better of those in given and in fitted poses."""
-        fitted = self.held_out_refined
-        return better_verdict(self.held_out.verdict, None if fitted is None else fitted.verdict)
+        """Verdict on the avatar from all sides."""
+        return self.all_round.verdict
 
     def to_json(self) -> str:
         """Return the text of report.json; NaN and infinity become null."""
         content = to_json_value(dataclasses.asdict(self) | {"verdict": self.verdict})
         order = ("format", "verdict", "command", "recipe", "machine", "frames", "training")
-        order += ("held_out", "held_out_refined", "curve", "stream", "package", "coverage")
+        order += (
+            "held_out",
+            "held_out_refined",
+            "all_round",
+            "curve",
+            "stream",
+            "package",
+            "coverage",
+        )
         order += ("earlier_videos", "cameras", "tracking")
         return json.dumps({key: content[key] for key in order}, indent=1, allow_nan=False) + "\n"
 

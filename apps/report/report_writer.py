@@ -161,6 +161,11 @@ def print_results(
         score += f", with poses fitted to {some}those frames {fitted_score}"
     training = report.training
     console.info(f"Trained for {training.wall_seconds:.1f} s ({training.steps} steps); {score}.")
+    found = report.all_round
+    if found.verdict is not None and found.verdict != "failed":
+        console.info(
+            f"The avatar is {found.verdict}." + (f" {found.advice}" if found.advice else "")
+        )
     if report.package is not None:
         console.print_artifact("package", run.package)
     console.print_artifact("report", run.report_json)
@@ -277,6 +282,7 @@ def _build_report(
         curve=result.curve,
         stream=result.meter.stats(ready_at=ready_at),
         package=package,
+        all_round=result.all_round_verdict(),
         coverage=CoverageStats.of(result.coverage),
         earlier_videos=result.earlier_videos,
         cameras=capture.camera_report,

@@ -23,7 +23,8 @@ from apps.run.run_folder import RunFolder
 from apps.run.run_timing import CpuTime, StreamMeter
 from apps.run.snapshot_writer import PackageSnapshot
 from avatar.avatar_model import Avatar
-from avatar.evaluation.coverage import Coverage
+from avatar.evaluation.all_round_verdict import AllRoundVerdict
+from avatar.evaluation.coverage import Coverage, coverage_advice
 from avatar.evaluation.held_out import (
     HeldOutFrame,
     PixelSample,
@@ -33,6 +34,7 @@ from avatar.evaluation.held_out import (
     score_rendering,
 )
 from avatar.evaluation.image_metrics import better_verdict, composite_on_white, overall_verdict
+from avatar.evaluation.unfilmed_views import half_transparent_share, render_unfilmed_views
 from avatar.events import HeldOutScore
 from avatar.render import render
 from avatar.training.checkpoint import (
@@ -69,20 +71,23 @@ class FinalScores:
         sampled: Scores of the same frames by the pixels of the learning curve.
         fitted: Scores in poses fitted to the frames, of as many frames as time allowed.
         renderings: A few of the frames as rendered on white, by their index.
+        half_transparent: Share of half-transparent pixels in views that were not filmed, in [0, 1];
+            None if it was not measured.
     """
 
     given: tuple[HeldOutScore, ...] = ()
     sampled: tuple[HeldOutScore, ...] = ()
     fitted: tuple[HeldOutScore, ...] = ()
     renderings: dict[int, WhiteImage] = field(default_factory=dict)
+    half_transparent: float | None = None
 
-    def summarize(self, last: CurvePoint) -> CurvePoint:
-        """The learning curve's last point with these scores, and the report's verdict on them."""
+    def summarize(self, last: CurvePoint, verdict: str | None) -> CurvePoint:
+        """The learning curve's last point with these scores, and the report's verdict."""
         return replace(
             last,
             psnr=finite_mean([score.psnr for score in self.given]),
             psnr_mask=finite_mean([score.psnr_mask for score in self.given]),
-            verdict=better_verdict(overall_verdict(self.given), overall_verdict(self.fitted)),
+            verdict=verdict,
             frames=tuple((score.frame, score.psnr) for score in self.given),
             pixels=None,
         )
@@ -122,6 +127,17 @@ class TrainingResult:
     def is_trained(self) -> bool:
         """Whether any step was made on any frame."""
         return self.trainer.steps > 0 and self.frames_added > 0
+
+    def all_round_verdict(self) -> AllRoundVerdict:
+        """The verdict on the avatar from all sides, after `bake`."""
+        scores, exported = self.scores, self.package and self.package.export_report
+        return AllRoundVerdict.of(
+            better_verdict(overall_verdict(scores.given), overall_verdict(scores.fitted)),
+            seen=self.coverage.seen_share,
+            half_transparent=scores.half_transparent,
+            player_psnr=exported.psnr_to_renderer.get("hq") if exported else None,
+            film_advice=coverage_advice(self.coverage),
+        )
 
 
 class _ScoredFrame(NamedTuple):
@@ -167,6 +183,7 @@ def score_finally(
         sampled=tuple(scored[i].sampled for i in order),
         fitted=tuple(sorted(fitted, key=lambda score: score.frame)),
         renderings={one.given.frame: one.rendering for one in shown if one.rendering is not None},
+        half_transparent=half_transparent_share(render_unfilmed_views(trainer.avatar)),
     )
 
 

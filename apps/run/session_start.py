@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numba
+import numpy as np
 import torch
 
 from apps.cli.command_line import exit_on_interrupt, stop_on_interrupt
@@ -20,6 +21,8 @@ from apps.run.run_timing import expected_held_out, post_training_seconds
 from apps.run.training_session import TrainingSession
 from avatar.backends import backend_for
 from avatar.config import HELD_OUT_STRIDE, TrainConfig
+from avatar.evaluation.all_round_verdict import SEEN
+from avatar.evaluation.coverage import coverage_advice, expected_coverage
 from avatar.evaluation.held_out import MAX_HELD_OUT
 from avatar.rig import Rig
 from avatar.training import checkpoint, train
@@ -68,6 +71,8 @@ def set_threads(requested: int | None) -> int:
 if TYPE_CHECKING:  # viser is an optional extra
     from apps.run.live_viewer import LiveViewer
 
+EXPECTED_POSES = 60
+"""Poses, evenly spread, that tell what a film will show of the person."""
 JOINT_TOLERANCE_M = 1e-3
 """Largest difference of rest joints within one body, metres; more is another body."""
 
@@ -115,6 +120,7 @@ def prepare_trainer(
     with console.status("warming up"):
         train.warm_up(prepared.trainer)
         proxy_surface.warm_up()
+    _announce_coverage(capture, console)
     _announce_duration(arguments, capture, prepared.trainer, console)
     return prepared
 
@@ -179,15 +185,11 @@ def new_trainer(
         seconds,
         steps=steps,
         footprint_m=recording.pixel_footprint_m(),
-        frames=recording.source.frame_count,
+        pose_uncertainty=recording.pose_uncertainty,
         held_out_stride=hold_every,
         seed=seed,
     )
-    config = replace(
-        config,
-        refine_poses=refine_poses,
-        poses_may_be_exact=not recording.has_estimated_poses,
-    )
+    config = replace(config, refine_poses=refine_poses)
     return Trainer(Rig.from_shaped_body(recording.shaped), config, device)
 
 
@@ -285,6 +287,22 @@ def _check_same_body(trainer: Trainer, capture: Capture, run: RunFolder) -> None
             f"The poses use a different body than the avatar in {run.path} (rest joints differ by "
             f"up to {100.0 * difference_m:.1f} cm), and {run.body_file.name} is missing. Retrain "
             "with --overwrite."
+        )
+
+
+def _announce_coverage(capture: Capture, console: Console) -> None:
+    """Print what a recording will not show of the person; nothing of one seen from all sides."""
+    rows, frames = np.flatnonzero(capture.motion.valid), capture.geometry().row_frames
+    wanted = [int(row) for row in rows if capture.source.selection.contains(round(frames[row]))]
+    if capture.live is not None or not wanted:
+        return
+    some = wanted[:: -(-len(wanted) // EXPECTED_POSES)]
+    views = ((capture.motion[row], capture.camera_of_pose(row)) for row in some)
+    expected = expected_coverage(capture.shaped, views)
+    if expected.seen_share < SEEN.sharp:
+        console.warning(
+            f"The film shows {expected.seen_share:.0%} of the person's skin; the rest will be "
+            f"completed by what it shows, as a guess. {coverage_advice(expected)}"
         )
 
 

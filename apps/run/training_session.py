@@ -215,10 +215,8 @@ class TrainingSession:
             OSError: If the disk is full; what was written before is kept.
         """
         self._check_trained(result)
-        views, quick = (
-            validation_views(self.held_out, self._recording),
-            self._recording.source.paced,
-        )
+        views = validation_views(self.held_out, self._recording)
+        quick = self._recording.source.paced
         self.trainer.replay.clear_correspondences()  # nothing is learnt from here on
         self._begin_checkpoint(trains_on=False)  # baking changes nothing of it
         try:
@@ -230,9 +228,11 @@ class TrainingSession:
         if quick:
             final = self._write_package("writing the final package, with finer detail", views)
             package = prefer_final(package, final)
+        result = replace(result, package=package)
         if result.scores.given and self.curve:
-            package = store_scores(package, result.scores.summarize(self.curve[-1]))
-        return replace(result, package=package)
+            scores = result.scores.summarize(self.curve[-1], result.all_round_verdict().verdict)
+            result = replace(result, package=store_scores(package, scores))
+        return result
 
     def _check_trained(self, result: TrainingResult) -> None:
         if result.is_trained:

@@ -1,6 +1,7 @@
 """Coverage: which skin the camera has seen, at what angle, and what to show it next."""
 
 import base64
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any, final
@@ -11,9 +12,14 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from avatar.evaluation.skin_patches import PART_NAMES, SIDE_NAMES, SkinPatches, view_patches
+from capture.camera import Camera
+from capture.source import Frame
+from preprocess.body.body_pose import BodyPose
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.observation import Observation
 
+EXPECTED_PX = 64
+"""Longer side of the images in which the coverage of poses is found, pixels."""
 MIN_SEEN_COSINE = 0.3
 """Cosine between normal and view direction below which a patch is not seen (72°)."""
 MIN_WELL_SEEN_COSINE = 0.6
@@ -135,6 +141,18 @@ class Coverage:
         if len(stages) == len(self.stages) == len(cosines):
             np.maximum(self.cosines, cosines.astype(np.float32) / 255.0, out=self.cosines)
             np.maximum(self.stages, stages, out=self.stages)
+
+
+def expected_coverage(shaped: ShapedBody, views: Iterable[tuple[BodyPose, Camera]]) -> Coverage:
+    """What frames in some poses will show of the person, before any frame is read."""
+    coverage = Coverage(shaped)
+    for pose, camera in views:
+        small = camera.resize_longer_side(EXPECTED_PX)
+        width, height = small.size_px
+        blank = Frame(index=0, time_s=0.0, rgb=np.zeros((height, width, 3), dtype=np.uint8))
+        alpha = np.ones((height, width), dtype=np.float32)
+        coverage.add(Observation(frame=blank, alpha=alpha, pose=pose, camera=small))
+    return coverage
 
 
 def _area_share(areas: Float32[np.ndarray, "patches"], seen: Any) -> float:

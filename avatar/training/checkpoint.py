@@ -29,7 +29,7 @@ from capture.source import Frame
 from preprocess.body.body_pose import BodyPose
 from preprocess.observation import Observation
 
-CHECKPOINT_FORMAT = 2
+CHECKPOINT_FORMAT = 3
 """Version of the checkpoint's layout; another version is refused."""
 CHECKPOINT_FILE = "state.pt"
 """File name of the checkpoint in its folder."""
@@ -76,6 +76,7 @@ def current_state(trainer: Trainer, *, notes: dict[str, Any] | None = None) -> d
             frame: torch.from_numpy(gain) for frame, gain in trainer.exposures.by_frame.items()
         },
         "shading": trainer.learner.shading.coefficients,
+        "seen": torch.from_numpy(trainer.unseen.evidence.cosines),
         "notes": notes or {},
     }
 
@@ -147,10 +148,9 @@ def _restored(state: dict[str, Any], device: torch.device) -> Trainer:
     trainer.pose_corrections = {
         frame: tensor.numpy() for frame, tensor in state["corrections"].items()
     }
-    gains = state.get("gains", {})  # checkpoints before 2026-11-22 have none
-    trainer.exposures.restore({frame: gain.numpy() for frame, gain in gains.items()})
-    if "shading" in state:
-        trainer.learner.shading.restore(state["shading"])
+    trainer.exposures.restore({frame: gain.numpy() for frame, gain in state["gains"].items()})
+    trainer.learner.shading.restore(state["shading"])
+    trainer.unseen.evidence.cosines[:] = state["seen"].numpy()
     for name in COUNTERS:
         setattr(trainer, name, state["counts"][name])
     return trainer

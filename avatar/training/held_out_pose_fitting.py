@@ -85,7 +85,7 @@ def _fit_frames(
         trainer.config,
         empty_space_weight=0.0,
         interior_weight=0.0,
-        inner_leg_weight=0.0,
+        off_skin_weight=0.0,
         rays=at_once * RAYS_PER_CORRECTION,
     )
     sampler = OccupancySampler(field.backend, avatar.occupancy, config)

@@ -35,6 +35,7 @@ from avatar.training.training_step import (
     StepResult,
     compute_gradients,
 )
+from avatar.training.unseen_skin import UnseenSkin
 from preprocess.body.body_pose import BodyPose
 
 EMA_HORIZON_STEPS = 250
@@ -101,6 +102,8 @@ NETWORK_RATE_FACTOR = 0.3
 """The network's learning rate as a share of the table's."""
 INITIAL_OCCUPANCY_STEPS = 300
 """Initial steps in which fog clears: the occupancy is probed more often and decays faster."""
+SOURCE_INTERVAL = 64
+"""Steps after which new frames change the sources of unseen skin."""
 CORRECTIONS_PER_STEP = 2
 """Pose corrections that one training step may make."""
 
@@ -117,6 +120,7 @@ class Trainer:
         sampler: Chooses the samples along rays.
         replay: Frames to train on.
         poses: Poses of these frames, corrected if the configuration says so.
+        unseen: What frames have shown of the skin, and what the other skin is drawn to.
         exposures: Exposures of these frames, estimated if the configuration says so.
         generator: Source of random numbers, on the field's device.
         pose_corrections: Correction of each frame's pose, by the frame's index in its source; a
@@ -146,7 +150,10 @@ class Trainer:
             sample_step_m=config.sample_step_m,
             shading=OrientationShading(rig, device),
         )
-        self.sampler: RaySampler = OccupancySampler(self.backend, self.learner.occupancy, config)
+        self.unseen = UnseenSkin(rig)
+        self.sampler: RaySampler = OccupancySampler(
+            self.backend, self.learner.occupancy, config, self.unseen
+        )
         self.avatar = replace(self.learner, field=self.field.clone())
         self.replay = ReplayBuffer(config.replay_capacity, device)
         self.poses = PoseOptimizer(
@@ -186,6 +193,7 @@ class Trainer:
             The replay slot that holds the frame.
         """
         slot = self.replay.add(frame)
+        self.unseen.add(frame)
         self.exposures.set_frame(slot, frame.index)
         known = self.pose_corrections.get(frame.index)
         step = 0 if is_restored else self.steps
@@ -240,6 +248,8 @@ class Trainer:
             detail_share: Progress from coarse samples along rays to fine ones, in [0, 1].
         """
         config, field = self._config_at(detail_share), self.field
+        if self.steps % SOURCE_INTERVAL == 0:
+            self.unseen.update()
         falling = rate if pose_rate is None else pose_rate
         batch = self.replay.sample_rays(config.rays, self.generator)
         refines = config.refine_poses and self.steps % self.poses.correction_interval(falling) == 0

@@ -23,6 +23,7 @@ from avatar.occupancy_grid import OccupancyGrid
 from avatar.radiance_field import RadianceField
 from avatar.training.pose_optimizer import PoseOptimizer
 from avatar.training.replay_buffer import TrainingBatch
+from avatar.training.unseen_skin import SourcePairs, UnseenSkin
 
 
 @runtime_checkable
@@ -40,6 +41,10 @@ class RaySampler(Protocol):
         """At most `count` canonical points at which density is penalised."""
         ...
 
+    def sample_source_pairs(self, count: int, generator: torch.Generator) -> SourcePairs:
+        """At most `count` points of unseen skin, and what they are drawn to."""
+        ...
+
 
 @final
 class OccupancySampler:
@@ -49,9 +54,16 @@ class OccupancySampler:
         sample_step_m: Distance between samples along a ray, metres; may be changed at any time.
     """
 
-    def __init__(self, backend: Backend, occupancy: OccupancyGrid, config: TrainConfig) -> None:
-        """Reads `occupancy` at every call; its owner keeps it up to date."""
+    def __init__(
+        self,
+        backend: Backend,
+        occupancy: OccupancyGrid,
+        config: TrainConfig,
+        unseen: UnseenSkin | None = None,
+    ) -> None:
+        """Reads `occupancy` and `unseen` at every call; their owner keeps them up to date."""
         self._backend = backend
+        self._unseen = unseen if config.unseen_weight else None
         self._occupancy = occupancy
         self._config = config
         self.sample_step_m = config.sample_step_m
@@ -70,6 +82,12 @@ class OccupancySampler:
     def sample_empty(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
         """Random points in unoccupied cells near the skin, at most `count`."""
         return self._occupancy.sample_empty(count, generator)
+
+    def sample_source_pairs(self, count: int, generator: torch.Generator) -> SourcePairs:
+        """Points of unseen skin and their sources, at most `count`; none without `unseen`."""
+        if self._unseen is None:
+            return SourcePairs.none()
+        return self._unseen.sample(count, generator)
 
 
 class StepResult(NamedTuple):
@@ -120,6 +138,8 @@ def compute_gradients(
     field = learner.field
     samples = sampler.sample_rays(batch.rays, correspondences)
     asked = _regularization_points(sampler, learner.occupancy, samples.points, config, generator)
+    pairs = sampler.sample_source_pairs(config.unseen_points, generator)
+    asked.append(pairs.points.to(samples.points))
     seen = field.forward(torch.cat([samples.points, *asked]))
     raw, *raw_asked = seen.raw.split([len(points) for points in (samples.points, *asked)])
     count = len(raw)
@@ -133,6 +153,8 @@ def compute_gradients(
         config.alpha_weight, config.hard_surface_weight * hard_surface_share,
     )  # fmt: skip
     grads = [grad, *_regularization_gradients(raw_asked, asked, config, surface_share)]
+    weights = pairs.weights.to(raw)
+    grads += [radiance_field.source_gradient(raw_asked[-1], weights, config.unseen_weight)]
     drawn, drawn_grads = draw_by_strength(torch.cat(grads), config.faint_gradient_share, generator)
     grad_features = field.backward(seen.rows(drawn), drawn_grads)
     if poses is not None and count:
@@ -154,7 +176,7 @@ def _regularization_points(
     config: TrainConfig,
     generator: torch.Generator,
 ) -> list[Float32[Tensor, "_ 3"]]:
-    """Points of the five regularizers: empty, TV pairs, interior, smoothness pairs, inner leg."""
+    """Points of the regularizers: empty, TV pairs, interior, smoothness pairs, off the skin."""
     none = points[:0]
     return [
         sampler.sample_empty(config.empty_space_points, generator).to(points)
@@ -165,8 +187,8 @@ def _regularization_points(
         if config.interior_weight
         else none,
         radiance_field.sample_smoothness_pairs(points, config, generator),
-        occupancy.sample_inner_leg(config.inner_leg_points, generator).to(points)
-        if config.inner_leg_weight
+        occupancy.sample_off_skin(config.off_skin_points, generator).to(points)
+        if config.off_skin_weight
         else none,
     ]
 
@@ -177,11 +199,9 @@ def _regularization_gradients(
     config: TrainConfig,
     surface_share: float,
 ) -> list[Float32[Tensor, "_ 4"]]:
-    """Gradients of the raw outputs at `_regularization_points`, in the same order."""
-    empty, pairs, solid, close, gaps = raw
-    grad_pairs = radiance_field.density_tv_gradient(
-        pairs, config.density_tv_weight_at(surface_share)
-    )
+    """Gradients of the raw outputs at the points of `_regularization_points`, in their order."""
+    empty, pairs, solid, close, away, *_ = raw
+    grad_pairs = radiance_field.density_tv_gradient(pairs, config.density_tv_weight)
     if config.double_well_weight:
         grad_pairs += radiance_field.double_well_gradient(
             pairs, config.double_well_weight * surface_share
@@ -202,9 +222,7 @@ def _regularization_gradients(
         grad_pairs,
         radiance_field.interior_gradient(solid, config.interior_weight) if len(solid) else solid,
         grad_close,
-        radiance_field.log_density_l1_gradient(gaps, config.inner_leg_weight)
-        if len(gaps)
-        else gaps,
+        radiance_field.log_density_l1_gradient(away, config.off_skin_weight) if len(away) else away,
     ]
 
 

@@ -24,6 +24,7 @@ from avatar.rig import Rig
 from avatar.training.frame_stream import TrainingFrame
 from avatar.training.trainer import Trainer
 from avatar.training.training_step import OccupancySampler, RaySampler, StepResult
+from avatar.training.unseen_skin import SourcePairs
 from baselines.instant_avatar.occupied_samples import sample_occupied_cells
 from baselines.instant_avatar.posed_field import (
     BroydenWarp,
@@ -78,6 +79,10 @@ class PosedSampler:
         """Canonical points in cells that are known to be empty, at most `count`."""
         return self._emptiness.sample_empty(count, generator)
 
+    def sample_source_pairs(self, count: int, generator: torch.Generator) -> SourcePairs:
+        """None: the paper leaves unseen skin to chance."""
+        return SourcePairs.none()
+
     def add_frame(
         self, slot: int, correspondences: CorrespondenceTables, bones: Float32[Tensor, "24 12"]
     ) -> None:
@@ -126,6 +131,10 @@ class GlobalSparsitySampler:
         """Random points of the whole box."""
         place = torch.rand(count, 3, generator=generator, device=generator.device)
         return self._low + place.to(self._low.device) * (self._high - self._low)
+
+    def sample_source_pairs(self, count: int, generator: torch.Generator) -> SourcePairs:
+        """Pairs of the other sampler."""
+        return self._sampler.sample_source_pairs(count, generator)
 
 
 @dataclass(frozen=True, kw_only=True)

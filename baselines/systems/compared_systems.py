@@ -1,7 +1,6 @@
 """The systems by name: the product, and each baseline in a preset."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any, Protocol, final, runtime_checkable
 
 import numpy as np
@@ -73,11 +72,10 @@ def train_config(
 ) -> TrainConfig:
     """The product's configuration for a budget and this capture, as ia-ingest makes it."""
     capture = data.capture
-    config = TrainConfig.for_budget(
+    return TrainConfig.for_budget(
         seconds, steps=steps, footprint_m=capture.pixel_footprint_m(),
-        frames=capture.source.frame_count, seed=seed,
+        pose_uncertainty=capture.pose_uncertainty, seed=seed,
     )  # fmt: skip
-    return replace(config, poses_may_be_exact=not capture.has_estimated_poses)
 
 
 FieldMaker = Callable[[SkinnedPerson, ComparedCapture, MethodSettings, TrainConfig], PosedRadiance]

@@ -1,7 +1,8 @@
 """Aligns an opened capture to its masks: body, poses and focal length at once.
 
-Exact poses are left alone: nothing is changed where the roots would hardly turn, or where
-proportions and focal length alone bring the outlines as close to the masks as corrected poses do.
+The fit would change exact poses, too, by its own noise. How much of its changes is made follows
+from how much larger they are than that noise (Wiener's factor), without a step: nothing of those of
+exact poses, nearly all of those of a tracker's.
 """
 
 from dataclasses import replace
@@ -59,14 +60,11 @@ POSE_ITERATIONS = 2
 """Iterations over poses alone after those, with `TRACKED_POSE_WEIGHTS`."""
 TRACKED_POSE_WEIGHTS = EvidenceWeights(outline_rows=480.0, keypoints=0.6)
 """Weights while poses alone are fitted: with these, proportions would follow the clothes."""
-PROPORTION_STEP = 3
-"""Stride of the frames that show how well proportions and focal length alone explain the masks."""
 MIN_ERROR_DECREASE = 0.01
 """Relative decrease of the error below which the iterations end."""
-MAX_ERROR_RATIO = 0.9
-"""Ratio of the errors with and without corrected poses above which the poses are exact."""
-MIN_ROOT_TURN_DEG = 1.0
-"""Mean rotation of the roots below which poses are exact, degrees (exact ones: 0.6 to 0.75)."""
+NOISE_DEG_PER_CM = 1.5
+"""Rotation by which the fit changes exact poses, degrees for each cm by which outlines still differ
+after it (1.4, 1.4 and 1.55 on three exact captures; a tracker's, real and simulated: 5 to 8)."""
 MIN_FRAMES = 4
 """Fewest frames with a usable mask for which an alignment is attempted."""
 
@@ -82,7 +80,7 @@ def apply_fit(capture: Capture, fit: CaptureFit, *, height_m: float | None = Non
         fit: Its fit.
         height_m: The person's stated height, which stays; metres.
     """
-    if not fit.taken:
+    if not fit.share:
         return replace(capture, fit=fit)
     geometry = capture.geometry()
     motion, cameras = fit.correct_motion(geometry), fit.scale_focal_lengths(capture.cameras)
@@ -130,29 +128,29 @@ def fit_capture(capture: Capture, *, fit_body: bool = True) -> CaptureFit | None
         settling = _iterate_until_settled(fitter, everything)
     before, after = settling[0], settling[-1]
     corrections = fitter.corrections
-    turned = np.degrees(np.linalg.norm(corrections[:, :3], axis=1).mean())
     pixel_cm = 100.0 * capture.pixel_footprint_m() * _reduction(capture, fitter)
+    share = 1.0 if tracked else share_beyond_noise(corrections, after * pixel_cm)
     return CaptureFit(
-        coefficients=fitter.coefficients,
-        focal_factor=float(np.exp(fitter.log_focal)),
-        corrections=_interpolate_corrections(capture, fitter, corrections),
+        coefficients=share * fitter.coefficients,
+        focal_factor=float(np.exp(share * fitter.log_focal)),
+        corrections=share * _interpolate_corrections(capture, fitter, corrections),
         error_before_cm=before * pixel_cm,
         error_after_cm=after * pixel_cm,
-        taken=tracked
-        or bool(
-            turned > MIN_ROOT_TURN_DEG
-            and after < MAX_ERROR_RATIO * _explained_error(capture, fitter, everything)
-        ),
+        share=share,
         fits_body=fit_body,
     )
 
 
-def _explained_error(capture: Capture, fitter: ClipFitter, fitted: FitParameters) -> float:
-    """The outlines' error, px, where only proportions and focal length change."""
-    some = [frame for frame in fitter.frames if frame.mask is not None]
-    some = some[:: PROPORTION_STEP if len(some) > KEY_FRAMES // 2 else 1]
-    alone = ClipFitter(capture.motion, fitter.model.space, some)
-    return _iterate_until_settled(alone, fitted._replace(poses=False))[-1]
+def share_beyond_noise(corrections: Float[np.ndarray, "frames 75"], error_cm: float) -> float:
+    """Share of corrections of poses that is more than the fit's noise: 1 - noise² / change².
+
+    Args:
+        corrections: Root and joint rotations, radians, and root positions.
+        error_cm: Distance of outlines of body and masks that the fit leaves, cm.
+    """
+    squares = (corrections[:, :72].reshape(-1, 24, 3) ** 2).sum(axis=2).mean(axis=0)
+    change_deg = float(np.degrees(np.sqrt(squares[0] + squares[1:].mean())))  # a root moves all
+    return max(0.0, 1.0 - (NOISE_DEG_PER_CM * error_cm / max(change_deg, 1e-9)) ** 2)
 
 
 def _fit_tracked(fitter: ClipFitter, everything: FitParameters) -> list[float]:

@@ -302,8 +302,9 @@ class CaptureFit:
         corrections: Correction of each row of the motion: root and joint rotations, root position.
         error_before_cm: Root mean square distance between outlines of body and masks, cm; of poses
             that were made of key points: after a fit to these alone.
-        error_after_cm: The same with the changes.
-        taken: Whether the changes are made; poses that are exact are left alone.
+        error_after_cm: The same with the whole of the changes.
+        share: Share of the changes that is made, in [0, 1], and how far the given poses are
+            estimates: none where they are exact, 1 where they were made of key points.
         fits_body: Whether proportions could change; not those of a finished avatar's person.
     """
 
@@ -312,7 +313,7 @@ class CaptureFit:
     corrections: Float[np.ndarray, "poses 75"]
     error_before_cm: float
     error_after_cm: float
-    taken: bool
+    share: float
     fits_body: bool
 
     def shape(self, shaped: ShapedBody) -> ShapedBody:
@@ -342,15 +343,17 @@ class CaptureFit:
         turned = np.degrees(np.linalg.norm(self.corrections[:, :72].reshape(-1, 24, 3), axis=2))
         return (
             "Body, poses and focal length were fitted to the masks: their outlines were "
-            f"{self.error_before_cm:.1f} cm apart and are {self.error_after_cm:.1f} cm apart now "
-            f"(the root turned by {turned[:, 0].mean():.1f} degrees on average, other joints by "
-            f"{turned[:, 1:].mean():.1f}; focal length times {self.focal_factor:.2f})."
+            f"{self.error_before_cm:.1f} cm apart, and {self.error_after_cm:.1f} cm by the fit, of "
+            f"which {self.share:.0%} was made (the root turned by {turned[:, 0].mean():.1f} "
+            f"degrees on average, other joints by {turned[:, 1:].mean():.1f}; focal length times "
+            f"{self.focal_factor:.2f})."
         )
 
     def as_json(self) -> dict[str, float | bool]:
         """Figures for the report."""
         return {
-            "taken": self.taken,
+            "taken": self.share > 0.0,
+            "share": round(self.share, 3),
             "outline_cm_before": round(self.error_before_cm, 3),
             "outline_cm_after": round(self.error_after_cm, 3),
             "focal_factor": round(self.focal_factor, 4),
@@ -371,7 +374,7 @@ def load_capture_fit(path: Path, video: str) -> CaptureFit | None:
     """Read what `CaptureFit.save` wrote; None if there is nothing for this video."""
     if not path.is_file():
         return None
-    scalars = ("focal_factor", "error_before_cm", "error_after_cm", "taken", "fits_body")
+    scalars = ("focal_factor", "error_before_cm", "error_after_cm", "share", "fits_body")
     try:
         read = read_npz(path, ("coefficients", "corrections", "video", *scalars))
         if str(read["video"]) != video:

@@ -1,13 +1,13 @@
-"""The recipe follows from the waiting time, the picture's size and the number of frames."""
+"""The recipe follows from the waiting time, the picture's size and how exact the poses are."""
 
 import pytest
 
-from avatar.config import COARSEST_M, FULL_DETAIL_FRAMES, TrainConfig
+from avatar.config import COARSEST_M, ESTIMATED_POSE_PRIORS, TrainConfig
 
 
 @pytest.mark.parametrize("footprint_m", [1e-4, 0.004, 0.009, 0.02, 0.5])
 def test_every_recipe_can_be_built(footprint_m):
-    config = TrainConfig.for_budget(60.0, footprint_m=footprint_m, frames=1)
+    config = TrainConfig.for_budget(60.0, footprint_m=footprint_m, pose_uncertainty=1.0)
     assert config.table_size & (config.table_size - 1) == 0
     assert 1 << 15 <= config.table_size <= 1 << 19
     assert 0.002 <= config.finest_m < COARSEST_M
@@ -22,44 +22,31 @@ def test_detail_follows_the_pixels():
     assert near.table_size >= far.table_size
 
 
-def test_few_frames_determine_less_detail():
-    def finest(frames):
-        return TrainConfig.for_budget(60.0, footprint_m=0.004, frames=frames).finest_m
-
-    assert finest(6) == pytest.approx(0.004 * (FULL_DETAIL_FRAMES / 6) ** 0.5)
-    assert finest(6) > finest(12) > finest(24) == finest(300) == finest(None)
-
-
-def test_the_fewer_the_frames_the_smoother_surfaces_are_asked_to_be():
-    weights = [
-        TrainConfig.for_budget(60.0, footprint_m=0.004, frames=frames).density_tv_weight
-        for frames in (None, 120, 24, 12, 6)
-    ]
-    usual = TrainConfig().density_tv_weight
-    assert weights == pytest.approx([usual, usual, usual, 2.0 * usual, 13.5 * usual])
-
-
-def test_what_few_frames_ask_for_is_not_there_when_they_are_enough():
-    usual = TrainConfig.for_budget(60.0, footprint_m=0.004)
-    for frames in (24, 25, 1000):
-        assert TrainConfig.for_budget(60.0, footprint_m=0.004, frames=frames) == usual
-    dozen = TrainConfig.for_budget(60.0, footprint_m=0.004, frames=12)
-    assert dozen.double_well_weight == dozen.interior_weight == dozen.inner_leg_weight == 0.0
-    assert dozen.density_slope_weight == dozen.color_tv_weight == dozen.min_occupied_density == 0.0
-    assert dozen.initial_density_tv_factor == 1.0
-    assert usual.double_well_weight == usual.interior_weight == 0.0
-    assert (
-        usual.density_tv_weight_at(0.0)
-        == usual.density_tv_weight_at(1.0)
-        == usual.density_tv_weight
+def test_poses_that_are_estimates_show_less_detail():
+    exact, half, estimated = (
+        TrainConfig.for_budget(60.0, footprint_m=0.004, pose_uncertainty=share)
+        for share in (0.0, 0.5, 1.0)
     )
+    assert exact.finest_m == 0.004
+    assert estimated.finest_m == pytest.approx(0.004 * 1.55)
+    assert half.finest_m == pytest.approx(0.5 * (exact.finest_m + estimated.finest_m))
+    assert exact.sample_step_m < half.sample_step_m < estimated.sample_step_m
 
 
-def test_surfaces_are_smoothest_at_first():
-    few = TrainConfig.for_budget(60.0, footprint_m=0.004, frames=8)
-    weights = [few.density_tv_weight_at(share) for share in (0.0, 0.5, 1.0)]
-    assert weights[2] == few.density_tv_weight < weights[1] < weights[0]
-    assert weights[0] == pytest.approx(1.5**3 * few.density_tv_weight)
+@pytest.mark.parametrize("name", ESTIMATED_POSE_PRIORS)
+def test_priors_of_firm_surfaces_grow_with_the_uncertainty_of_the_poses(name):
+    exact, some, half = (
+        getattr(TrainConfig.for_budget(60.0, footprint_m=0.004, pose_uncertainty=share), name)
+        for share in (0.0, 0.25, 0.5)
+    )
+    assert exact == 0.0
+    assert half == pytest.approx(2.0 * some)
+    assert some > 0.0
+
+
+def test_uncertain_poses_are_corrected_whatever_their_rays_agree_on():
+    assert TrainConfig(pose_uncertainty=0.1).poses_may_be_exact
+    assert not TrainConfig(pose_uncertainty=0.9).poses_may_be_exact
 
 
 def test_edges_may_be_as_steep_as_the_finest_cells_are_fine():

@@ -1,7 +1,4 @@
-"""Occupancy: what is dense stays, what is empty goes, thin surfaces are not forgotten.
-
-Between the legs, off the skin: where few photographs leave webs.
-"""
+"""Occupancy: what is dense stays, what is empty goes, thin surfaces are not forgotten."""
 
 import math
 
@@ -16,9 +13,8 @@ from avatar.occupancy_grid import (
     OccupancyGrid,
     dilate,
     find_floaters,
-    inner_leg_cells,
 )
-from avatar.rig import PART_OF_JOINT
+from avatar.rig import CLOTHING_BAND_M
 
 CPU = torch.device("cpu")
 STEP_M = 0.01
@@ -154,36 +150,11 @@ def test_solid_points_lie_deep_under_the_skin(rig, occupancy, generator):
     assert (rig.skin_distance[tuple(cell.T.numpy())] > INTERIOR_DEPTH_M).all()
 
 
-def cell_at(rig, point):
-    cells = np.array(rig.skin_distance.shape)
-    place = ((point - rig.box_low) / (rig.box_high - rig.box_low) * cells).astype(int)
-    return int(np.ravel_multi_index(place, rig.skin_distance.shape))
-
-
-def knees(rig):
-    """Where they are in canonical space."""
-    return [rig.seeds[rig.seed_parts == PART_OF_JOINT[joint]].mean(axis=0) for joint in (4, 5)]
-
-
-def test_the_middle_of_the_knees_is_between_legs_and_what_is_before_or_beside_them_is_not(rig):
-    left, right = knees(rig)
-    middle = 0.5 * (left + right)
-    ahead, beside = left + np.array([0.0, 0.0, 0.14]), left + (left - right) * 0.7
-    cells = np.array([cell_at(rig, point) for point in (middle, ahead, beside)])
-    np.testing.assert_array_equal(inner_leg_cells(rig, cells), [True, False, False])
-
-
-def test_nothing_near_the_skin_or_under_it_is_between_legs(rig):
-    cells = np.flatnonzero(rig.skin_distance <= 0.08)
-    found = cells[inner_leg_cells(rig, cells)]
-    assert 0.01 * len(cells) < len(found) < 0.2 * len(cells)
-    assert rig.skin_distance.reshape(-1)[found].min() > OFF_SKIN_M
-    assert not rig.inside_skin.reshape(-1)[found].any()
-
-
-def test_points_are_drawn_between_the_legs(rig, generator):
+def test_points_off_the_skin_are_where_no_clothes_are(rig, generator):
     occupancy = OccupancyGrid(rig, torch.device("cpu"))
-    points = occupancy.sample_inner_leg(200, generator).numpy()
-    cells = np.array([cell_at(rig, point) for point in points])
-    assert len(points) == 200
-    assert inner_leg_cells(rig, cells).all()
+    points = occupancy.sample_off_skin(500, generator)
+    cell = ((points - occupancy.density_grid.low) * occupancy.density_grid.cells_per_m).long()
+    distance = rig.skin_distance[tuple(cell.T.numpy())]
+    assert len(points) == 500
+    assert ((distance > OFF_SKIN_M) & (distance <= CLOTHING_BAND_M)).all()
+    assert not rig.inside_skin[tuple(cell.T.numpy())].any()

@@ -31,6 +31,7 @@ from apps.report.report_writer import (
     play_command,
     webp_data_uri,
 )
+from avatar.evaluation.all_round_verdict import AllRoundVerdict
 from avatar.events import HeldOutScore
 from preprocess.observation import DroppedFrame
 
@@ -78,8 +79,15 @@ def report(**changes):
             inbox_depth=Percentiles(p50=0.0, p95=2.0),
         ),
         "package": None,
+        "all_round": judged(None),
     }
     return Report(**{**content, **changes})
+
+
+def judged(held_out):
+    return AllRoundVerdict.of(
+        held_out, seen=0.99, half_transparent=0.08, player_psnr=44.0, film_advice="Turn."
+    )
 
 
 def scores(*values):
@@ -256,6 +264,7 @@ def failed(*, steps, video="my clip.mp4", overlap=0.9):
     return replace(
         given,
         held_out=note,
+        all_round=judged("failed"),
         training=replace(given.training, steps=steps),
         command={"video": video, "poses": "p.npz", "masks": None, "cameras": "solve"},
     )
@@ -280,10 +289,16 @@ def test_nothing_has_failed_during_training():
     assert format_psnr(None, None) == "n/a"
 
 
-def test_an_avatar_that_is_good_in_fitted_poses_has_not_failed():
-    fitted = replace(HeldOutStats.of(scores((23.0, 18.0)), (64, 48)), verdict="soft")
-    kept = replace(failed(steps=900), held_out_refined=fitted)
-    assert kept.verdict == "soft"
+def test_an_avatar_of_one_side_is_not_called_sharp():
+    one_sided = AllRoundVerdict.of(
+        "sharp", seen=0.45, half_transparent=0.11, player_psnr=40.0, film_advice="Turn round."
+    )
+    kept = replace(report(), all_round=one_sided)
+    assert kept.verdict == "blurred"
+    assert json.loads(kept.to_json())["all_round"]["limit"] == "filmed"
+    page = report_page(kept, name="clip")
+    assert "55% of the skin was not filmed" in page
+    assert "Turn round." in page
     assert diagnose_failure(kept) is None
 
 

@@ -55,6 +55,7 @@ def score(held_out, monkeypatch):
         black[..., 3] = held_out[0].observation.alpha
         worse = replace(score_rendering(black, held_out[0]), psnr=0.0)
         monkeypatch.setattr(final_scoring, "render", lambda *_, **__: black)
+        monkeypatch.setattr(final_scoring, "render_unfilmed_views", lambda *_: [black])
         monkeypatch.setattr(PixelSample, "score", lambda sample, _: sample.score_rendering(black))
         monkeypatch.setattr(final_scoring, "fit_test_poses", lambda trainer, frames: iter(frames))
         monkeypatch.setattr(final_scoring, "score_frame", lambda *_: worse)

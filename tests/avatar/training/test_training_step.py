@@ -26,10 +26,10 @@ FIRM_SHARE = 0.25
 CONFIG = TrainConfig(
     rays=200, sample_step_m=0.02, finest_m=0.03, table_size=1 << 12, levels=4,
     empty_space_points=32, empty_space_weight=0.3, hard_surface_weight=0.1, density_tv_weight=0.2,
-    density_tv_pairs=16, initial_density_tv_factor=3.0, double_well_weight=0.4,
+    density_tv_pairs=16, double_well_weight=0.4,
     interior_weight=0.1, interior_points=24, max_samples=256,
     density_slope_weight=0.2, color_tv_weight=0.3, smoothness_pairs=40,
-    inner_leg_weight=0.5, inner_leg_points=20, faint_gradient_share=0.0,
+    off_skin_weight=0.5, off_skin_points=20, unseen_weight=0.0, faint_gradient_share=0.0,
 )  # fmt: skip
 
 
@@ -65,12 +65,12 @@ def mean_loss(trainer, parameters, samples, empty, pairs, solid, close, gaps, ba
     of_empty, of_pairs, of_solid, *_ = opacity.split(parts)
     loss = loss + CONFIG.empty_space_weight * of_empty.mean()
     if len(gaps):
-        loss = loss + CONFIG.inner_leg_weight * raw[-len(gaps) :, 3].clamp(min=0.0).mean()
+        loss = loss + CONFIG.off_skin_weight * raw[-len(gaps) :, 3].clamp(min=0.0).mean()
     loss = loss - CONFIG.interior_weight * of_solid.log().mean()
     if len(pairs) == 0:
         return loss
     one, other = of_pairs.chunk(2)
-    variation = 0.2 * 3.0**0.75 * (one - other).abs().mean()
+    variation = 0.2 * (one - other).abs().mean()
     return loss + variation + 0.4 * FIRM_SHARE * (of_pairs * (1.0 - of_pairs)).mean()
 
 
@@ -107,7 +107,7 @@ def one_step(trainer, backend):
     pairs = torch.cat([samples.points[chosen], samples.points[chosen] + apart])
     solid = occupancy.sample_interior(CONFIG.interior_points, generator)
     close = radiance_field.sample_smoothness_pairs(samples.points, CONFIG, generator)
-    gaps = occupancy.sample_inner_leg(CONFIG.inner_leg_points, generator)
+    gaps = occupancy.sample_off_skin(CONFIG.off_skin_points, generator)
     grads = [parameter.grad.clone() for parameter in field.parameters()]
     return grads, (samples, empty, pairs, solid, close, gaps, batch)
 

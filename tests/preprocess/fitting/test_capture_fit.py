@@ -12,7 +12,7 @@ def fit() -> CaptureFit:
     corrections[:, 0] = 0.1
     return CaptureFit(
         coefficients=np.arange(3.0), focal_factor=1.05, corrections=corrections,
-        error_before_cm=1.6, error_after_cm=0.7, taken=True, fits_body=False,
+        error_before_cm=1.6, error_after_cm=0.7, share=0.9, fits_body=False,
     )  # fmt: skip
 
 

@@ -95,7 +95,7 @@ def fit(lifted):
 
 def test_the_fit_brings_lifted_poses_near_the_truth(lifted, truth, fit):
     fitted = apply_fit(lifted, fit)
-    assert fit.taken
+    assert fit.share == 1.0
     assert fit.error_after_cm < 0.6 * fit.error_before_cm
     assert error_mm(fitted, truth) < 0.85 * error_mm(lifted, truth)
     assert error_mm(fitted, truth) < 40.0
@@ -120,7 +120,7 @@ def test_fitted_poses_are_read_as_they_were_written(lifted, fit, tmp_path):
 
 def test_a_fit_without_masks_takes_the_key_points_alone(lifted, truth):
     alone = fit_capture(replace(lifted, masks=None))
-    assert alone.taken
+    assert alone.share == 1.0
     assert error_mm(apply_fit(lifted, alone), truth) < 0.95 * error_mm(lifted, truth)
 
 

@@ -1,0 +1,84 @@
+"""What the frames have shown of the skin: how squarely each of its patches was seen.
+
+A patch is a seed of the rig, about 2 cm wide. Evidence only grows, costs a millisecond a frame, and
+needs no image but the frame's mask.
+"""
+
+from dataclasses import replace
+from typing import final
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from avatar.rig import Rig
+from avatar.training.frame_stream import TrainingFrame
+from preprocess.body.body_surface import visible_points
+
+OCCLUSION_CELL_M = 0.03
+"""Cell size of the depth buffer for self-occlusion, metres."""
+OCCLUSION_TOLERANCE_M = 0.03
+"""Depth by which a patch may lie behind the buffer and still be visible, metres."""
+MIN_PERSON_ALPHA = 127
+"""Alpha of 255 above which a pixel shows the person."""
+UNSEEN_COSINE, SEEN_COSINE = 0.1, 0.4
+"""Cosines between normal and view direction up to which a patch counts as not seen (84°), and from
+which it counts as seen (66°)."""
+
+
+@final
+class SkinEvidence:
+    """Evidence of each patch of a rig's skin.
+
+    Attributes:
+        cosines: Largest cosine at which each patch was seen, in [0, 1]; 0 if it never was.
+    """
+
+    cosines: Float32[np.ndarray, "seeds"]
+
+    def __init__(self, rig: Rig) -> None:
+        """Starts with every patch unseen."""
+        self._rig = rig
+        self._weights = rig.weights_at(rig.seeds)
+        self.cosines = np.zeros(len(rig.seeds), dtype=np.float32)
+
+    def add(self, frame: TrainingFrame) -> None:
+        """Takes in what a frame shows: patches that face the camera, unoccluded, in the mask."""
+        blends = self._rig.body_from_canonical(frame.pose.joint_rotations)[:, :3].reshape(24, 12)
+        blends = (self._weights @ blends.astype(np.float32)).reshape(-1, 3, 4)
+        points = np.einsum("pab,pb->pa", blends[..., :3], self._rig.seeds) + blends[..., 3]
+        normals = np.einsum("pab,pb->pa", blends[..., :3], self._rig.seed_normals)
+        to_camera = frame.origin - points
+        cosines = np.einsum("pa,pa->p", to_camera, normals) / np.maximum(
+            np.linalg.norm(to_camera, axis=1) * np.linalg.norm(normals, axis=1), 1e-9
+        )
+        in_camera = -to_camera @ frame.body_from_camera
+        depths = in_camera[:, 2]
+        if depths.min() <= 0.0:  # a person behind the camera is not in the image either
+            return
+        shown = visible_points(
+            in_camera[:, :2] / depths[:, None] * depths.mean(), depths, cosines,
+            cell_m=OCCLUSION_CELL_M, tolerance_m=OCCLUSION_TOLERANCE_M,
+        )  # fmt: skip
+        shown &= _lies_in_mask(in_camera, frame)
+        np.maximum(self.cosines, np.where(shown, cosines, 0.0), out=self.cosines)
+
+    @property
+    def seen(self) -> Float32[np.ndarray, "seeds"]:
+        """How far each patch was seen, in [0, 1]: a smooth step of its cosine."""
+        share = (self.cosines - UNSEEN_COSINE) / (SEEN_COSINE - UNSEEN_COSINE)
+        share = np.clip(share, 0.0, 1.0)
+        return (share * share * (3.0 - 2.0 * share)).astype(np.float32)
+
+
+def _lies_in_mask(
+    in_camera: Float[np.ndarray, "points 3"], frame: TrainingFrame
+) -> Bool[np.ndarray, "points"]:
+    """Whether the pixels onto which points in camera axes fall show the person."""
+    camera = replace(frame.view.camera, camera_from_world=np.eye(4))
+    width, height = camera.size_px
+    column, row = np.floor(camera.project(in_camera)).astype(np.int64).T
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    near = np.unpackbits(frame.view.near_person_bits, count=width * height)
+    alpha = np.zeros(width * height, dtype=np.uint8)
+    alpha[near > 0] = frame.colors[:, 3]
+    return inside & (alpha[(row * width + column) * inside] > MIN_PERSON_ALPHA)

@@ -1,0 +1,289 @@
+"""Skin that no frame shows looks like skin that frames show: mirrored, or the same garment's.
+
+Rays say nothing about the side that was never filmed. There each canonical point is given a source,
+a point whose color and density it is drawn to as far as it is unseen and the source is seen:
+
+1. the mirrored point on the other side of the body (people are symmetric);
+2. the point in front of, or behind, the limb's bone, on the same garment (but never a face);
+3. the nearest point around the limb at the same height, so that stripes go round.
+
+The source of a patch is the candidate of the least cost: the distance to it, in which lengths along
+the bone count more than those around it, a price for each kind of reflection, and a price for
+candidates that were themselves seen poorly.
+"""
+
+from typing import NamedTuple, final
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Int
+from scipy.spatial import KDTree
+from torch import Tensor
+
+from avatar.rig import CLOTHING_BAND_M, Rig
+from avatar.training.frame_stream import TrainingFrame
+from avatar.training.skin_evidence import SkinEvidence
+from preprocess.body.kinematics import body_from_rest
+
+BONE_OF_PART = (
+    (0, 12), (1, 4), (2, 5), (4, 7), (5, 8), (7, 10), (8, 11), (12, 15), (16, 18), (17, 19),
+    (18, 20), (19, 21), (20, 22), (21, 23),
+)  # fmt: skip
+"""Joints at both ends of each body part's bone."""
+MIRRORED_PART = np.array([0, 2, 1, 4, 3, 6, 5, 7, 9, 8, 11, 10, 13, 12])
+"""The part on the other side of the body."""
+SIDES_OF_BODY = ((1, 2), (4, 5), (16, 17), (18, 19))
+"""Pairs of left and right joints, which lie symmetrically."""
+HEAD, FEET = 7, (5, 6)
+"""Parts whose front and back are not alike."""
+MIRROR_COST_M = 0.03
+"""Price of the mirrored side, as a distance around the limb, metres."""
+REVERSE_COST_M = 0.08
+"""Price of the limb's other face, metres."""
+FACE_COST_M = 1.0
+"""Price of a face as the source of anything but a face, metres."""
+UNSEEN_COST_M = 0.2
+"""Price of a source that is unseen itself, metres."""
+ALONG_BONE_FACTOR = 4.0
+"""Factor of lengths along the bone."""
+MAX_COST_M = 0.6
+"""Cost from which a source counts nothing, metres; its weight falls from half of it on."""
+MIN_SOURCE_SEEN = 0.5
+"""How far a source must have been seen."""
+MIN_WEIGHT = 0.02
+"""Weight below which a patch is left to its rays."""
+
+
+class Sources(NamedTuple):
+    """Where each patch's color and density come from.
+
+    Attributes:
+        patch: Patch that is the source.
+        reflection: 0: none, the source lies around the limb; 1: mirrored; 2: the limb's other face;
+            3: both.
+        weight: How strongly the patch is drawn to it, in [0, 1].
+    """
+
+    patch: Int[np.ndarray, "seeds"]
+    reflection: Int[np.ndarray, "seeds"]
+    weight: Float32[np.ndarray, "seeds"]
+
+
+class SourcePairs(NamedTuple):
+    """Points of unseen skin and their sources.
+
+    Attributes:
+        points: Canonical points, then their sources.
+        weights: How strongly each point is drawn to its source, in [0, 1].
+    """
+
+    points: Float32[Tensor, "points 3"]
+    weights: Float32[Tensor, "pairs"]
+
+    @classmethod
+    def none(cls) -> "SourcePairs":
+        """No pairs."""
+        return cls(torch.empty(0, 3), torch.empty(0))
+
+
+class _BoneFrames(NamedTuple):
+    """Origin and axes (forward, sideways, along the bone) of each part, canonical."""
+
+    origin: Float[np.ndarray, "14 3"]
+    axes: Float[np.ndarray, "14 3 3"]
+
+    @classmethod
+    def of(cls, rig: Rig) -> "_BoneFrames":
+        """The frames of a rig's bones; forward is as near to the chest's as the bone allows."""
+        transforms = body_from_rest(rig.rest_joints, rig.parents, rig.canonical_rotations)
+        joints = np.einsum("jab,jb->ja", transforms[:, :3, :3], rig.rest_joints)
+        joints += transforms[:, :3, 3]
+        start, end = joints[np.array(BONE_OF_PART)].transpose(1, 0, 2)
+        along = end - start
+        along[HEAD] = (0.0, 1.0, 0.0)
+        along[list(FEET)] = (0.0, 1.0, 0.0)
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
+        forward = np.array([0.0, 0.0, 1.0]) - along[:, 2:] * along
+        forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+        axes = np.stack([forward, np.cross(along, forward), along], axis=1)
+        return cls(start, axes)
+
+    def to_bone(
+        self, points: Float[np.ndarray, "points 3"], parts: Int[np.ndarray, "points"]
+    ) -> Float[np.ndarray, "points 3"]:
+        """Canonical points in the frames of their parts' bones."""
+        return np.einsum("pab,pb->pa", self.axes[parts], points - self.origin[parts])
+
+    def from_bone(
+        self, points: Float[np.ndarray, "points 3"], parts: Int[np.ndarray, "points"]
+    ) -> Float[np.ndarray, "points 3"]:
+        """Canonical points of points in the frames of bones."""
+        return np.einsum("pba,pb->pa", self.axes[parts], points) + self.origin[parts]
+
+
+@final
+class UnseenSkin:
+    """Draws points of unseen skin with their sources.
+
+    Attributes:
+        evidence: What frames have shown.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        """Starts with everything unseen, and so without any source."""
+        self.evidence = SkinEvidence(rig)
+        self._rig, self._frames = rig, _BoneFrames.of(rig)
+        sides = rig.rest_joints[np.array(SIDES_OF_BODY)][..., 0]
+        self._middle_x = float(sides.mean())
+        near = (rig.skin_distance <= CLOTHING_BAND_M).reshape(-1)
+        self._cells = np.flatnonzero(near)
+        self._shape = rig.skin_distance.shape
+        centers = np.stack(np.unravel_index(self._cells, rig.skin_distance.shape), axis=1) + 0.5
+        _, seed = KDTree(rig.seeds).query(rig.box_low + centers / rig.cells_per_m, workers=1)
+        self._seed_of_cell = np.full(near.size, -1, dtype=np.int32)
+        self._seed_of_cell[self._cells] = seed
+        self._sources: Sources | None = None
+        self._is_stale = True
+        self._drawn_from = self._cells[:0]
+
+    def add(self, frame: TrainingFrame) -> None:
+        """Takes in what a frame shows; sources follow at the next `update`."""
+        self.evidence.add(frame)
+        self._is_stale = True
+
+    def update(self) -> None:
+        """Finds the sources anew, if frames have been added since the last time."""
+        if not self._is_stale:
+            return
+        self._sources = find_sources(self._rig, self._frames, self.evidence.seen, self._middle_x)
+        weights = self._sources.weight[self._seed_of_cell[self._cells]]
+        self._drawn_from = self._cells[weights > MIN_WEIGHT]
+        self._is_stale = False
+
+    @property
+    def sources(self) -> Sources | None:
+        """Sources of all patches, as of the last update."""
+        return self._sources
+
+    def sample(self, count: int, generator: torch.Generator) -> SourcePairs:
+        """Random points of unseen skin with their sources, at most `count`."""
+        if self._sources is None or not len(self._drawn_from):
+            return SourcePairs.none()
+        device = generator.device
+        drawn = torch.randint(len(self._drawn_from), (count,), generator=generator, device=device)
+        within = torch.rand(count, 3, generator=generator, device=device).cpu().numpy()
+        cells = self._drawn_from[drawn.cpu().numpy()]
+        corner = np.stack(np.unravel_index(cells, self._shape), axis=1)
+        points = (self._rig.box_low + (corner + within) / self._rig.cells_per_m).astype(np.float32)
+        there, found = self._source_points(points, self._seed_of_cell[cells])
+        pairs = np.concatenate([points[found], there[found]])
+        weights = self._sources.weight[self._seed_of_cell[cells[found]]]
+        return SourcePairs(torch.from_numpy(pairs), torch.from_numpy(weights))
+
+    def _source_points(
+        self, points: Float32[np.ndarray, "points 3"], seeds: Int[np.ndarray, "points"]
+    ) -> tuple[Float32[np.ndarray, "points 3"], Bool[np.ndarray, "points"]]:
+        """The sources of points, and whether they lie near the skin."""
+        assert self._sources is not None
+        rig, target = self._rig, self._sources.patch[seeds]
+        normals, reflection = rig.seed_normals[seeds], self._sources.reflection[seeds]
+        heights = ((points - rig.seeds[seeds]) * normals).sum(axis=1)
+        parts = rig.seed_parts[seeds]
+        at = reflect(self._frames, points, parts, reflection, self._middle_x)
+        landed = np.where(reflection > 0, self._seed_at(at), target)
+        found = landed >= 0
+        normal, place = rig.seed_normals[landed], rig.seeds[landed]
+        lift = heights - ((at - place) * normal).sum(axis=1)
+        along = self._frames.axes[rig.seed_parts[target], 2]
+        slide = ((points - place) * along).sum(axis=1, keepdims=True) * along
+        around = place + slide + heights[:, None] * normal
+        there = np.where(
+            np.isin(reflection, (2, 3))[:, None],
+            at + lift[:, None] * normal,
+            np.where((reflection == 1)[:, None], at, around),
+        )
+        return there.astype(np.float32), found
+
+    def _seed_at(self, points: Float[np.ndarray, "points 3"]) -> Int[np.ndarray, "points"]:
+        """The seed nearest to each point; -1 far from the skin."""
+        cell = np.floor((points - self._rig.box_low) * self._rig.cells_per_m).astype(np.int64)
+        inside = ((cell >= 0) & (cell < np.array(self._shape))).all(axis=1)
+        flat = np.ravel_multi_index(tuple(np.where(inside, cell.T, 0)), self._shape)
+        return np.where(inside, self._seed_of_cell[flat], -1)
+
+
+def reflect(
+    frames: _BoneFrames,
+    points: Float[np.ndarray, "points 3"],
+    parts: Int[np.ndarray, "points"],
+    reflection: Int[np.ndarray, "points"],
+    middle_x: float,
+) -> Float[np.ndarray, "points 3"]:
+    """Canonical points mirrored in the body's middle plane, through a limb's bone, or both.
+
+    Args:
+        frames: Frames of the bones.
+        points: Canonical points.
+        parts: Their body parts.
+        reflection: See `Sources`.
+        middle_x: Position of the body's middle plane, metres.
+    """
+    mirrors, reverses = np.isin(reflection, (1, 3)), np.isin(reflection, (2, 3))
+    local = frames.to_bone(points, parts)
+    local[:, 0] = np.where(reverses, -local[:, 0], local[:, 0])
+    out = np.where(reverses[:, None], frames.from_bone(local, parts), points)
+    out[:, 0] = np.where(mirrors, 2.0 * middle_x - out[:, 0], out[:, 0])
+    return out
+
+
+def find_sources(
+    rig: Rig, frames: _BoneFrames, seen: Float32[np.ndarray, "seeds"], middle_x: float
+) -> Sources:
+    """The source of each patch, by the least cost.
+
+    Args:
+        rig: Rig of the person.
+        frames: Frames of its bones.
+        seen: How far each patch was seen, in [0, 1].
+        middle_x: Position of the body's middle plane, metres.
+    """
+    parts = rig.seed_parts.astype(np.int64)
+    best, cost = np.zeros(len(parts), dtype=np.int64), np.full(len(parts), np.inf)
+    kind = np.zeros(len(parts), dtype=np.int64)
+    is_face = _faces(frames, rig)
+    sources = np.flatnonzero(seen > MIN_SOURCE_SEEN)
+    for reflection in range(4):
+        places = reflect(
+            frames, rig.seeds[sources], parts[sources], np.full(len(sources), reflection), middle_x
+        )
+        landed = MIRRORED_PART[parts[sources]] if reflection & 1 else parts[sources]
+        extra = MIRROR_COST_M * (reflection & 1) + REVERSE_COST_M * (reflection >> 1)
+        extra = extra + UNSEEN_COST_M * (1.0 - seen[sources])
+        for part in range(len(BONE_OF_PART)):
+            here = np.flatnonzero((parts == part) & (seen < 1.0))
+            there = np.flatnonzero(landed == part)
+            if not len(here) or not len(there) or (reflection > 1 and part in (HEAD, *FEET)):
+                continue
+            to = frames.to_bone(rig.seeds[here], parts[here])
+            come = frames.to_bone(places[there], landed[there])
+            away = (to[:, None, :] - come[None, :, :]) * (1.0, 1.0, ALONG_BONE_FACTOR)
+            costs = np.linalg.norm(away, axis=2) + extra[there]
+            costs += FACE_COST_M * (is_face[sources[there]][None] & ~is_face[here][:, None])
+            chosen = costs.argmin(axis=1)
+            least = costs[np.arange(len(here)), chosen]
+            better = least < cost[here]
+            cost[here[better]] = least[better]
+            best[here[better]] = sources[there[chosen[better]]]
+            kind[here[better]] = reflection
+    trust = np.clip(2.0 - 2.0 * cost / MAX_COST_M, 0.0, 1.0)
+    weight = np.where(np.isfinite(cost), (1.0 - seen) * trust * seen[best], 0.0)
+    return Sources(best, kind, weight.astype(np.float32))
+
+
+def _faces(frames: _BoneFrames, rig: Rig) -> Bool[np.ndarray, "seeds"]:
+    """Which patches are part of a face: the head's front, below the hairline."""
+    local = frames.to_bone(rig.seeds, rig.seed_parts)
+    head = rig.seed_parts == HEAD
+    height = local[:, 2]
+    top = height[head].max() if head.any() else 0.0
+    return head & (rig.seed_normals[:, 2] > 0.2) & (height < 0.8 * top)

@@ -1,0 +1,172 @@
+"""What frames show of the skin, and where the skin that they do not show gets its looks from."""
+
+import numpy as np
+import pytest
+import torch
+
+from avatar import radiance_field
+from avatar.config import TrainConfig
+from avatar.training import checkpoint
+from avatar.training.frame_stream import prepare_frame
+from avatar.training.skin_evidence import SkinEvidence
+from avatar.training.trainer import Trainer, cosine_decay
+from avatar.training.unseen_skin import HEAD, MIN_WEIGHT, UnseenSkin
+
+CPU = torch.device("cpu")
+TORSO, LEFT_THIGH, LEFT_FOREARM, RIGHT_FOREARM = 0, 1, 10, 11
+
+
+@pytest.fixture(scope="module")
+def generator_seed():
+    return 3
+
+
+@pytest.fixture
+def frame(observed, rig):
+    """A frame of the body, turned by an angle about the vertical."""
+    return lambda turned=0.0, **more: prepare_frame(observed(turned=turned, **more), rig)
+
+
+@pytest.fixture
+def of_front(rig, frame):
+    unseen = UnseenSkin(rig)
+    unseen.add(frame())
+    unseen.update()
+    return unseen
+
+
+def facing(rig, part, z):
+    """Patches of a part whose skin faces a direction along z."""
+    return (rig.seed_parts == part) & (rig.seed_normals[:, 2] * z > 0.7)
+
+
+def test_a_frame_shows_the_side_that_faces_its_camera(rig, frame):
+    evidence = SkinEvidence(rig)
+    evidence.add(frame())
+    assert evidence.seen[facing(rig, TORSO, 1.0)].mean() > 0.95
+    assert not evidence.seen[facing(rig, TORSO, -1.0)].any()
+    evidence.add(frame(turned=np.pi))
+    assert evidence.seen[facing(rig, TORSO, -1.0)].mean() > 0.95
+
+
+def test_skin_outside_the_mask_or_the_picture_is_not_seen(rig, frame):
+    alpha = np.ones((200, 200), dtype=np.float32)
+    alpha[:100] = 0.0
+    cut = SkinEvidence(rig)
+    cut.add(frame(alpha=alpha))
+    whole = SkinEvidence(rig)
+    whole.add(frame())
+    head = facing(rig, HEAD, 1.0)
+    assert whole.seen[head].mean() > 0.9
+    assert not cut.seen[head].any()
+    away = SkinEvidence(rig)
+    away.add(frame(up_m=30.0))
+    assert not away.seen.any()
+
+
+def test_the_back_is_drawn_to_the_front_and_the_front_to_nothing(rig, of_front):
+    sources = of_front.sources
+    back, front = facing(rig, TORSO, -1.0), facing(rig, TORSO, 1.0)
+    assert sources.weight[back].mean() > 0.8
+    assert sources.weight[front].mean() < 0.05
+    assert (of_front.evidence.seen[sources.patch[back]] > 0.5).all()
+    apart = rig.seeds[back] - rig.seeds[sources.patch[back]]
+    assert np.abs(apart[:, 1]).mean() < 0.03  # stripes go round
+
+
+def test_a_back_of_the_head_is_no_face(rig, of_front):
+    behind = facing(rig, HEAD, -1.0)
+    sources = rig.seed_normals[of_front.sources.patch[behind], 2]
+    cheeks = (
+        rig.seeds[of_front.sources.patch[behind], 1] < rig.seeds[rig.seed_parts == HEAD, 1].mean()
+    )
+    assert ((sources < 0.2) | ~cheeks).all()
+
+
+def test_a_hidden_arm_looks_like_the_other_one(rig, frame):
+    unseen = UnseenSkin(rig)
+    for turned in np.linspace(0.0, 2.0 * np.pi, 12):
+        unseen.add(frame(turned=turned))
+    unseen.evidence.cosines[rig.seed_parts == LEFT_FOREARM] = 0.0
+    unseen.update()
+    hidden = rig.seed_parts == LEFT_FOREARM
+    sources = unseen.sources
+    assert (rig.seed_parts[sources.patch[hidden]] == RIGHT_FOREARM).mean() > 0.9
+    assert (sources.reflection[hidden] % 2 == 1).mean() > 0.9
+    mirrored = rig.seeds[sources.patch[hidden]] * [-1.0, 1.0, 1.0]
+    assert np.linalg.norm(mirrored - rig.seeds[hidden], axis=1).mean() < 0.05
+
+
+def test_points_and_sources_are_as_far_from_the_skin(rig, of_front, generator):
+    pairs = of_front.sample(2000, generator)
+    points, sources = pairs.points.numpy().reshape(2, -1, 3)
+    assert len(points) > 1500
+    assert (pairs.weights > MIN_WEIGHT).all()
+
+    def distance(places):
+        cell = ((places - rig.box_low) * rig.cells_per_m).astype(int)
+        return rig.skin_distance[tuple(cell.clip(0, np.array(rig.skin_distance.shape) - 1).T)]
+
+    assert np.abs(distance(points) - distance(sources)).mean() < 0.015
+
+
+def test_nothing_is_drawn_before_anything_was_seen(rig, generator):
+    unseen = UnseenSkin(rig)
+    assert not len(unseen.sample(100, generator).points)
+    unseen.update()
+    assert not len(unseen.sample(100, generator).points)
+
+
+def test_the_gradient_is_that_of_cross_entropy_to_a_source_that_stands_still(generator):
+    raw = torch.randn(12, 4, generator=generator)
+    raw[:, 3] += 4.0
+    weights = torch.rand(6, generator=generator)
+    found = radiance_field.source_gradient(raw, weights, 0.7)
+    free = raw[:6].clone().requires_grad_()
+    opacity = 1.0 - torch.exp(-torch.exp(raw[6:, 3]) * radiance_field.OPACITY_LENGTH_M)
+    target = (0.5 + radiance_field.SOURCE_STEEPNESS * (opacity - 0.5)).clamp(0.0, 1.0)
+    color = torch.nn.functional.binary_cross_entropy_with_logits(
+        free[:, :3], torch.sigmoid(raw[6:, :3]), reduction="none"
+    ).sum(dim=1)
+    (expected,) = torch.autograd.grad((0.7 * weights * opacity * color).mean(), free)
+    torch.testing.assert_close(found[:6, :3], expected[:, :3])
+    mine = 1.0 - torch.exp(-torch.exp(raw[:6, 3]) * radiance_field.OPACITY_LENGTH_M)
+    torch.testing.assert_close(found[:6, 3], 0.7 * weights * (mine - target) / 6)
+    assert not found[6:].any()
+
+
+def test_unseen_skin_becomes_like_its_sources(rig, clip, generator):
+    """Front views alone: opacity and color of points and sources, with the loss and without."""
+    front = [seen for seen in clip.observations if abs(seen.pose.root_rotation[1]) < 0.8]
+    assert len(front) >= 2
+    apart = []
+    for weight in (0.0, 0.1):
+        config = TrainConfig(
+            rays=256, finest_m=0.02, table_size=1 << 13, sample_step_m=0.015,
+            unseen_weight=weight, refine_poses=False,
+        )  # fmt: skip
+        trainer = Trainer(rig, config, CPU)
+        for seen in front:
+            trainer.add_frame(prepare_frame(seen, rig))
+        for step in range(300):
+            trainer.step(rate=cosine_decay(step / 300), hard_surface_share=1.0)
+        pairs = trainer.unseen.sample(4000, generator)
+        raw = trainer.field.raw_outputs_at(pairs.points)
+        opacity = 1.0 - torch.exp(-torch.exp(raw[:, 3].clamp(max=9.0)) * 0.01)
+        points, sources = opacity.chunk(2)
+        colors, source_colors = torch.sigmoid(raw[:, :3]).chunk(2)
+        apart.append([
+            float((points - sources).abs().mean()),
+            float((sources[:, None] * (colors - source_colors).abs()).mean()),
+        ])  # fmt: skip
+    (opacity_without, color_without), (opacity_with, color_with) = apart
+    assert opacity_with < 0.92 * opacity_without
+    assert color_with < 0.8 * color_without
+
+
+def test_a_checkpoint_keeps_what_was_seen(rig, frame, tmp_path):
+    trainer = Trainer(rig, TrainConfig(table_size=1 << 12, levels=4, finest_m=0.03), CPU)
+    trainer.add_frame(frame())
+    checkpoint.save(trainer, tmp_path)
+    loaded, _ = checkpoint.load(tmp_path, CPU)
+    np.testing.assert_array_equal(loaded.unseen.evidence.cosines, trainer.unseen.evidence.cosines)
