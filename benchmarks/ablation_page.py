@@ -222,17 +222,22 @@ def _loss(full: MechanismScore, without: MechanismScore) -> list[float]:
 
 
 def _loss_text(full: MechanismScore, without: MechanismScore) -> str:
-    """`_loss`, and how much less the player is like the renderer, if it was exported."""
+    """`_loss`, how much less the player is like the renderer, and how much more is fog."""
     losses = _loss(full, without)
     if full.player is not None and without.player is not None:
         losses.append(full.player - without.player)
-    return " / ".join(f"{loss:+.2f}" for loss in losses)
+    text = " / ".join(f"{loss:+.2f}" for loss in losses)
+    if full.half_transparent is None or without.half_transparent is None:
+        return text
+    return f"{text}, {100.0 * (without.half_transparent - full.half_transparent):+.1f} % fog"
 
 
 def _levels(score: MechanismScore) -> str:
     novel = "" if score.novel is None else f"{score.novel:.2f} dB novel, "
     player = "" if score.player is None else f", player to renderer {score.player:.2f} dB"
-    return f"{novel}{score.held_out:.2f} dB held out{player}"
+    fog = score.half_transparent
+    firm = "" if fog is None else f", {100.0 * fog:.1f} % of the pixels half transparent"
+    return f"{novel}{score.held_out:.2f} dB held out{player}{firm}"
 
 
 def written(mark: str, lines: Sequence[str], path: Path) -> str:

@@ -24,6 +24,7 @@ from apps.run.session_start import new_trainer
 from avatar.avatar_model import Avatar
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.evaluation.image_metrics import composite_on_white, psnr
+from avatar.evaluation.unfilmed_views import half_transparent_share, render_unfilmed_views
 from avatar.render import render
 from avatar.training.held_out_pose_fitting import fit_test_poses
 from avatar.training.trainer import Trainer, cosine_decay
@@ -176,11 +177,6 @@ FEW_FRAME_MECHANISMS = [
     FULL,
     LONGER,
     Mechanism(
-        name="strong total variation at first",
-        off={"initial_density_tv_factor": 1.0},
-        code=("avatar.config.TrainConfig.density_tv_weight_at",),
-    ),
-    Mechanism(
         name="double well",
         off={"double_well_weight": 0.0},
         code=("avatar.radiance_field.double_well_gradient",),
@@ -204,14 +200,20 @@ FEW_FRAME_MECHANISMS = [
     ),
     Mechanism(name="least density of occupied cells", off={"min_occupied_density": 0.0}),
     Mechanism(
-        name="inner leg",
-        off={"inner_leg_weight": 0.0},
+        name="density off the skin",
+        off={"off_skin_weight": 0.0},
         code=(
             "avatar.radiance_field.log_density_l1_gradient",
-            "avatar.occupancy_grid.OccupancyGrid.sample_inner_leg",
-            "avatar.occupancy_grid.OccupancyGrid._inner_leg_cells",
-            "avatar.occupancy_grid.inner_leg_cells",
-            "avatar.occupancy_grid._nearest_leg_seed",
+            "avatar.occupancy_grid.OccupancyGrid.sample_off_skin",
+        ),
+    ),
+    Mechanism(
+        name="unseen skin",
+        off={"unseen_weight": 0.0},
+        code=(
+            "avatar.radiance_field.source_gradient",
+            "avatar.training.unseen_skin",
+            "avatar.training.skin_evidence",
         ),
     ),
 ]
@@ -228,6 +230,7 @@ class MechanismScore(NamedTuple):
         novel: The same of poses never filmed; None where there are none.
         player: PSNR of the exported player to the renderer in poses never filmed, dB; None where
             it was not exported.
+        half_transparent: Share of half-transparent pixels from four sides of poses never filmed.
     """
 
     name: str
@@ -235,6 +238,7 @@ class MechanismScore(NamedTuple):
     held_out: float
     novel: float | None
     player: float | None = None
+    half_transparent: float | None = None
 
 
 class CaptureScores(NamedTuple):
@@ -341,6 +345,7 @@ def score_mechanisms(
             _fitted_psnr(run.trainer, held_out),
             _fitted_psnr(run.trainer, novel) if novel else None,
             None if dance is None else _player_psnr(run.trainer.avatar, held_out, dance),
+            half_transparent_share(render_unfilmed_views(run.trainer.avatar)),
         )
         print(seed, *score, file=sys.stderr, flush=True)
         yield score

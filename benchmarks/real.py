@@ -194,6 +194,8 @@ def run_figures(run: IngestRun) -> Figures:
         "held out, fitted poses: SSIM": fitted.get("ssim"),
         "core-s before torch is loaded: opening, checks, alignment": run.preparing_core_s,
         "start-up, s": training["startup_seconds"],
+        "skin that was seen, %": 100.0 * report["all_round"]["seen"],
+        "half-transparent pixels, %": 100.0 * report["all_round"]["half_transparent"],
         "steps": float(training["steps"]),
         "core-ms a step": None if in_steps is None else 1e3 * in_steps / training["steps"],
         "share of training's core time in steps, %": None

@@ -152,7 +152,7 @@ class UnseenSkin:
         self._is_stale = True
 
     def update(self) -> None:
-        """Finds the sources anew, if frames have been added since the last time."""
+        """Finds the sources again, if frames have been added since the last time."""
         if not self._is_stale:
             return
         self._sources = find_sources(self._rig, self._frames, self.evidence.seen, self._middle_x)
