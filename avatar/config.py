@@ -92,10 +92,11 @@ class TrainConfig:
     """Points per step at which the interior's opacity is measured."""
     density_tv_pairs: int = 128
     """Pairs of points per step at which the total variation is measured."""
-    unseen_weight: float = 0.03
+    unseen_weight: float = 0.12
     """Weight of the loss that draws unseen skin to its source (`avatar.training.unseen_skin`)."""
-    unseen_points: int = 256
-    """Points per step at which unseen skin is drawn to its source."""
+    unseen_points: int = 512
+    """Points per step at which skin is drawn to its source if all of it is unseen; fewer, as strong
+    each, the more was seen."""
     occupancy_interval: int = 16
     """Steps between updates of the occupancy grid."""
     refine_poses: bool = True

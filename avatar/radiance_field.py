@@ -343,7 +343,7 @@ def color_tv_gradient(
 def source_gradient(
     raw: Float32[Tensor, "points 4"], weights: Float32[Tensor, "pairs"], weight: float
 ) -> Float32[Tensor, "points 4"]:
-    """Gradient of the mean cross-entropy of points to their sources, in opacity and in color.
+    """Gradient of the cross-entropy of points to their sources, in opacity and in color.
 
     Cross-entropy acts where a point is empty and its source is not, too. The sources stand still.
     Their opacity is steepened about one half, so that the copy of a soft surface is firm; their
@@ -352,11 +352,11 @@ def source_gradient(
     Args:
         raw: Raw outputs at the points, then at their sources.
         weights: Weight of each pair, in [0, 1].
-        weight: Weight of the term.
+        weight: Weight of a pair.
     """
     count, color = len(weights), torch.sigmoid(raw[:, :3])
     opacity = OpacityWithSlope.of(raw).value
-    scale = weight / max(count, 1) * weights
+    scale = weight * weights
     source = (0.5 + SOURCE_STEEPNESS * (opacity[count:] - 0.5)).clamp(0.0, 1.0)
     grad = torch.zeros_like(raw)
     grad[:count, :3] = (scale * opacity[count:])[:, None] * (color[:count] - color[count:])

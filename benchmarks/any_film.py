@@ -46,7 +46,7 @@ from export.build import export_avatar
 from export.player import Player, premultiply
 
 CUTS = {"sixth": 6, "third": 3, "half": 2, "all": 1}
-"""Parts of a film, by what they are called: the first one of so many."""
+"""Parts of a film, by what they are called: the first one of this number."""
 SCORED_HELD_OUT = 6
 """Held-out frames that are scored, evenly spread."""
 VALIDATION_VIEWS = 4

@@ -153,8 +153,8 @@ def compute_gradients(
         config.alpha_weight, config.hard_surface_weight * hard_surface_share,
     )  # fmt: skip
     grads = [grad, *_regularization_gradients(raw_asked, asked, config, surface_share)]
-    weights = pairs.weights.to(raw)
-    grads += [radiance_field.source_gradient(raw_asked[-1], weights, config.unseen_weight)]
+    weight = config.unseen_weight / config.unseen_points
+    grads += [radiance_field.source_gradient(raw_asked[-1], pairs.weights.to(raw), weight)]
     drawn, drawn_grads = draw_by_strength(torch.cat(grads), config.faint_gradient_share, generator)
     grad_features = field.backward(seen.rows(drawn), drawn_grads)
     if poses is not None and count:

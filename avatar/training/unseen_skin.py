@@ -50,6 +50,9 @@ MAX_COST_M = 0.6
 """Cost from which a source counts nothing, metres; its weight falls from half of it on."""
 MIN_SOURCE_SEEN = 0.5
 """How far a source must have been seen."""
+NEAR_SKIN_M, NEAR_SKIN_FACTOR = 0.025, 4
+"""Distance from the skin within which points are drawn that factor as often: surfaces lie there.
+"""
 MIN_WEIGHT = 0.02
 """Weight below which a patch is left to its rays."""
 
@@ -143,7 +146,7 @@ class UnseenSkin:
         self._seed_of_cell = np.full(near.size, -1, dtype=np.int32)
         self._seed_of_cell[self._cells] = seed
         self._sources: Sources | None = None
-        self._is_stale = True
+        self._is_stale, self._unseen_share = True, 0.0
         self._drawn_from = self._cells[:0]
 
     def add(self, frame: TrainingFrame) -> None:
@@ -157,7 +160,10 @@ class UnseenSkin:
             return
         self._sources = find_sources(self._rig, self._frames, self.evidence.seen, self._middle_x)
         weights = self._sources.weight[self._seed_of_cell[self._cells]]
-        self._drawn_from = self._cells[weights > MIN_WEIGHT]
+        drawn = self._cells[weights > MIN_WEIGHT]
+        near = drawn[self._rig.skin_distance.reshape(-1)[drawn] < NEAR_SKIN_M]
+        self._drawn_from = np.concatenate([drawn, *[near] * (NEAR_SKIN_FACTOR - 1)])
+        self._unseen_share = len(drawn) / len(self._cells)
         self._is_stale = False
 
     @property
@@ -166,8 +172,9 @@ class UnseenSkin:
         return self._sources
 
     def sample(self, count: int, generator: torch.Generator) -> SourcePairs:
-        """Random points of unseen skin with their sources, at most `count`."""
-        if self._sources is None or not len(self._drawn_from):
+        """Random points of unseen skin with their sources: of `count` the share that is unseen."""
+        count = round(count * self._unseen_share)
+        if self._sources is None or not count:
             return SourcePairs.none()
         device = generator.device
         drawn = torch.randint(len(self._drawn_from), (count,), generator=generator, device=device)
