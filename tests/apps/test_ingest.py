@@ -24,8 +24,8 @@ from capture.atomic_files import write_text_atomically
 from export.player import Player
 
 KEYS = {
-    "": "format verdict command recipe machine frames training held_out held_out_refined all_round curve "
-    "stream package coverage earlier_videos cameras tracking",
+    "": "format verdict command recipe machine frames training held_out held_out_refined all_round "
+    "curve stream package coverage earlier_videos cameras tracking",
     "machine": "device backend threads",
     "frames": "read used held_out dropped near_duplicates not_replayed",
     "training": "wall_seconds cpu_seconds step_cpu_seconds cpu_contention_seconds startup_seconds "
