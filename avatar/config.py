@@ -6,11 +6,9 @@ from dataclasses import dataclass, replace
 
 COARSEST_M = 0.13
 """Cell size of the coarsest hash level, metres: 16 cells along a two-metre box."""
-DETAIL_PIXELS = 1.0
-"""Cell size of the finest level where poses are exact, in pixels on the body."""
-ESTIMATED_DETAIL_PIXELS = 1.55
-"""The same where poses are estimates: finer cells learn their errors, which costs 0.1 to 1.6 dB in
-new poses."""
+ESTIMATED_POSE_DETAIL_M = 0.0075
+"""Smallest detail that frames agree on where poses are estimates, metres: finer cells learn their
+errors, which costs 0.2 to 1.6 dB in new poses, more the longer the training."""
 ESTIMATED_POSE_PRIORS: Mapping[str, float] = {
     "double_well_weight": 0.25, "interior_weight": 0.025, "density_slope_weight": 0.04,
     "color_tv_weight": 0.05, "min_occupied_density": 150.0, "off_skin_weight": 0.05,
@@ -158,8 +156,7 @@ class TrainConfig:
         """
         if seconds is None:
             seconds = 60.0 if steps is None else steps / NOMINAL_STEPS_PER_S
-        coarser = (ESTIMATED_DETAIL_PIXELS - DETAIL_PIXELS) * pose_uncertainty
-        detail_m = (DETAIL_PIXELS + coarser) * footprint_m
+        detail_m = math.hypot(footprint_m, ESTIMATED_POSE_DETAIL_M * pose_uncertainty)
         finest_m = min(max(detail_m, 0.002), COARSEST_M / 2)
         # about four times as many entries as the skin has cells, within what a cache can hold
         entries = 4.0 * 2.0 / finest_m**2

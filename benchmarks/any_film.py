@@ -135,12 +135,15 @@ def track_film(film: Path, folder: Path) -> Path:
 
 
 def spread_frames(folder: Path) -> slice | None:
-    """At most `FILM_FRAMES` of the frames that have a pose, evenly spread; None for all."""
+    """At most `FILM_FRAMES` of the frames that have pose and mask, evenly spread; None for all."""
     with np.load(folder / "poses.npz") as poses:
         numbers = poses["frame"] if "frame" in poses else np.arange(len(poses["transl"]))
+        numbers = numbers[poses["valid"]] if "valid" in poses else numbers
+    masked = [int(path.stem) for path in folder.glob("masks/*") if path.stem.isdecimal()]
+    numbers = np.intersect1d(numbers, masked) if masked else numbers
     if len(numbers) <= FILM_FRAMES:
         return None
-    step = int(numbers[1] - numbers[0]) * -(-len(numbers) // FILM_FRAMES)
+    step = int(np.diff(numbers).min()) * -(-len(numbers) // FILM_FRAMES)
     return slice(int(numbers[0]), int(numbers[-1]) + 1, step)
 
 
