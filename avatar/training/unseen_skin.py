@@ -17,6 +17,7 @@ from typing import NamedTuple, final
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Int
+from scipy.sparse import coo_array
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -53,6 +54,12 @@ MIN_SOURCE_SEEN = 0.5
 NEAR_SKIN_M, NEAR_SKIN_FACTOR = 0.025, 4
 """Distance from the skin within which points are drawn that factor as often: surfaces lie there.
 """
+NEIGHBOR_M = 0.06
+"""Distance within which patches must be unseen, too: rays see the space around a lone one, such as
+the fold of an ear, and know it to be empty."""
+MAX_RISE_M = 0.02
+"""Difference of the distances of a point and its source from the skin above which the pair is left
+out, metres: about ears and fingers a source may lie under the skin of a point that lies off it."""
 MIN_WEIGHT = 0.02
 """Weight below which a patch is left to its rays."""
 
@@ -145,6 +152,13 @@ class UnseenSkin:
         _, seed = KDTree(rig.seeds).query(rig.box_low + centers / rig.cells_per_m, workers=1)
         self._seed_of_cell = np.full(near.size, -1, dtype=np.int32)
         self._seed_of_cell[self._cells] = seed
+        one, other = KDTree(rig.seeds).query_pairs(NEIGHBOR_M, output_type="ndarray").T
+        links = np.concatenate([one, other]), np.concatenate([other, one])
+        shape = (len(rig.seeds), len(rig.seeds))
+        self._neighbors = coo_array((np.ones(len(links[0])), links), shape=shape).tocsr()
+        self._neighbor_counts = self._neighbors.sum(axis=1) + 1.0
+        distance = np.where(rig.inside_skin, -rig.skin_distance, rig.skin_distance)
+        self._signed_distance = distance.reshape(-1)
         self._sources: Sources | None = None
         self._is_stale, self._unseen_share = True, 0.0
         self._drawn_from = self._cells[:0]
@@ -158,7 +172,9 @@ class UnseenSkin:
         """Finds the sources again, if frames have been added since the last time."""
         if not self._is_stale:
             return
-        self._sources = find_sources(self._rig, self._frames, self.evidence.seen, self._middle_x)
+        found = find_sources(self._rig, self._frames, self.evidence.seen, self._middle_x)
+        around = (self._neighbors @ found.weight + found.weight) / self._neighbor_counts
+        self._sources = found._replace(weight=(found.weight * around).astype(np.float32))
         weights = self._sources.weight[self._seed_of_cell[self._cells]]
         drawn = self._cells[weights > MIN_WEIGHT]
         near = drawn[self._rig.skin_distance.reshape(-1)[drawn] < NEAR_SKIN_M]
