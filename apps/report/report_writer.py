@@ -164,7 +164,8 @@ def print_results(
     found = report.all_round
     if found.verdict is not None and found.verdict != "failed":
         console.info(
-            f"The avatar is {found.verdict}." + (f" {found.advice}" if found.advice else "")
+            f"From all sides the avatar is {found.verdict}."
+            + (f" {found.advice}" if found.advice else "")
         )
     if report.package is not None:
         console.print_artifact("package", run.package)
