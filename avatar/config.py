@@ -11,7 +11,7 @@ ESTIMATED_POSE_DETAIL_M = 0.006
 errors, which costs up to 1.6 dB in new poses; at 0.0075 these gain 0.2 dB more, but eyes blur."""
 ESTIMATED_POSE_PRIORS: Mapping[str, float] = {
     "double_well_weight": 0.25, "interior_weight": 0.025, "density_slope_weight": 0.04,
-    "color_tv_weight": 0.05, "min_occupied_density": 150.0, "off_skin_weight": 0.05,
+    "color_tv_weight": 0.05, "min_occupied_density": 150.0, "off_skin_weight": 0.1,
 }  # fmt: skip
 """Priors of firm and smooth surfaces where poses are estimates; they grow with the uncertainty. Fog
 imitates views in poses that are off: together they cost an exact actor 0.8 to 1.4 dB in new poses,
