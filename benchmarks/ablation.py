@@ -3,9 +3,9 @@
     python -m benchmarks.ablation [--tables mechanisms|paper] [--few CAPTURE] [--keep FOLDER]
         [--seconds S] [--quick] [--json FILE] [--write docs/ablation.md]
 
-First, each mechanism is left out in turn on phone-like films, and each few-frame prior on few
-frames of one and on a capture of your own (`benchmarks.mechanisms`). Then the paper's tables on an
-exact sample: losses, empty-space skipping, root finding, refinement; all variants of a table are
+First, each mechanism is left out in turn on phone-like films, and each prior of estimated poses on
+few frames of one and of a capture of your own (`benchmarks.mechanisms`). Then the paper's tables on
+an exact sample: losses, empty-space skipping, root finding, refinement; all variants of a table are
 trained in turns in one process, with one thread, each for the same seconds of one core and then
 again for the same number of steps, and scored by the exact renderer on held-out frames and on poses
 that were never filmed. There are no thresholds here.
@@ -116,7 +116,7 @@ class Ablation:
     seeds: tuple[int, ...] = (0,)
     """Of training, for the mechanisms."""
     few: Path | None = None
-    """Capture of a few photographs, for the few-frame priors."""
+    """Capture of a few photographs, for the priors of estimated poses."""
     quick: bool = False
     """Two seconds and twenty steps each: whether it runs, not what comes out."""
     size: int = 128
@@ -174,7 +174,7 @@ def show(job: Ablation, mark: str, lines: list[str]) -> None:
 
 
 def run_mechanisms(job: Ablation, folder: Path) -> Iterator[CaptureScores]:
-    """The mechanisms on phone-like films, then the few-frame priors on few frames."""
+    """The mechanisms on phone-like films, then the priors of estimated poses on few frames."""
     films = [film_by_phone(folder, subject, quick=job.quick) for subject in job.subjects]
     few = [films[-1], *([job.few] if job.few is not None else [])]
     for capture, frames in [*((film, None) for film in films), *((each, FEW) for each in few)]:

@@ -300,7 +300,7 @@ def measured_scores(
         kept: File of the scores, JSON.
         size_px: Longer side, pixels.
         steps, seed: Of training.
-        frames: How few of its frames are used, to leave out few-frame priors; all if None.
+        frames: How few of its frames are used, to leave out priors of estimated poses; all if None.
         dance: File of the poses in which the exported player is compared with the renderer.
     """
     if not kept.exists():

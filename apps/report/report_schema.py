@@ -303,16 +303,8 @@ class Report:
         """Return the text of report.json; NaN and infinity become null."""
         content = to_json_value(dataclasses.asdict(self) | {"verdict": self.verdict})
         order = ("format", "verdict", "command", "recipe", "machine", "frames", "training")
-        order += (
-            "held_out",
-            "held_out_refined",
-            "all_round",
-            "curve",
-            "stream",
-            "package",
-            "coverage",
-        )
-        order += ("earlier_videos", "cameras", "tracking")
+        order += ("held_out", "held_out_refined", "all_round", "curve", "stream", "package")
+        order += ("coverage", "earlier_videos", "cameras", "tracking")
         return json.dumps({key: content[key] for key in order}, indent=1, allow_nan=False) + "\n"
 
 

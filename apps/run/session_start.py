@@ -292,8 +292,9 @@ def _check_same_body(trainer: Trainer, capture: Capture, run: RunFolder) -> None
 
 def _announce_coverage(capture: Capture, console: Console) -> None:
     """Print what a recording will not show of the person; nothing of one seen from all sides."""
-    rows, frames = np.flatnonzero(capture.motion.valid), capture.geometry().row_frames
-    wanted = [int(row) for row in rows if capture.source.selection.contains(round(frames[row]))]
+    frames, selection = capture.geometry().row_frames, capture.source.selection
+    rows = np.flatnonzero(capture.motion.valid & np.isfinite(frames)).tolist()
+    wanted = [row for row in rows if selection.contains(round(frames[row]))]
     if capture.live is not None or not wanted:
         return
     some = wanted[:: -(-len(wanted) // EXPECTED_POSES)]

@@ -53,7 +53,8 @@ class AllRoundVerdict:
     Attributes:
         verdict: The worst of the words; None if nothing was measured.
         limit: What has the worst word: filmed, surface, player or held_out; None of a sharp avatar.
-        advice: What to do about it, a sentence; None of a sharp avatar.
+        advice: What to do about it, a sentence; None of a sharp avatar, and of a failed one, whose
+            failure has causes of its own (`diagnose_failure`).
         seen: Share of the skin that was filmed, in [0, 1].
         half_transparent: Share of half-transparent pixels in views that were not filmed, in [0, 1].
     """
@@ -109,11 +110,11 @@ class AllRoundVerdict:
             "held_out": "Faces and hands are sharper the larger the person is in the picture: "
             f"step nearer, hold still for a moment on each side, or {TRAIN_LONGER}.",
         }
-        sharp = known[worst] == "sharp"
+        sharp, failed = (known[worst] == word for word in ("sharp", "failed"))
         return cls(
             verdict=known[worst],
             limit=None if sharp else worst,
-            advice=None if sharp else cures[worst],
+            advice=None if sharp or failed else cures[worst],
             seen=seen,
             half_transparent=half_transparent,
         )

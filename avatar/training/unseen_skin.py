@@ -8,8 +8,8 @@ a point whose color and density it is drawn to as far as it is unseen and the so
 3. the nearest point around the limb at the same height, so that stripes go round.
 
 The source of a patch is the candidate of the least cost: the distance to it, in which lengths along
-the bone count more than those around it, a price for each kind of reflection, and a price for
-candidates that were themselves seen poorly.
+the bone count more than those around it, a cost of each kind of reflection, and one of candidates
+that were seen poorly.
 """
 
 from typing import NamedTuple, final
@@ -38,28 +38,26 @@ SIDES_OF_BODY = ((1, 2), (4, 5), (16, 17), (18, 19))
 HEAD, FEET = 7, (5, 6)
 """Parts whose front and back are not alike."""
 MIRROR_COST_M = 0.03
-"""Price of the mirrored side, as a distance around the limb, metres."""
+"""Cost of the mirrored side, as a distance around the limb, metres."""
 REVERSE_COST_M = 0.08
-"""Price of the limb's other face, metres."""
+"""Cost of the limb's other face, metres."""
 FACE_COST_M = 1.0
-"""Price of a face as the source of anything but a face, metres."""
+"""Cost of a face as the source of anything but a face, metres."""
 UNSEEN_COST_M = 0.2
-"""Price of a source that is unseen itself, metres."""
+"""Cost of a source that is unseen itself, metres."""
 ALONG_BONE_FACTOR = 4.0
 """Factor of lengths along the bone."""
 MAX_COST_M = 0.6
 """Cost from which a source counts nothing, metres; its weight falls from half of it on."""
 MIN_SOURCE_SEEN = 0.5
 """How far a source must have been seen."""
-NEAR_SKIN_M, NEAR_SKIN_FACTOR = 0.025, 4
-"""Distance from the skin within which points are drawn that factor as often: surfaces lie there.
-"""
+NEAR_SKIN_M = 0.025
+"""Distance from the skin within which most surfaces lie, metres."""
+NEAR_SKIN_FACTOR = 4
+"""Factor by which points that near are drawn more often than others."""
 NEIGHBOR_M = 0.06
 """Distance within which patches must be unseen, too: rays see the space around a lone one, such as
 the fold of an ear, and know it to be empty."""
-MAX_RISE_M = 0.02
-"""Difference of the distances of a point and its source from the skin above which the pair is left
-out, metres: about ears and fingers a source may lie under the skin of a point that lies off it."""
 MIN_WEIGHT = 0.02
 """Weight below which a patch is left to its rays."""
 
@@ -133,7 +131,7 @@ class _BoneFrames(NamedTuple):
 
 @final
 class UnseenSkin:
-    """Draws points of unseen skin with their sources.
+    """Random points of unseen skin, and their sources.
 
     Attributes:
         evidence: What frames have shown.
@@ -157,8 +155,6 @@ class UnseenSkin:
         shape = (len(rig.seeds), len(rig.seeds))
         self._neighbors = coo_array((np.ones(len(links[0])), links), shape=shape).tocsr()
         self._neighbor_counts = self._neighbors.sum(axis=1) + 1.0
-        distance = np.where(rig.inside_skin, -rig.skin_distance, rig.skin_distance)
-        self._signed_distance = distance.reshape(-1)
         self._sources: Sources | None = None
         self._is_stale, self._unseen_share = True, 0.0
         self._drawn_from = self._cells[:0]

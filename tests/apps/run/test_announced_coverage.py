@@ -1,0 +1,44 @@
+"""What ia-ingest says before training about skin that a film will not show."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from apps.cli.console import Console
+from apps.run.session_start import _announce_coverage
+from preprocess.capture_session import CaptureInputs
+from preprocess.open_capture import open_capture
+from studio.shoot import ShootConfig, film_capture
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("announced") / "capture"
+    film_capture(folder, ShootConfig(frames=24, size=64, turns=1.0))
+    return folder
+
+
+def announced(capture) -> list[str]:
+    console = Console()
+    _announce_coverage(capture, console)
+    return console.warnings
+
+
+def test_a_whole_turn_needs_no_word(folder):
+    assert not announced(open_capture(CaptureInputs(video=folder)))
+
+
+def test_the_front_of_a_turn_is_said_to_be_half_of_the_person(folder):
+    (said,) = announced(open_capture(CaptureInputs(video=folder, frames=slice(0, 3))))
+    assert "of the person's skin" in said
+    assert "back" in said
+
+
+def test_poses_without_a_frame_do_not_count(folder):
+    capture = open_capture(CaptureInputs(video=folder, frames=slice(0, 3)))
+    numbers = np.arange(24.0)
+    numbers[5:] = np.nan
+    strays = replace(capture.geometry(), row_frames=numbers)
+    object.__setattr__(capture, "geometry", lambda: strays)
+    assert len(announced(capture)) == 1
