@@ -25,14 +25,14 @@ def announced(capture) -> list[str]:
     return console.warnings
 
 
-def test_a_whole_turn_needs_no_word(folder):
+def test_a_whole_turn_gives_no_warning(folder):
     assert not announced(open_capture(CaptureInputs(video=folder)))
 
 
-def test_the_front_of_a_turn_is_said_to_be_half_of_the_person(folder):
-    (said,) = announced(open_capture(CaptureInputs(video=folder, frames=slice(0, 3))))
-    assert "of the person's skin" in said
-    assert "back" in said
+def test_the_front_of_a_turn_warns_of_unseen_skin(folder):
+    (warning,) = announced(open_capture(CaptureInputs(video=folder, frames=slice(0, 3))))
+    assert "of the person's skin" in warning
+    assert "back" in warning
 
 
 def test_poses_without_a_frame_do_not_count(folder):
