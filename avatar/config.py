@@ -10,8 +10,8 @@ ESTIMATED_POSE_DETAIL_M = 0.006
 """Smallest detail that frames agree on where poses are estimates, metres. Finer cells learn their
 errors, which costs up to 1.6 dB in new poses; at 0.0075 these gain 0.2 dB more, but eyes blur."""
 ESTIMATED_POSE_PRIORS: Mapping[str, float] = {
-    "double_well_weight": 0.25, "interior_weight": 0.025, "density_slope_weight": 0.04,
-    "color_tv_weight": 0.05, "min_occupied_density": 150.0, "off_skin_weight": 0.1,
+    "double_well_weight": 0.2, "interior_weight": 0.0125, "density_slope_weight": 0.02,
+    "color_tv_weight": 0.025, "min_occupied_density": 150.0, "off_skin_weight": 0.1,
 }  # fmt: skip
 """Priors of firm and smooth surfaces where poses are estimates; they grow with the uncertainty. Fog
 imitates views in poses that are off: together they cost an exact actor 0.8 to 1.4 dB in new poses,
@@ -58,7 +58,7 @@ class TrainConfig:
     """Cell size of the finest level, metres."""
     learning_rate: float = 2.5e-2
     """Learning rate of the hash table; the network's is `NETWORK_RATE_FACTOR` times it."""
-    alpha_weight: float = 0.1
+    alpha_weight: float = 0.2
     """Weight of the L1 loss on alpha; 0 turns it off."""
     hard_surface_weight: float = 0.02
     """Weight of the hard-surface loss; 0 turns it off."""
