@@ -293,8 +293,8 @@ def test_cells_that_tell_of_poses_are_small_enough_whatever_the_detail(footprint
     """Without levels below 37 mm poses drift in long trainings: 2 dB in new poses."""
     config = TrainConfig.for_budget(footprint_m=footprint_m, pose_uncertainty=uncertainty)
     levels = HashLevels.spanning(
-        np.zeros(3), np.ones(3), coarsest_m=COARSEST_M, finest_m=config.finest_m,
-        levels=config.levels, table_size=config.table_size,
+        np.zeros(3, np.float32), np.ones(3, np.float32), coarsest_m=COARSEST_M,
+        finest_m=config.finest_m, levels=config.levels, table_size=config.table_size,
     )  # fmt: skip
     assert 1.0 / levels.coarser_than(MIN_POSE_GRADIENT_CELL_M).cells_per_m[-1] < 0.025
 
