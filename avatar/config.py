@@ -12,6 +12,7 @@ errors, which costs up to 1.6 dB in new poses; at 0.0075 these gain 0.2 dB more,
 ESTIMATED_POSE_PRIORS: Mapping[str, float] = {
     "double_well_weight": 0.2, "interior_weight": 0.0125, "density_slope_weight": 0.02,
     "color_tv_weight": 0.025, "min_occupied_density": 150.0, "off_skin_weight": 0.1,
+    "head_interior_weight": 0.03,
 }  # fmt: skip
 """Priors of firm and smooth surfaces where poses are estimates; they grow with the uncertainty. Fog
 imitates views in poses that are off: together they cost an exact actor 0.8 to 1.4 dB in new poses,
@@ -73,6 +74,9 @@ class TrainConfig:
     surfaces firm from all sides, at a small loss in the filmed views."""
     interior_weight: float = 0.0
     """Weight of the loss that makes the body's interior opaque; 0 turns the term off."""
+    head_interior_weight: float = 0.0
+    """Initial weight of the same loss in the head, which falls as surfaces become firm; without it
+    a face that is filmed from one side alone is a shell at any depth."""
     density_slope_weight: float = 0.0
     """Final weight of density slopes above `max_log_density_slope_per_m` and of excess density; it
     grows as the learning rate falls. No image resolves edges sharper than the finest cells."""
@@ -88,6 +92,8 @@ class TrainConfig:
     """Points per step at which that log density is penalised."""
     interior_points: int = 128
     """Points per step at which the interior's opacity is measured."""
+    head_interior_points: int = 64
+    """Points per step at which the opacity of the head's interior is measured."""
     density_tv_pairs: int = 128
     """Pairs of points per step at which the total variation is measured."""
     unseen_weight: float = 0.12

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from avatar.kernels.backend_protocol import DensityGrid
 from avatar.kernels.torch_reference import MAX_LOG_DENSITY
-from avatar.rig import CLOTHING_BAND_M, Rig
+from avatar.rig import CLOTHING_BAND_M, HEAD_JOINT, Rig
 
 OCCUPANCY_DECAY = 0.9
 """Factor of a probed cell's cached density. At 0.6 thin surfaces vanish."""
@@ -64,6 +64,12 @@ class OccupancyGrid:
             rig.inside_skin & (rig.skin_distance > INTERIOR_DEPTH_M)
         ).to(device)
         self._interior_cells = self._interior_cells.flatten().nonzero()[:, 0]
+        centers = (
+            np.stack(np.unravel_index(self._interior_cells.cpu().numpy(), band.shape), axis=1) + 0.5
+        )
+        weights = rig.weights_at(rig.box_low + centers / rig.cells_per_m)
+        in_head = torch.from_numpy(weights[:, HEAD_JOINT] > 0.5).to(device)
+        self._head_cells = self._interior_cells[in_head]
         off_skin = torch.from_numpy(~rig.inside_skin & (rig.skin_distance > OFF_SKIN_M)).to(device)
         self._off_skin_cells = (band & off_skin).flatten().nonzero()[:, 0]
         self._near_skin = rig.skin_distance <= NEAR_SKIN_M
@@ -147,12 +153,11 @@ class OccupancyGrid:
         )
 
     def sample_interior(
-        self, count: int, generator: torch.Generator
+        self, count: int, generator: torch.Generator, *, of_head: bool = False
     ) -> Float32[Tensor, "points 3"]:
-        """Random points deep under the skin, at most `count`."""
-        return self._jittered_points(
-            self._draw_cells(self._interior_cells, count, generator), generator
-        )
+        """Random points deep under the skin, or under the head's, at most `count`."""
+        cells = self._head_cells if of_head else self._interior_cells
+        return self._jittered_points(self._draw_cells(cells, count, generator), generator)
 
     def _empty_cells(self) -> Int64[Tensor, "cells"]:
         """Unoccupied cells of the band, cached until the occupancy changes."""

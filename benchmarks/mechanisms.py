@@ -183,7 +183,7 @@ FEW_FRAME_MECHANISMS = [
     ),
     Mechanism(
         name="interior",
-        off={"interior_weight": 0.0},
+        off={"interior_weight": 0.0, "head_interior_weight": 0.0},
         code=(
             "avatar.radiance_field.interior_gradient",
             "avatar.occupancy_grid.OccupancyGrid.sample_interior",

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Float32, Int, Int32, Shaped, UInt8
 from avatar.config import TrainConfig
 from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.held_out import HeldOutFrame
-from avatar.rig import Rig
+from avatar.rig import HEAD_JOINT, Rig
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import body_from_rest
@@ -19,8 +19,6 @@ from preprocess.observation import DroppedFrame, Observation
 
 NEAR_MASK_SHARE = 0.035
 """Distance from the mask within which pixels are near the person, in image heights."""
-HEAD_JOINT = 15
-"""Joint at the base of the skull."""
 HEAD_UP_M = 0.08
 """Distance of the head's middle above that joint, metres."""
 HEAD_RADIUS_M = 0.16

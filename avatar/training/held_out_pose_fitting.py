@@ -85,6 +85,7 @@ def _fit_frames(
         trainer.config,
         empty_space_weight=0.0,
         interior_weight=0.0,
+        head_interior_weight=0.0,
         off_skin_weight=0.0,
         rays=at_once * RAYS_PER_CORRECTION,
     )

@@ -176,7 +176,7 @@ def _regularization_points(
     config: TrainConfig,
     generator: torch.Generator,
 ) -> list[Float32[Tensor, "_ 3"]]:
-    """Points of the regularizers: empty, TV pairs, interior, smoothness pairs, off the skin."""
+    """Points of the regularizers: empty, TV pairs, interior, smoothness pairs, off skin, head."""
     none = points[:0]
     return [
         sampler.sample_empty(config.empty_space_points, generator).to(points)
@@ -190,6 +190,9 @@ def _regularization_points(
         occupancy.sample_off_skin(config.off_skin_points, generator).to(points)
         if config.off_skin_weight
         else none,
+        occupancy.sample_interior(config.head_interior_points, generator, of_head=True).to(points)
+        if config.head_interior_weight
+        else none,
     ]
 
 
@@ -200,7 +203,7 @@ def _regularization_gradients(
     surface_share: float,
 ) -> list[Float32[Tensor, "_ 4"]]:
     """Gradients of the raw outputs at the points of `_regularization_points`, in their order."""
-    empty, pairs, solid, close, away, *_ = raw
+    empty, pairs, solid, close, away, head, *_ = raw
     grad_pairs = radiance_field.density_tv_gradient(pairs, config.density_tv_weight)
     if config.double_well_weight:
         grad_pairs += radiance_field.double_well_gradient(
@@ -223,6 +226,11 @@ def _regularization_gradients(
         radiance_field.interior_gradient(solid, config.interior_weight) if len(solid) else solid,
         grad_close,
         radiance_field.log_density_l1_gradient(away, config.off_skin_weight) if len(away) else away,
+        radiance_field.interior_gradient(
+            head, config.head_interior_weight * (1.0 - surface_share) ** 2
+        )
+        if len(head)
+        else head,
     ]
 
 

@@ -46,7 +46,9 @@ FACE_COST_M = 1.0
 UNSEEN_COST_M = 0.2
 """Cost of a source that is unseen itself, metres."""
 ALONG_BONE_FACTOR = 4.0
-"""Factor of lengths along the bone."""
+"""Factor of lengths along the bone; none of the head, whose hair comes from above."""
+FACE_MIN_NORMAL = -0.2
+"""Least forward component of a normal that belongs to a face; ears are part of it."""
 MAX_COST_M = 0.6
 """Cost from which a source counts nothing, metres; its weight falls from half of it on."""
 MIN_SOURCE_SEEN = 0.5
@@ -285,7 +287,8 @@ def find_sources(
                 continue
             to = frames.to_bone(rig.seeds[here], parts[here])
             come = frames.to_bone(places[there], landed[there])
-            away = (to[:, None, :] - come[None, :, :]) * (1.0, 1.0, ALONG_BONE_FACTOR)
+            along = 1.0 if part == HEAD else ALONG_BONE_FACTOR
+            away = (to[:, None, :] - come[None, :, :]) * (1.0, 1.0, along)
             costs = np.linalg.norm(away, axis=2) + extra[there]
             costs += FACE_COST_M * (is_face[sources[there]][None] & ~is_face[here][:, None])
             chosen = costs.argmin(axis=1)
@@ -305,4 +308,4 @@ def _faces(frames: _BoneFrames, rig: Rig) -> Bool[np.ndarray, "seeds"]:
     head = rig.seed_parts == HEAD
     height = local[:, 2]
     top = height[head].max() if head.any() else 0.0
-    return head & (rig.seed_normals[:, 2] > 0.2) & (height < 0.8 * top)
+    return head & (rig.seed_normals[:, 2] > FACE_MIN_NORMAL) & (height < 0.8 * top)

@@ -14,7 +14,7 @@ from avatar.occupancy_grid import (
     dilate,
     find_floaters,
 )
-from avatar.rig import CLOTHING_BAND_M
+from avatar.rig import CLOTHING_BAND_M, HEAD_JOINT
 
 CPU = torch.device("cpu")
 STEP_M = 0.01
@@ -158,3 +158,10 @@ def test_points_off_the_skin_are_where_no_clothes_are(rig, generator):
     assert len(points) == 500
     assert ((distance > OFF_SKIN_M) & (distance <= CLOTHING_BAND_M)).all()
     assert not rig.inside_skin[tuple(cell.T.numpy())].any()
+
+
+def test_the_heads_interior_lies_in_the_head(rig, generator):
+    points = OccupancyGrid(rig, CPU).sample_interior(200, generator, of_head=True).numpy()
+    assert len(points) == 200
+    assert (rig.weights_at(points).argmax(axis=1) == HEAD_JOINT).mean() > 0.95
+    assert points[:, 1].min() > rig.rest_joints[HEAD_JOINT, 1] - 0.1
