@@ -16,9 +16,10 @@ from avatar.evaluation.held_out import HeldOutFrame
 from avatar.evaluation.image_metrics import composite_on_white, psnr
 from avatar.kernels.backend_protocol import RayBatch
 from avatar.render import correspondence_tables, render
-from avatar.training.frame_stream import RayView, TrainingFrame, rebuild_frame
+from avatar.training.frame_stream import TrainingFrame, rebuild_frame
 from avatar.training.replay_buffer import ReplayBuffer
 from avatar.training.trainer import cosine_decay, step_optimizer
+from avatar.training.training_pixels import RayView
 from benchmarks.dense_sampling import DenseSampler, dense_as_in_paper, dense_in_box
 from benchmarks.measurements import Measurement
 from benchmarks.sample_training import LoadedTrainer
@@ -156,7 +157,7 @@ def whole_frame(seen: LoadedTrainer, held: HeldOutFrame) -> TrainingFrame:
     """A held-out frame with every pixel of its picture."""
     observation = held.observation
     near = np.ones_like(observation.alpha, dtype=bool)
-    view = RayView(camera=observation.camera, near_person_bits=np.packbits(near))
+    view = RayView.of(observation.camera, near)
     colors = np.zeros((near.size, 4), dtype=np.uint8)
     rig = seen.trainer.avatar.rig
     return rebuild_frame(observation.frame.index, observation.pose, view, colors, rig)

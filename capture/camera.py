@@ -67,6 +67,11 @@ class Camera:
             size_px=size_px,
         )
 
+    def crop(self, corner_px: tuple[int, int], size_px: tuple[int, int]) -> "Camera":
+        """The camera of a part of the picture: its upper left corner (x, y), width and height."""
+        (cx, cy), (left, top) = self.center_px, corner_px
+        return replace(self, center_px=(cx - left, cy - top), size_px=size_px)
+
     def scale_focal(self, factor: float) -> "Camera":
         """The same camera with focal lengths times a factor."""
         return replace(self, focal_px=(self.focal_px[0] * factor, self.focal_px[1] * factor))

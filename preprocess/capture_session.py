@@ -210,8 +210,11 @@ class Capture:
         """Replay the capture: each frame comes at its own time."""
         return replace(self, source=RealtimePlayback(self.source, PacingClock()))
 
-    def pixel_footprint_m(self) -> float:
+    def pixel_footprint_m(self, *, as_filmed: bool = False) -> float:
         """What one pixel covers on the body: the dial of the field's resolution.
+
+        Args:
+            as_filmed: Whether a pixel of the film is meant, not of the reduced pictures.
 
         Raises:
             InputError: If the person is behind the camera.
@@ -231,5 +234,5 @@ class Capture:
                 "in each frame's own camera."
             )
         longer = max(camera.size_px)
-        shrinking = min(1.0, (self.size_px or longer) / longer)
+        shrinking = 1.0 if as_filmed else min(1.0, (self.size_px or longer) / longer)
         return depth / (max(camera.focal_px) * shrinking)

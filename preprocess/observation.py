@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, UInt8
 
 from capture.atomic_files import OutputFileList
 from capture.camera import Camera, same_aspect_ratio
@@ -29,12 +29,14 @@ class Observation:
         alpha: How far each pixel is person, in [0, 1], never thresholded.
         pose: The body's pose in the camera's world.
         camera: The camera, already of the picture's size.
+        filmed_rgb: The picture as it was filmed, where `frame` is a reduced copy; else None.
     """
 
     frame: Frame
     alpha: Float32[np.ndarray, "height width"]
     pose: BodyPose
     camera: Camera
+    filmed_rgb: UInt8[np.ndarray, "rows columns 3"] | None = None
 
     def __post_init__(self) -> None:
         """Pictures, masks and cameras of different sizes are our own bug by now."""
@@ -150,7 +152,10 @@ def compose_observation_builder(
             return DroppedFrame(index=frame.index, reason=f"mask unusable: {cause}")
         if not (alpha > 0.5).any():
             return DroppedFrame(index=frame.index, reason="mask empty")
-        return Observation(frame=scaled, alpha=alpha, pose=pose, camera=camera)
+        filmed_rgb = None if scaled is frame else frame.rgb
+        return Observation(
+            frame=scaled, alpha=alpha, pose=pose, camera=camera, filmed_rgb=filmed_rgb
+        )
 
     return joined
 

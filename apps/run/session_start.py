@@ -185,6 +185,7 @@ def new_trainer(
         seconds,
         steps=steps,
         footprint_m=recording.pixel_footprint_m(),
+        filmed_footprint_m=recording.pixel_footprint_m(as_filmed=True),
         pose_uncertainty=recording.pose_uncertainty,
         held_out_stride=hold_every,
         seed=seed,

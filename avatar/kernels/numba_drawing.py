@@ -14,7 +14,7 @@ rounding for a lens without distortion, to about 0.02 px for a strongly bent one
 
 
 @compile_kernel(inline="always", **FAST_MATH)
-def _sight(sights, slot, width, flat):
+def _sight(sights, picture, width, flat):
     """Unit direction of a pixel in its camera's axes, between the four kept ones about it."""
     row, column = flat // width, flat % width
     columns = width // SIGHT_SPACING_PX + 2
@@ -25,33 +25,33 @@ def _sight(sights, slot, width, flat):
     m = n + columns
     p, q, r, s = (F32(1) - a) * (F32(1) - b), a * (F32(1) - b), (F32(1) - a) * b, a * b
     x = (
-        p * sights[slot, n, 0] + q * sights[slot, n + 1, 0]
-        + r * sights[slot, m, 0] + s * sights[slot, m + 1, 0]
+        p * sights[picture, n, 0] + q * sights[picture, n + 1, 0]
+        + r * sights[picture, m, 0] + s * sights[picture, m + 1, 0]
     )  # fmt: skip
     y = (
-        p * sights[slot, n, 1] + q * sights[slot, n + 1, 1]
-        + r * sights[slot, m, 1] + s * sights[slot, m + 1, 1]
+        p * sights[picture, n, 1] + q * sights[picture, n + 1, 1]
+        + r * sights[picture, m, 1] + s * sights[picture, m + 1, 1]
     )  # fmt: skip
     z = F32(1) / np.sqrt(x * x + y * y + F32(1))
     return x * z, y * z, z
 
 
 @compile_kernel(inline="always")
-def _find_runs(runs, pixels, slots, numbers, found):
+def _find_runs(runs, pixels, pictures, numbers, found):
     """The run that holds each ray's pixel: binary searches, a step of all rays at a time.
 
     Each step waits for memory; steps of different rays wait together.
     """
     step, most = 1, 1
-    for slot in range(pixels.shape[0]):
-        most = max(most, pixels[slot, 5])
+    for picture in range(pixels.shape[0]):
+        most = max(most, pixels[picture, 3])
     while 2 * step < most:
         step *= 2
     found[:] = 0
     while step > 0:
-        for ray in range(slots.shape[0]):
-            slot, run = slots[ray], found[ray] + step
-            if run < pixels[slot, 5] and runs[slot, run - 1, 0] <= numbers[ray]:
+        for ray in range(pictures.shape[0]):
+            picture, run = pictures[ray], found[ray] + step
+            if run < pixels[picture, 3] and runs[picture, run - 1, 0] <= numbers[ray]:
                 found[ray] = run
         step //= 2
 
@@ -63,46 +63,50 @@ def draw_rays(
 ):  # fmt: skip
     """Draws rays uniformly from the frames, in their order; the last five arguments are written.
 
+    A slot has two pictures, 2 * slot: the whole frame, and 2 * slot + 1: the head.
+
     Args:
         chances: Random numbers in [0, 1) (5, rays): frame, near the person or not, pixel, head or
             not; the last row is not read.
         frames: Number of frames, whose slots are the first.
-        shares: Share of the rays near the person, and of these, of those in the head's rows.
-        pixels: Of each slot: numbers of pixels near the person and of all, number of the head's
-            first pixel and of the first behind them; width of the picture, number of runs
-            (slots, 6).
-        runs: `PixelRuns.ends` and `shifts` (slots, runs, 2).
+        shares: Share of the rays near the person, and of these, of those in the head's picture: if
+            it has as many pixels as the whole frame's person, and at most.
+        pixels: Of each picture: numbers of pixels near the person and of all (0: there is none),
+            width, number of runs (pictures, 4).
+        runs: `PixelRuns.ends` and `shifts` (pictures, runs, 2).
         sights: Points of the plane at depth 1 seen by every `SIGHT_SPACING_PX`-th pixel
-            (slots, nodes, 2).
-        colors: Premultiplied RGBA of the pixels near the person (slots, pixels, 4).
+            (pictures, nodes, 2).
+        colors: Premultiplied RGBA of the pixels near the person (pictures, pixels, 4).
         all_origins, turns: Origin of the rays and body-from-camera rotation of each slot.
         world_from_camera: Rotation of each slot's camera.
         slots, origins, directions, targets, world_from_body: Of each ray.
     """
     rays, stop = slots.shape[0], 0
     drawn, numbers, found = np.zeros(frames, I32), np.empty(rays, np.int64), np.empty(rays, I32)
+    pictures = np.empty(rays, I32)
     for n in range(rays):
         drawn[min(I32(chances[0, n] * F32(frames)), frames - 1)] += 1
     for slot in range(frames):
-        near, count = pixels[slot, 0], pixels[slot, 1]
-        first, last = pixels[slot, 2], pixels[slot, 3]
+        near, count, head = pixels[2 * slot, 0], pixels[2 * slot, 1], pixels[2 * slot + 1, 0]
         start, stop = stop, stop + drawn[slot]
+        in_head = min(F32(shares[1]) * np.sqrt(F32(head) / F32(near)), F32(shares[2]))
         for ray in range(start, stop):
             place, far = chances[2, ray], count - near
-            number = near + np.int64(place * F32(far))
+            picture, number = 2 * slot, near + np.int64(place * F32(far))
             if chances[1, ray] < F32(shares[0]) or far == 0:
                 number = np.int64(place * F32(near))
-                if last > first and chances[3, ray] < F32(shares[1]):
-                    number = first + np.int64(place * F32(last - first))
-            slots[ray], numbers[ray] = slot, min(number, count - 1)
-    _find_runs(runs, pixels[:frames], slots, numbers, found)
+                if chances[3, ray] < in_head:
+                    picture, number = picture + 1, np.int64(place * F32(head))
+            slots[ray], pictures[ray] = slot, picture
+            numbers[ray] = min(number, pixels[picture, 1] - 1)
+    _find_runs(runs, pixels[: 2 * frames], pictures, numbers, found)
     for ray in range(rays):
-        slot, number = slots[ray], numbers[ray]
+        slot, picture, number = slots[ray], pictures[ray], numbers[ray]
         turn, camera = turns[slot], world_from_camera[slot]
-        flat = number + runs[slot, found[ray], 1]
-        x, y, z = _sight(sights, slot, pixels[slot, 4], flat)
+        flat = number + runs[picture, found[ray], 1]
+        x, y, z = _sight(sights, picture, pixels[picture, 2], flat)
         for q in range(4):
-            color = colors[slot, number, q] if number < pixels[slot, 0] else 0
+            color = colors[picture, number, q] if number < pixels[picture, 0] else 0
             targets[ray, q] = F32(color) / F32(255)
         for i in range(3):
             origins[ray, i] = all_origins[slot, i]

@@ -15,13 +15,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import UInt8
 
 from avatar.config import TrainConfig
 from avatar.evaluation.held_out import HeldOutFrame, subsample_evenly
 from avatar.rig import Rig
-from avatar.training.frame_stream import RayView, TrainingFrame, rebuild_frame
+from avatar.training.frame_stream import TrainingFrame, rebuild_frame
 from avatar.training.replay_buffer import ReplayBuffer, ReplayFrame
 from avatar.training.trainer import Trainer
+from avatar.training.training_pixels import RayView
 from capture.atomic_files import atomic_file
 from capture.camera import Camera
 from capture.input_error import InputError
@@ -236,7 +238,7 @@ class SavedFrames(NamedTuple):
 
     def training_frames(self, rig: Rig) -> list[TrainingFrame]:
         """The key frames, ready to be learnt from again."""
-        return [rebuild_frame(*frame, rig) for frame in self.replay_frames]
+        return [rebuild_frame(*frame[:4], rig, head=frame.head) for frame in self.replay_frames]
 
     def save(self, path: Path) -> None:
         """Writes them, whole or not at all.
@@ -277,20 +279,30 @@ class SavedFrames(NamedTuple):
 def _replay_frame_state(frame: ReplayFrame) -> dict[str, Any]:
     return {
         "index": frame.index,
-        "colors": torch.from_numpy(frame.colors),
-        "near": torch.from_numpy(frame.view.near_person_bits),
-        "camera": _camera_state(frame.view.camera),
         "pose": _pose_state(frame.pose),
+        **_pixels_state(frame.view, frame.colors),
+        "head": frame.head and _pixels_state(*frame.head),
     }
 
 
 def _replay_frame(state: dict[str, Any]) -> ReplayFrame:
+    head = state.get("head")  # earlier versions saved none
     return ReplayFrame(
-        index=state["index"],
-        pose=_pose(state["pose"]),
-        view=RayView(camera=_camera(state["camera"]), near_person_bits=state["near"].numpy()),
-        colors=state["colors"].numpy(),
+        state["index"], _pose(state["pose"]), *_pixels(state), head and _pixels(head)
     )
+
+
+def _pixels_state(view: RayView, colors: UInt8[np.ndarray, "pixels 4"]) -> dict[str, Any]:
+    return {
+        "colors": torch.from_numpy(colors),
+        "near": torch.from_numpy(view.near_person_bits),
+        "camera": _camera_state(view.camera),
+    }
+
+
+def _pixels(state: dict[str, Any]) -> tuple[RayView, UInt8[np.ndarray, "pixels 4"]]:
+    view = RayView(camera=_camera(state["camera"]), near_person_bits=state["near"].numpy())
+    return view, state["colors"].numpy()
 
 
 def _observation_state(observation: Observation) -> dict[str, Any]:

@@ -4,75 +4,25 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple, final
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, Int32, Shaped, UInt8
+from jaxtyping import Float, Float32, Shaped, UInt8
 
 from avatar.config import TrainConfig
 from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.held_out import HeldOutFrame
-from avatar.rig import HEAD_JOINT, Rig
+from avatar.rig import Rig
+from avatar.training.head_picture import head_pixels, picture_head
+from avatar.training.training_pixels import (
+    PixelRuns,
+    RayView,
+    TrainingPixels,
+    around_person,
+    near_person_mask,
+    premultiplied_rgba,
+)
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
-from preprocess.body.kinematics import body_from_rest
 from preprocess.observation import DroppedFrame, Observation
-
-NEAR_MASK_SHARE = 0.035
-"""Distance from the mask within which pixels are near the person, in image heights."""
-HEAD_UP_M = 0.08
-"""Distance of the head's middle above that joint, metres."""
-HEAD_RADIUS_M = 0.16
-"""Half of the height of the image rows that hold the head, metres."""
-BOX_MARGIN_SHARE = 0.04
-"""Margin of the training pixels around the near ones, in image heights."""
-
-
-class RayView(NamedTuple):
-    """Camera and pixels of a training frame.
-
-    Attributes:
-        camera: Camera of the image.
-        near_person_bits: Mask of the pixels near the person, row by row, eight to a byte.
-    """
-
-    camera: Camera
-    near_person_bits: UInt8[np.ndarray, "bytes"]
-
-
-class PixelRuns(NamedTuple):
-    """Pixels of an image in runs of adjacent ones: those near the person, then those about them.
-
-    The pixels are numbered through; 100 bytes of runs stand for a thousand pixels.
-
-    Attributes:
-        ends: Number of pixels up to the end of each run.
-        shifts: Difference between a pixel's flat index in the image and its number, by run.
-        near_count: Number of pixels near the person.
-    """
-
-    ends: Int32[np.ndarray, "runs"]
-    shifts: Int32[np.ndarray, "runs"]
-    near_count: int
-
-    @classmethod
-    def of(
-        cls, near: Bool[np.ndarray, "height width"], far: Bool[np.ndarray, "height width"]
-    ) -> "PixelRuns":
-        """The runs of two masks."""
-        sides = [_run_sides(mask) for mask in (near, far)]
-        starts, stops = (np.concatenate(parts) for parts in zip(*sides, strict=True))
-        ends = np.cumsum(stops - starts)
-        shifts = stops - ends
-        return cls(ends.astype(np.int32), shifts.astype(np.int32), int(near.sum()))
-
-    @property
-    def count(self) -> int:
-        """Number of pixels."""
-        return int(self.ends[-1])
-
-    def flat_indices(self) -> Int[np.ndarray, "pixels"]:
-        """Flat indices of all pixels in the image."""
-        return np.arange(self.count) + np.repeat(self.shifts, np.diff(self.ends, prepend=0))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -86,10 +36,9 @@ class TrainingFrame:
         origin: Origin of the rays, body frame, metres.
         body_from_camera: Rotation of the rays.
         pixels: Training pixels.
-        head_pixels: Numbers of the first pixel near the person in the rows of the head, and of the
-            first one behind them.
         colors: Premultiplied RGBA of those near the person; that of the others is zero.
         view: View from which the frame can be rebuilt with its colors alone.
+        head: The picture of the head in the film's own resolution; None where it shows nothing.
     """
 
     index: int
@@ -98,9 +47,9 @@ class TrainingFrame:
     origin: Float32[np.ndarray, "3"]
     body_from_camera: Float32[np.ndarray, "3 3"]
     pixels: PixelRuns
-    head_pixels: tuple[int, int]
     colors: UInt8[np.ndarray, "near 4"]
     view: RayView
+    head: TrainingPixels | None
 
     def directions(self) -> Float32[np.ndarray, "pixels 3"]:
         """Unit directions of all training pixels, body frame; computed at every call."""
@@ -112,19 +61,25 @@ class TrainingFrame:
 
 def prepare_frame(observation: Observation, rig: Rig) -> TrainingFrame:
     """Solves the frame's correspondences and selects its training pixels."""
-    near = _near_person_mask(observation.alpha)
-    view = RayView(camera=observation.camera, near_person_bits=np.packbits(near))
-    colors = _premultiplied_rgba(observation, near)
-    return _assemble_frame(observation.frame.index, observation.pose, view, near, colors, rig)
+    near = near_person_mask(observation.alpha)
+    view = RayView.of(observation.camera, near)
+    colors = premultiplied_rgba(observation.frame.rgb, observation.alpha, near)
+    head = picture_head(observation, rig)
+    return _assemble_frame(observation.frame.index, observation.pose, view, colors, head, rig)
 
 
 def rebuild_frame(
-    index: int, pose: BodyPose, view: RayView, colors: UInt8[np.ndarray, "pixels 4"], rig: Rig
+    index: int,
+    pose: BodyPose,
+    view: RayView,
+    colors: UInt8[np.ndarray, "pixels 4"],
+    rig: Rig,
+    *,
+    head: tuple[RayView, UInt8[np.ndarray, "near 4"]] | None = None,
 ) -> TrainingFrame:
     """Makes a frame ready from what is kept of it: finds its rays, and solves its warp."""
-    width, height = view.camera.size_px
-    bits = np.unpackbits(view.near_person_bits, count=width * height)
-    return _assemble_frame(index, pose, view, bits.reshape(height, width) > 0, colors, rig)
+    pixels = None if head is None else head_pixels(*head)
+    return _assemble_frame(index, pose, view, colors, pixels, rig)
 
 
 def camera_in_body(
@@ -141,12 +96,13 @@ def _assemble_frame(
     index: int,
     pose: BodyPose,
     view: RayView,
-    near: Bool[np.ndarray, "height width"],
     colors: UInt8[np.ndarray, "pixels 4"],
+    head: TrainingPixels | None,
     rig: Rig,
 ) -> TrainingFrame:
+    near = view.near_person()
     origin, body_from_camera = camera_in_body(view.camera, pose, rig)
-    pixels = PixelRuns.of(near, _around(near) & ~near)
+    pixels = PixelRuns.of(near, around_person(near) & ~near)
     return TrainingFrame(
         index=index,
         pose=pose,
@@ -154,73 +110,10 @@ def _assemble_frame(
         origin=origin,
         body_from_camera=body_from_camera,
         pixels=pixels,
-        head_pixels=_head_pixels(near, view.camera, rig.world_from_body(pose), pose, rig),
         colors=colors[: pixels.near_count],  # earlier versions saved the others' zeros, too
         view=view,
+        head=head,
     )
-
-
-def _head_pixels(
-    near: Bool[np.ndarray, "height width"],
-    camera: Camera,
-    world_from_body: Float[np.ndarray, "4 4"],
-    pose: BodyPose,
-    rig: Rig,
-) -> tuple[int, int]:
-    """Numbers of the pixels near the person in the image rows that hold the head."""
-    head = body_from_rest(rig.rest_joints, rig.parents, pose.joint_rotations)[HEAD_JOINT]
-    middle = rig.rest_joints[HEAD_JOINT] + np.array([0.0, HEAD_UP_M, 0.0])
-    placed = camera.camera_from_world @ world_from_body @ head @ np.append(middle, 1.0)
-    if placed[2] < HEAD_RADIUS_M:
-        return 0, 0
-    row = camera.focal_px[1] * placed[1] / placed[2] + camera.center_px[1]
-    reach = camera.focal_px[1] * HEAD_RADIUS_M / placed[2]
-    first, last = np.clip(np.rint([row - reach, row + reach]), 0, len(near)).astype(int)
-    before = np.count_nonzero(near[:first])
-    return int(before), int(before + np.count_nonzero(near[first:last]))
-
-
-def _premultiplied_rgba(
-    observation: Observation, near: Bool[np.ndarray, "height width"]
-) -> UInt8[np.ndarray, "near 4"]:
-    """Color times alpha, and alpha, of the pixels near the person, in 8 bits."""
-    places = np.flatnonzero(near)
-    alpha = observation.alpha.reshape(-1).take(places)
-    rgb = observation.frame.rgb.reshape(-1, 3).take(places, axis=0)
-    premultiplied = np.empty((4, len(places)), dtype=np.float32)
-    for channel in range(3):
-        np.multiply(rgb[:, channel], alpha, out=premultiplied[channel])
-    np.multiply(alpha, np.float32(255.0), out=premultiplied[3])
-    rounded = np.rint(premultiplied, out=premultiplied).astype(np.uint8)
-    return np.ascontiguousarray(rounded.T)
-
-
-def _near_person_mask(
-    alpha: Float32[np.ndarray, "height width"],
-) -> Bool[np.ndarray, "height width"]:
-    """The pixels near the person."""
-    kernel = np.ones((max(5, int(NEAR_MASK_SHARE * len(alpha)) | 1),) * 2, dtype=np.uint8)
-    return cv2.dilate((alpha > 0).astype(np.uint8), kernel) > 0
-
-
-def _around(near: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
-    """The pixels in a box around those near the person."""
-    rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
-    margin = int(BOX_MARGIN_SHARE * len(near))
-    box = np.zeros_like(near)
-    box[
-        max(0, rows[0] - margin) : rows[-1] + margin + 1,
-        max(0, columns[0] - margin) : columns[-1] + margin + 1,
-    ] = True
-    return box
-
-
-def _run_sides(
-    mask: Bool[np.ndarray, "height width"],
-) -> tuple[Int[np.ndarray, "runs"], Int[np.ndarray, "runs"]]:
-    """Flat indices at which the runs of a mask begin, and behind which they end."""
-    changes = np.flatnonzero(np.diff(mask.reshape(-1).view(np.int8), prepend=0, append=0))
-    return changes[::2], changes[1::2]
 
 
 JOINT_ANGLE_WEIGHT = 0.5
@@ -321,7 +214,7 @@ def separate_held_out(
     """
     for position, item in enumerate(observations):
         if isinstance(item, Observation) and is_held_out(position, stride=stride, total=total):
-            yield HeldOutFrame(observation=item)
+            yield HeldOutFrame(observation=replace(item, filmed_rgb=None))
         else:
             yield item
 

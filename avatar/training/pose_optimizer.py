@@ -39,7 +39,7 @@ MIN_RAYS_SHARE = 0.5
 EQUATION_DECAY = 0.85
 """Factor of an estimated pose's earlier normal equations at each of its corrections: about seven
 corrections count. The noise of 512 rays alone is as large as the error that is left."""
-MIN_POSE_GRADIENT_CELL_M = 0.015
+MIN_POSE_GRADIENT_CELL_M = 0.0105
 """Smallest cells of the hash levels whose gradient reaches the poses, metres. Finer levels point to
 the right place from a few millimetres away only, and win nothing; without those below 37 mm poses
 drift in long trainings, which costs 2 dB in new poses."""

@@ -17,21 +17,22 @@ from avatar.correspondence_grid import CORRESPONDENCE_CELL_M, CorrespondenceGrid
 from avatar.kernels.backend_protocol import CorrespondenceTables, RayBatch
 from avatar.kernels.numba_drawing import SIGHT_SPACING_PX, draw_rays
 from avatar.rig import Rig
-from avatar.training.frame_stream import (
-    RayView,
-    TrainingFrame,
-    camera_in_body,
-    view_descriptor,
-)
+from avatar.training.frame_stream import TrainingFrame, camera_in_body, view_descriptor
 from avatar.training.pose_optimizer import RootCorrection
+from avatar.training.training_pixels import RayView, TrainingPixels
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
 
 NEAR_PERSON_RAY_SHARE = 0.9
 """Share of the rays that pass through pixels near the person."""
-HEAD_RAY_SHARE = 0.15
-"""Share of the rays near the person that are drawn from the rows of the head alone, where people
-look; the others are drawn from all rows."""
+HEAD_SIDE_RAY_SHARE = 0.5
+"""Share of the rays near the person that are drawn from the picture of the head, where people look,
+if it has as many pixels as the person in the whole frame; it falls with their square root, to 0.15
+where the film is not reduced."""
+MAX_HEAD_RAY_SHARE = 0.35
+"""Largest share of these rays."""
+PICTURES = 2
+"""Pictures of a slot: the whole frame, and the head in the film's own resolution."""
 DRAWS_PER_RAY = 5
 """Random numbers that decide a ray: its frame, near the person or not, its pixel, the head or not,
 where its samples begin."""
@@ -45,12 +46,14 @@ class ReplayFrame(NamedTuple):
         pose: The tracker's pose.
         view: Camera and pixels.
         colors: Premultiplied RGBA of the pixels near the person.
+        head: The same of the picture of the head, if there is one.
     """
 
     index: int
     pose: BodyPose
     view: RayView
     colors: UInt8[np.ndarray, "pixels 4"]
+    head: tuple[RayView, UInt8[np.ndarray, "pixels 4"]] | None
 
 
 class TrainingBatch(NamedTuple):
@@ -80,13 +83,14 @@ class ReplayBuffer:
         self.capacity = capacity
         self.device = device
         self.frame_indices: list[int] = []
-        self._poses_and_views: list[tuple[BodyPose, RayView]] = []
+        self._poses_and_views: list[tuple[BodyPose, RayView, RayView | None]] = []
         self._descriptors = np.zeros((capacity, 3 + 69))
         self._descriptor_distances = np.full((capacity, capacity), np.inf)
-        self._pixels = np.zeros((capacity, 6), dtype=np.int64)
-        self._runs = torch.zeros(capacity, 1, 2, dtype=torch.int32)
-        self._sights = torch.zeros(capacity, 1, 2)
-        self._colors = torch.zeros(capacity, 1, 4, dtype=torch.uint8)
+        pictures = PICTURES * capacity
+        self._pixels = np.zeros((pictures, 4), dtype=np.int64)
+        self._runs = torch.zeros(pictures, 1, 2, dtype=torch.int32)
+        self._sights = torch.zeros(pictures, 1, 2)
+        self._colors = torch.zeros(pictures, 1, 4, dtype=torch.uint8)
         self._given_origins = np.zeros((capacity, 3))
         self._origins = np.zeros((capacity, 3), dtype=np.float32)
         self._body_from_camera = np.zeros((capacity, 3, 3))
@@ -114,11 +118,12 @@ class ReplayBuffer:
         if len(self) < self.capacity:
             slot = len(self)
             self.frame_indices.append(frame.index)
-            self._poses_and_views.append((frame.pose, frame.view))
+            self._poses_and_views.append((frame.pose, frame.view, None))
         else:
             slot = self._most_redundant_slot()
             self.frame_indices[slot] = frame.index
-            self._poses_and_views[slot] = frame.pose, frame.view
+        head_view = frame.head and frame.head.view
+        self._poses_and_views[slot] = frame.pose, frame.view, head_view
         self._update_distances(slot, view_descriptor(frame.origin, frame.pose))
         self._store_frame(slot, frame)
         return slot
@@ -126,9 +131,13 @@ class ReplayBuffer:
     def replay_frames(self) -> list[ReplayFrame]:
         """The frames as they are saved, for training on them again."""
         kept = []
-        for slot, (pose, view) in enumerate(self._poses_and_views):
-            colors = self._colors[slot, : self._pixels[slot, 0]].numpy().copy()
-            kept.append(ReplayFrame(self.frame_indices[slot], pose, view, colors))
+        for slot, (pose, view, head_view) in enumerate(self._poses_and_views):
+            colors, head_colors = (
+                self._colors[picture, : self._pixels[picture, 0]].numpy().copy()
+                for picture in range(PICTURES * slot, PICTURES * (slot + 1))
+            )
+            head = None if head_view is None else (head_view, head_colors)
+            kept.append(ReplayFrame(self.frame_indices[slot], pose, view, colors, head))
         return kept
 
     def clear_correspondences(self) -> None:
@@ -150,8 +159,8 @@ class ReplayBuffer:
 
     def set_pose(self, slot: int, pose: BodyPose, rig: Rig) -> None:
         """Gives a slot's frame another pose; `set_correspondences` and `correct_root` follow."""
-        view = self._poses_and_views[slot][1]
-        self._poses_and_views[slot] = pose, view
+        _, view, head_view = self._poses_and_views[slot]
+        self._poses_and_views[slot] = pose, view, head_view
         origin, self._body_from_camera[slot] = camera_in_body(view.camera, pose, rig)
         self._given_origins[slot] = origin
         self._update_distances(slot, view_descriptor(origin, pose))
@@ -178,7 +187,8 @@ class ReplayBuffer:
         targets = np.empty((count, 4), dtype=np.float32)
         world_from_body = np.empty((count, 3, 3), dtype=np.float32)
         draw_rays(
-            chances.cpu().numpy(), len(self), (NEAR_PERSON_RAY_SHARE, HEAD_RAY_SHARE),
+            chances.cpu().numpy(), len(self),
+            (NEAR_PERSON_RAY_SHARE, HEAD_SIDE_RAY_SHARE, MAX_HEAD_RAY_SHARE),
             self._pixels, self._runs.numpy(), self._sights.numpy(), self._colors.numpy(),
             self._origins, self._turns, self._world_from_camera,
             slots, origins, directions, targets, world_from_body,
@@ -192,28 +202,32 @@ class ReplayBuffer:
 
     def _store_frame(self, slot: int, frame: TrainingFrame) -> None:
         self.set_correspondences(slot, frame.correspondences)
-        camera, pixels = frame.view.camera, frame.pixels
-        runs = np.stack([pixels.ends, pixels.shifts], axis=1)
-        self._runs = self._store_rows(self._runs, slot, runs)
-        self._sights = self._store_rows(self._sights, slot, _sights_on_a_grid(camera))
-        self._colors = self._store_rows(self._colors, slot, frame.colors)
-        counts = pixels.near_count, pixels.count, *frame.head_pixels
-        self._pixels[slot] = *counts, camera.size_px[0], len(runs)
+        body = TrainingPixels(frame.view, frame.pixels, frame.colors)
+        for picture, part in enumerate((body, frame.head), start=PICTURES * slot):
+            self._pixels[picture] = 0
+            if part is None:
+                continue
+            camera, runs = part.view.camera, part.runs
+            rows = np.stack([runs.ends, runs.shifts], axis=1)
+            self._runs = self._store_rows(self._runs, picture, rows)
+            self._sights = self._store_rows(self._sights, picture, _sights_on_a_grid(camera))
+            self._colors = self._store_rows(self._colors, picture, part.colors)
+            self._pixels[picture] = runs.near_count, runs.count, camera.size_px[0], len(rows)
         self._given_origins[slot] = self._origins[slot] = frame.origin
         self._body_from_camera[slot] = self._turns[slot] = frame.body_from_camera
-        self._world_from_camera[slot] = camera.camera_from_world[:3, :3].T
+        self._world_from_camera[slot] = frame.view.camera.camera_from_world[:3, :3].T
 
-    def _store_rows(self, store: Tensor, slot: int, values: np.ndarray) -> Tensor:
-        """Writes one slot; a store that is too narrow becomes a quarter wider than needed."""
+    def _store_rows(self, store: Tensor, row: int, values: np.ndarray) -> Tensor:
+        """Writes a row; a store that is too narrow becomes a quarter wider than needed."""
         needed = len(values)
         if needed > store.shape[1]:
             width = needed + needed // 4
             # untouched pages cost nothing; numpy, not torch, asks for those of 2 MiB
-            room = np.empty((self.capacity, width, *store.shape[2:]), dtype=values.dtype)
-            wider, held = torch.from_numpy(room).to(store), len(self)
+            room = np.empty((len(store), width, *store.shape[2:]), dtype=values.dtype)
+            wider, held = torch.from_numpy(room).to(store), len(store) // self.capacity * len(self)
             wider[:held, : store.shape[1]] = store[:held]
             store = wider
-        store[slot, :needed] = torch.from_numpy(values).to(store)
+        store[row, :needed] = torch.from_numpy(values).to(store)
         return store
 
     def _update_distances(self, slot: int, descriptor: Float[np.ndarray, " 72"]) -> None:

@@ -78,7 +78,6 @@ def _lies_in_mask(
     width, height = camera.size_px
     column, row = np.floor(camera.project(in_camera)).astype(np.int64).T
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    near = np.unpackbits(frame.view.near_person_bits, count=width * height)
     alpha = np.zeros(width * height, dtype=np.uint8)
-    alpha[near > 0] = frame.colors[:, 3]
+    alpha[frame.view.near_person().reshape(-1)] = frame.colors[:, 3]
     return inside & (alpha[(row * width + column) * inside] > MIN_PERSON_ALPHA)

@@ -29,7 +29,6 @@ from avatar.events import (
 from avatar.render import render
 from avatar.rig import Rig
 from avatar.training.frame_stream import (
-    RayView,
     RedundantFrame,
     StreamItem,
     TrainingFrame,
@@ -37,6 +36,7 @@ from avatar.training.frame_stream import (
 )
 from avatar.training.pose_optimizer import FIRST_CORRECTION_STEPS
 from avatar.training.trainer import Trainer, cosine_decay
+from avatar.training.training_pixels import RayView
 from capture.camera import Camera
 from capture.inbox import Inbox
 from preprocess.body.body_pose import BodyPose
@@ -357,5 +357,5 @@ def _dummy_frame(rig: Rig, camera: Camera) -> TrainingFrame:
     width, height = camera.size_px
     near = np.full((height, width), True)
     colors: UInt8[np.ndarray, "pixels 4"] = np.full((near.size, 4), 255, dtype=np.uint8)
-    view = RayView(camera=camera, near_person_bits=np.packbits(near))
+    view = RayView.of(camera, near)
     return rebuild_frame(0, pose, view, colors, rig)

@@ -74,6 +74,7 @@ def train_config(
     capture = data.capture
     return TrainConfig.for_budget(
         seconds, steps=steps, footprint_m=capture.pixel_footprint_m(),
+        filmed_footprint_m=capture.pixel_footprint_m(as_filmed=True),
         pose_uncertainty=capture.pose_uncertainty, seed=seed,
     )  # fmt: skip
 

@@ -1,8 +1,15 @@
 """The recipe follows from the waiting time, the picture's size and how exact the poses are."""
 
+import numpy as np
 import pytest
 
-from avatar.config import COARSEST_M, ESTIMATED_POSE_PRIORS, TrainConfig
+from avatar.config import (
+    COARSEST_M,
+    ESTIMATED_POSE_PRIORS,
+    HEAD_SIDE_M,
+    MAX_HEAD_PX,
+    TrainConfig,
+)
 
 
 @pytest.mark.parametrize("footprint_m", [1e-4, 0.004, 0.009, 0.02, 0.5])
@@ -22,13 +29,28 @@ def test_detail_follows_the_pixels():
     assert near.table_size >= far.table_size
 
 
+def test_cells_follow_the_pixels_in_which_the_head_was_filmed_and_samples_the_others():
+    reduced, filmed = (
+        TrainConfig.for_budget(60.0, footprint_m=0.004, filmed_footprint_m=size)
+        for size in (None, 0.0025)
+    )
+    assert reduced.finest_m == 0.004
+    assert filmed.finest_m == 0.0025
+    assert reduced.sample_step_m == filmed.sample_step_m
+    tiny = TrainConfig.for_budget(
+        60.0, footprint_m=0.004, filmed_footprint_m=1e-4, pose_uncertainty=1.0
+    )
+    head_m = HEAD_SIDE_M / MAX_HEAD_PX  # a picture of the head has no more pixels
+    assert tiny.finest_m == pytest.approx(np.hypot(head_m, 0.003))
+
+
 def test_poses_that_are_estimates_show_less_detail():
     exact, half, estimated = (
         TrainConfig.for_budget(60.0, footprint_m=0.004, pose_uncertainty=share)
         for share in (0.0, 0.5, 1.0)
     )
     assert exact.finest_m == 0.004
-    assert estimated.finest_m == pytest.approx(0.0072, abs=2e-5)  # 4 mm of a pixel, 6 of poses
+    assert estimated.finest_m == pytest.approx(0.005)  # 4 mm of a pixel, 3 of poses
     assert exact.finest_m < half.finest_m < estimated.finest_m
     assert exact.sample_step_m < half.sample_step_m < estimated.sample_step_m
 

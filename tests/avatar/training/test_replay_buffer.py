@@ -1,15 +1,23 @@
 """Replay: the rays are those of the video, and the frames that stay are worth keeping."""
 
 import dataclasses
+from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from avatar.training.frame_stream import PixelRuns, prepare_frame
-from avatar.training.replay_buffer import HEAD_RAY_SHARE, NEAR_PERSON_RAY_SHARE, ReplayBuffer
+from avatar.training.frame_stream import prepare_frame
+from avatar.training.replay_buffer import (
+    HEAD_SIDE_RAY_SHARE,
+    MAX_HEAD_RAY_SHARE,
+    NEAR_PERSON_RAY_SHARE,
+    ReplayBuffer,
+)
+from avatar.training.training_pixels import PixelRuns
 from preprocess.body.body_pose import BodyPose
 
 CPU = torch.device("cpu")
@@ -35,7 +43,7 @@ def cut(frame, near, far):
     places, count = frame.pixels.flat_indices(), frame.pixels.near_count
     masks[0, places[:near]] = masks[1, places[count : count + far]] = True
     pixels = PixelRuns.of(*masks.reshape(2, height, width))
-    return dataclasses.replace(frame, pixels=pixels, colors=frame.colors[:near], head_pixels=(0, 0))
+    return dataclasses.replace(frame, pixels=pixels, colors=frame.colors[:near], head=None)
 
 
 def posed(frame, index, *, knee):
@@ -104,7 +112,7 @@ def test_a_video_whose_lens_changes_is_seen_through_each_frames_own(frames, gene
         )
     )
     own = [
-        dataclasses.replace(frame, view=frame.view._replace(camera=camera))
+        dataclasses.replace(frame, view=frame.view._replace(camera=camera), head=None)
         for frame, camera in zip(frames, (frames[0].view.camera, zoomed, bent), strict=False)
     ]
     batch = store(own).sample_rays(600, generator)
@@ -235,19 +243,45 @@ def test_cached_distances_are_those_computed_afresh(frames, rng):
 
 
 def test_the_head_gets_more_rays_than_its_pixels(frames):
-    replay = store(frames)
-    batch = replay.sample_rays(8000, torch.Generator().manual_seed(0))
+    """Half of the square root of the shares of pixels: 0.15 where the film is not reduced."""
+    batch = store(frames).sample_rays(8000, torch.Generator().manual_seed(0))
     found = places(batch, frames)
     for slot, frame in enumerate(frames):
-        first, last = frame.head_pixels
-        mine = found[(batch.rays.slots == slot).numpy()]
-        natural = (last - first) / frame.pixels.near_count
-        expected = NEAR_PERSON_RAY_SHARE * (HEAD_RAY_SHARE + (1.0 - HEAD_RAY_SHARE) * natural)
-        assert np.mean((mine >= first) & (mine < last)) == pytest.approx(expected, abs=0.04)
+        natural = frame.head.runs.near_count / frame.pixels.near_count
+        drawn = HEAD_SIDE_RAY_SHARE * natural**0.5
+        assert natural < 0.12 < drawn < MAX_HEAD_RAY_SHARE
+        expected = NEAR_PERSON_RAY_SHARE * (drawn + (1.0 - drawn) * natural)
+        inside = np.isin(found, head_numbers(frame))[(batch.rays.slots == slot).numpy()]
+        assert np.mean(inside) == pytest.approx(expected, abs=0.04)
 
 
-def test_the_rows_of_the_head_are_those_at_the_top_of_a_standing_person(frames):
-    for frame in frames:
-        first, last = frame.head_pixels
-        assert first < 0.03 * frame.pixels.near_count
-        assert 0.05 < (last - first) / frame.pixels.near_count < 0.4
+def test_a_head_of_more_pixels_gets_more_rays_up_to_a_bound(rig, clip):
+    """The film before it is reduced: rays of the head lie between the reduced frame's pixels."""
+    observation, shares = clip.observations[0], []
+    for factor in (1, 2, 4):
+        width, height = observation.frame.size_px
+        filmed = cv2.resize(observation.frame.rgb, (factor * width, factor * height))
+        frame = prepare_frame(replace(observation, filmed_rgb=filmed), rig)
+        batch = store([frame]).sample_rays(8000, torch.Generator().manual_seed(0))
+        sights = batch.rays.directions.numpy() @ frame.body_from_camera
+        camera = frame.head.view.camera
+        pixels = sights[:, :2] / sights[:, 2:] * camera.focal_px + camera.center_px
+        off_center = np.abs(pixels - np.floor(pixels) - 0.5).max(axis=1)
+        is_inside = ((pixels > 0.0) & (pixels < camera.size_px)).all(axis=1)
+        shares.append(np.mean(is_inside & (off_center < 1e-3)))
+    assert shares[0] < shares[1] < shares[2]
+    assert shares[2] == pytest.approx(NEAR_PERSON_RAY_SHARE * MAX_HEAD_RAY_SHARE, abs=0.02)
+
+
+def head_numbers(frame):
+    """Numbers, among the frame's training pixels, of those that its picture of the head has."""
+    (left, top), width = corner_of_head(frame), frame.view.camera.size_px[0]
+    row, column = np.divmod(frame.head.runs.flat_indices(), frame.head.view.camera.size_px[0])
+    places = (row + top) * width + column + left
+    return np.flatnonzero(np.isin(frame.pixels.flat_indices(), places))
+
+
+def corner_of_head(frame):
+    """Upper left corner of the picture of the head in a frame that is not reduced."""
+    shift = np.subtract(frame.view.camera.center_px, frame.head.view.camera.center_px)
+    return np.rint(shift).astype(int)

@@ -39,6 +39,11 @@ def test_a_frame_is_rebuilt_from_its_colors_alone(frames, rig):
         np.testing.assert_array_equal(again.directions(), frame.directions())
         np.testing.assert_array_equal(again.colors, frame.colors)
         np.testing.assert_array_equal(again.origin, frame.origin)
+        assert again.head is None
+        head = frame.head.view, frame.head.colors
+        again = rebuild_frame(0, frame.pose, frame.view, frame.colors, rig, head=head)
+        for part, other in zip(again.head.runs, frame.head.runs, strict=True):
+            np.testing.assert_array_equal(part, other)
         np.testing.assert_array_equal(
             again.correspondences.packed_cells, frame.correspondences.packed_cells
         )
@@ -74,6 +79,10 @@ def test_what_is_written_is_read(kept, tmp_path):
         assert one.index == other.index
         np.testing.assert_array_equal(one.colors, other.colors)
         np.testing.assert_array_equal(one.view.near_person_bits, other.view.near_person_bits)
+        for part, other_part in zip(one.head, other.head, strict=True):
+            part, other_part = (getattr(p, "near_person_bits", p) for p in (part, other_part))
+            np.testing.assert_array_equal(part, other_part)
+        assert one.head[0].camera.center_px == other.head[0].camera.center_px
         for name in ("focal_px", "center_px", "size_px", "distortion"):
             assert getattr(one.view.camera, name) == getattr(other.view.camera, name)
         np.testing.assert_array_equal(one.pose.joint_rotations, other.pose.joint_rotations)
