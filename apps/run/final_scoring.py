@@ -48,7 +48,7 @@ from avatar.training.checkpoint import (
 from avatar.training.held_out_pose_fitting import fit_test_poses
 from avatar.training.trainer import Trainer
 
-SCORING_LIMIT_S = 20.0
+SCORING_LIMIT_S = 12.0
 """Wall time that final scoring and pose fitting aim for."""
 WHOLE_IMAGES_SHARE = 0.2
 """Share of that time after which frames in given poses are no longer scored as whole images."""

@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Int
+from jaxtyping import Float32, Float64, Int
 
 from avatar.avatar_model import Avatar
 from avatar.correspondence_grid import CorrespondenceGrid
@@ -202,13 +202,20 @@ class PixelSample:
 
     def score(self, avatar: Avatar) -> HeldOutScore:
         """Renders the pixels and compares them with the frame."""
+        return self.score_colors(self.render_colors(avatar))
+
+    def psnr(self, avatar: Avatar) -> float:
+        """The score's PSNR alone, dB: blur takes as long to measure as the pixels to render."""
+        return psnr_of_errors(self._errors(self.render_colors(avatar)), self.areas)
+
+    def render_colors(self, avatar: Avatar) -> Float32[np.ndarray, "pixels 4"]:
+        """The avatar's premultiplied colors of the pixels, in the frame's pose."""
         seen = self.frame.observation
         cells = self.correspondences or self.frame.correspondences
         posed = PosedAvatar.of(avatar, seen.pose, seen.camera, cells=cells, shaded=True)
         rows, columns = np.divmod(self.places, seen.camera.size_px[0])
-        return self.score_colors(
-            posed.colors_at(np.stack([columns + 0.5, rows + 0.5], axis=-1).astype(np.float64))
-        )
+        pixels = np.stack([columns + 0.5, rows + 0.5], axis=-1).astype(np.float64)
+        return posed.colors_at(pixels)
 
     def score_rendering(self, rendering: Float32[np.ndarray, "height width 4"]) -> HeldOutScore:
         """Compares the same pixels of a whole rendering with the frame."""
@@ -216,9 +223,7 @@ class PixelSample:
 
     def score_colors(self, colors: Float32[np.ndarray, "pixels 4"]) -> HeldOutScore:
         """Compares premultiplied colors of the pixels with the frame; SSIM is not measured."""
-        image = np.clip(composite_on_white(self.frame.expose(colors)), 0.0, 1.0)
-        errors = ((image.astype(np.float64) - self._truth) ** 2).mean(axis=-1)
-        inside = self._alpha > MASK_THRESHOLD
+        errors, inside = self._errors(colors), self._alpha > MASK_THRESHOLD
         psnr_mask = psnr_of_errors(errors[inside], self.areas[inside])
         return HeldOutScore(
             frame=self.frame.observation.frame.index,
@@ -228,6 +233,11 @@ class PixelSample:
             blur=equivalent_blur(psnr_mask, self.frame.blur_calibration),
             overlap=soft_iou(colors[:, 3] * self.areas, self._alpha * self.areas),
         )
+
+    def _errors(self, colors: Float32[np.ndarray, "pixels 4"]) -> Float64[np.ndarray, "pixels"]:
+        """Squared errors of colors on white, the mean over channels."""
+        image = np.clip(composite_on_white(self.frame.expose(colors)), 0.0, 1.0)
+        return ((image.astype(np.float64) - self._truth) ** 2).mean(axis=-1)
 
     @cached_property
     def _alpha(self) -> Float32[np.ndarray, "pixels"]:
@@ -241,3 +251,8 @@ class PixelSample:
 def score_fine_sample(avatar: Avatar, frame: HeldOutFrame) -> HeldOutScore:
     """Scores a frame by 4,096 of its pixels: about 0.1 dB off, and SSIM is not measured."""
     return PixelSample.of(frame, density=FINE_DENSITY).score(avatar)
+
+
+def fine_sample_psnr(avatar: Avatar, frame: HeldOutFrame) -> float:
+    """PSNR of `score_fine_sample`, dB."""
+    return PixelSample.of(frame, density=FINE_DENSITY).psnr(avatar)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from avatar.correspondence_grid import CorrespondenceGrid
-from avatar.evaluation.held_out import HeldOutFrame, score_fine_sample
+from avatar.evaluation.held_out import HeldOutFrame, fine_sample_psnr
 from avatar.training.frame_exposure import FrameExposures
 from avatar.training.frame_stream import prepare_frame
 from avatar.training.pose_correction import interpolate_correction
@@ -68,7 +68,7 @@ def fit_test_poses(
         if np.abs(gain - 1.0).max() > MIN_SCORED_GAIN:
             options.append(replace(frame, gain=gain))
         progress(FITTING_SHARE + (1.0 - FITTING_SHARE) * (slot + 1) / len(frames))
-        yield max(options, key=lambda option: score_fine_sample(avatar, option).psnr)
+        yield max(options, key=lambda option: fine_sample_psnr(avatar, option))
 
 
 def _fit_frames(
