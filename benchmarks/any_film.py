@@ -38,6 +38,7 @@ from avatar.training.held_out_pose_fitting import fit_test_poses
 from avatar.training.trainer import Trainer, cosine_decay
 from baselines.systems.compared_capture import ComparedCapture
 from benchmarks.hardware import ROOT, Hardware
+from benchmarks.head_scores import score_heads
 from benchmarks.real import SUBJECTS, Figures, RealJob, film_phone_capture, table_lines
 from benchmarks.stopwatch import limit_threads
 from capture.source_opening import open_source
@@ -167,6 +168,11 @@ def measure_film(job: AnyFilmJob, folder: Path, frames: slice | None, name: str)
     step_ms = train_for_steps(trainer, job.steps)
     held_out = spread(compared.held_out, SCORED_HELD_OUT)
     figures = avatar_figures(trainer, held_out, compared.novel, job.folder / f"{name}.png")
+    if size_px < longer_side(folder):
+        filmed = ComparedCapture.open(folder, None, frames=frames).held_out
+        head = score_heads(trainer, spread(filmed, SCORED_HELD_OUT))
+        figures["head as filmed, fitted: PSNR, dB"] = None if head is None else head.whole
+        figures["head as filmed, without its border: PSNR, dB"] = head and head.inside
     figures |= {
         "skin that was seen, %": 100.0 * float(trainer.unseen.evidence.seen.mean()),
         "samples a ray": trainer.samples / trainer.rays,

@@ -98,7 +98,7 @@ class IngestArguments(CaptureArguments):
     frame and pose."""
     size: Annotated[int | None, arg(metavar="PX", help_behavior_hint="")] = None
     """Longer side of training images in pixels; never upscaled (default: 540 for 60 s, proportional
-    to the square root of --seconds)."""
+    to the square root of --seconds). The head is learnt in the video's own resolution."""
     hold_out: Annotated[int, arg(metavar="N", help_behavior_hint="(default: 10)")] = HELD_OUT_STRIDE
     """Hold out every Nth frame for evaluation; 0 trains on all frames."""
     refine_poses: Annotated[bool, arg(help_behavior_hint="")] = True

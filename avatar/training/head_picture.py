@@ -39,7 +39,7 @@ def picture_head(observation: Observation, rig: Rig) -> TrainingPixels | None:
         rgb = observation.frame.rgb
     height, width = rgb.shape[:2]
     camera = observation.camera.resize((width, height))
-    left, top, right, bottom = _head_box(camera, observation.pose, rig)
+    left, top, right, bottom = head_box(camera, observation.pose, rig)
     if right - left < 2 or bottom - top < 2:
         return None
     camera = camera.crop((left, top), (right - left, bottom - top))
@@ -76,7 +76,7 @@ def head_pixels(view: RayView, colors: UInt8[np.ndarray, "near 4"]) -> TrainingP
     return TrainingPixels(view, PixelRuns.of(near, np.zeros_like(near)), colors)
 
 
-def _head_box(camera: Camera, pose: BodyPose, rig: Rig) -> tuple[int, int, int, int]:
+def head_box(camera: Camera, pose: BodyPose, rig: Rig) -> tuple[int, int, int, int]:
     """Left, upper, right and lower border of the head in the picture, pixels."""
     head = body_from_rest(rig.rest_joints, rig.parents, pose.joint_rotations)[HEAD_JOINT]
     middle = rig.rest_joints[HEAD_JOINT] + np.array([0.0, HEAD_UP_M, 0.0])
