@@ -131,6 +131,8 @@ def _fit_to_masks(
     fitted = apply_fit(capture, fit, height_m=arguments.capture_inputs().height_m)
     for note in fitted.notes[len(capture.notes) :]:
         console.info(note)
+    if (advice := fit.advice()) is not None:
+        console.warning(advice)
     return fitted
 
 

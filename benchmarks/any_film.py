@@ -52,6 +52,8 @@ SCORED_HELD_OUT = 6
 """Held-out frames that are scored, evenly spread."""
 VALIDATION_VIEWS = 4
 """Held-out views that a package is validated with."""
+COARSE_SUBJECT: Literal[1, 2, 3] = 2
+"""The actor whose whole film is also learnt from coarse poses, and from none."""
 FILM_FRAMES = 120
 """Most frames, evenly spread, of a film of your own that are learnt from."""
 
@@ -66,6 +68,8 @@ class AnyFilmJob:
     """How many phone-like actors; 0: only the films named."""
     cuts: tuple[Literal["sixth", "third", "half", "all"], ...] = ("sixth", "third", "half", "all")
     """Parts of the actors' films."""
+    coarse_error: float = 2.5
+    """Factor of a good tracker's errors in poses that are compared with none at all; 0: not done."""
     size: int = 400
     """Height of the actors' pictures, and longer side of training."""
     frames: int = 120
@@ -88,7 +92,9 @@ class AnyFilmJob:
         """The job with what `quick` means."""
         if not self.quick:
             return self
-        return replace(self, subjects=min(self.subjects, 1), cuts=("sixth",), steps=200)
+        return replace(
+            self, subjects=min(self.subjects, 1), cuts=("sixth",), steps=200, coarse_error=0.0
+        )
 
 
 def main() -> None:
@@ -116,6 +122,14 @@ def measure_all(job: AnyFilmJob) -> Iterator[tuple[str, Figures]]:
             name = f"{subject}, {cut}"
             frames = slice(0, job.frames // CUTS[cut])
             yield name, measure_film(job, film, frames, name)
+    if job.coarse_error and job.subjects:
+        coarse = film_phone_capture(filming, COARSE_SUBJECT, tracker_error=job.coarse_error)
+        tracked = track_film(coarse / "video.mp4", job.folder / f"tracked-{coarse.name}")
+        if not (tracked / "truth").exists():
+            (tracked / "truth").symlink_to(coarse / "truth")
+        for name, folder in (("coarse poses", coarse), ("no poses", tracked)):
+            name = f"{COARSE_SUBJECT}, {name}"
+            yield name, measure_film(job, folder, None, name)
     for film in job.films:
         name = film.resolve().stem
         folder = film if film.is_dir() else track_film(film, job.folder / f"tracked-{name}")

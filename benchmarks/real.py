@@ -146,12 +146,24 @@ def measure_phone_capture(job: RealJob, subject: Literal[1, 2, 3]) -> Figures:
 
 
 def film_phone_capture(
-    job: RealJob, subject: Literal[1, 2, 3], motion: Literal["turn", "dance"] = "turn"
+    job: RealJob,
+    subject: Literal[1, 2, 3],
+    motion: Literal["turn", "dance"] = "turn",
+    *,
+    tracker_error: float = 1.0,
 ) -> Path:
-    """The folder of a phone-like capture, which is filmed unless it lies there already."""
+    """The folder of a phone-like capture, which is filmed unless it lies there already.
+
+    Args:
+        job: Size, length and seed of the film, and the folder above.
+        subject: Who is filmed.
+        motion: What the subject does.
+        tracker_error: Factor of a good tracker's errors in the given poses.
+    """
     width = 2 * round(job.size * 9 / 32)
     named = f"phone-{subject}-{width}px-{job.frames}-seed{job.seed}"
-    capture = job.folder / (named if motion == "turn" else f"{named}-{motion}")
+    named = named if motion == "turn" else f"{named}-{motion}"
+    capture = job.folder / (named if tracker_error == 1.0 else f"{named}-error{tracker_error:g}")
     if not capture.exists():
         config = ShootConfig(
             frames=job.frames,
@@ -160,6 +172,7 @@ def film_phone_capture(
             subject=subject,
             like_a_phone=True,
             motion=motion,
+            tracker_error=tracker_error,
         )
         film_capture(capture, config)
     return capture

@@ -1,5 +1,7 @@
 """What a fit changes, and that a resumed run reads it again."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -36,3 +38,12 @@ def test_the_fit_of_another_video_is_not_taken(fit, tmp_path):
 def test_the_description_names_quantities_and_units(fit):
     assert "1.6 cm" in fit.describe()
     assert "5.7 degrees" in fit.describe()
+
+
+def test_poses_that_the_fit_turns_far_are_said_to_disagree_with_the_film(fit):
+    assert fit.advice() is None
+    corrections = np.zeros((4, 75))
+    corrections[:, 3:72:3] = np.radians(6.5)
+    advice = replace(fit, corrections=corrections).advice()
+    assert "6.5 degrees" in advice
+    assert "without --poses" in advice
