@@ -69,7 +69,7 @@ class AnyFilmJob:
     cuts: tuple[Literal["sixth", "third", "half", "all"], ...] = ("sixth", "third", "half", "all")
     """Parts of the actors' films."""
     coarse_error: float = 2.5
-    """Factor of a good tracker's errors in poses that are compared with none at all; 0: not done."""
+    """Factor of a good tracker's errors in poses that are compared with none; 0: not done."""
     size: int = 400
     """Height of the actors' pictures, and longer side of training."""
     frames: int = 120
