@@ -23,8 +23,8 @@ from apps.run.run_folder import RunFolder
 from capture.atomic_files import write_text_atomically
 from capture.input_error import InputError
 from preprocess.capture_session import Capture
+from preprocess.fitting.capture_fit import load_capture_fit
 from preprocess.fitting.capture_fitting import apply_fit, fit_capture
-from preprocess.fitting.clip_fitting import load_capture_fit
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -130,7 +130,8 @@ MECHANISMS = [
         code=("avatar.avatar_model.OrientationShading", "avatar.kernels.numba_shading"),
     ),
     Mechanism(
-        name="more rays for the head", patched={"avatar.training.replay_buffer.HEAD_RAY_SHARE": 0.0}
+        name="more rays for the head",
+        patched={"avatar.training.replay_buffer.HEAD_SIDE_RAY_SHARE": 0.0},
     ),
     Mechanism(
         name="mean of the parameters",

@@ -134,7 +134,6 @@ def export_avatar(
     """
     occupied = avatar.rendering_grid().occupied.cpu().numpy()
     device = avatar.field.table.device
-    finest_m = 1.0 / float(avatar.field.levels.cells_per_m[-1])
 
     def field_at(
         points: Float32[torch.Tensor, "points 3"],
@@ -142,7 +141,7 @@ def export_avatar(
         rgb, density = avatar.color_and_density_at(points.to(device))
         return rgb.cpu(), density.cpu()
 
-    config = config or BakeConfig.for_cell_size(finest_m)
+    config = config or BakeConfig.for_sample_step(avatar.sample_step_m)
     config = config if fine_tune_bricks else replace(config, fine_tuning_pictures=0)
     return export_field(
         field_at,

@@ -17,7 +17,7 @@ from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.capture_paths import CapturePaths, find_parts
-from preprocess.fitting.clip_fitting import CaptureFit
+from preprocess.fitting.capture_fit import CaptureFit
 from preprocess.live_inputs import LiveInputs
 from preprocess.masks.mask_files import Masks
 from preprocess.masks.mask_refinement import GivenMaskRefiner

@@ -19,8 +19,8 @@ from capture.image_folder import any_has_cutout_alpha, list_images, read_image
 from capture.input_error import InputError
 from capture.source import FrameSource
 from preprocess.capture_session import Capture, CaptureInputs
+from preprocess.fitting.capture_fit import load_capture_fit
 from preprocess.fitting.capture_fitting import apply_fit
-from preprocess.fitting.clip_fitting import load_capture_fit
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
 

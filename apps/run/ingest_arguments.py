@@ -18,7 +18,7 @@ from capture.input_error import InputError
 from capture.live_sources import IDLE_TIMEOUT_S, camera_address
 from preprocess.alignment.mask_alignment import MAX_HEIGHT_CM, MIN_HEIGHT_CM
 from preprocess.capture_session import Capture, CaptureInputs
-from preprocess.fitting.clip_fitting import load_capture_fit
+from preprocess.fitting.capture_fit import load_capture_fit
 from preprocess.open_capture import open_capture
 from preprocess.plugins import segmenter_name
 

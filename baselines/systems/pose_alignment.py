@@ -17,7 +17,7 @@ from scipy.ndimage import distance_transform_edt
 from avatar.evaluation.image_metrics import composite_on_white, ground_truth_on_white
 from preprocess.body.kinematics import descendant_matrix
 from preprocess.body.parametric_body import ShapedBody
-from preprocess.fitting.clip_fitting import correct_pose
+from preprocess.fitting.capture_fit import correct_pose
 from preprocess.fitting.clip_poses import POSE_SIGMA
 from preprocess.observation import Observation
 from studio.lighting import NO_FACE, rasterize

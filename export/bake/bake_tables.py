@@ -98,10 +98,11 @@ THICK_SURFACE_DENSITY = 12.0
 behind."""
 BRICK_MARGIN_M = 0.012
 """Distance outside the surface that bricks cover, metres."""
-VOXEL_TO_CELL_RATIO = 0.53
-"""Voxel size in units of the field's finest cells: finer voxels cost bytes and show nothing."""
+VOXEL_TO_SAMPLE_RATIO = 0.53
+"""Voxel size in units of the distance between samples in training: finer voxels cost bytes and show
+nothing, also where the field's cells are finer for the head's sake."""
 MIN_VOXEL_M = 0.0038
-"""Smallest voxel that follows from a field's cells, metres."""
+"""Smallest voxel that follows from a field's samples, metres."""
 MAX_VOXEL_M = 0.006
 """Largest voxel, metres."""
 BRICK_BYTES = 2.4e6
@@ -151,9 +152,9 @@ class BakeConfig:
     fine_tuning_pictures: int = 0
 
     @classmethod
-    def for_cell_size(cls, finest_cell_m: float) -> "BakeConfig":
-        """Choose voxels of about half the field's finest cells, within bounds, and fine-tuning."""
-        voxel_m = float(np.clip(VOXEL_TO_CELL_RATIO * finest_cell_m, MIN_VOXEL_M, MAX_VOXEL_M))
+    def for_sample_step(cls, sample_step_m: float) -> "BakeConfig":
+        """Choose voxels of about half the distance of samples, within bounds, and fine-tuning."""
+        voxel_m = float(np.clip(VOXEL_TO_SAMPLE_RATIO * sample_step_m, MIN_VOXEL_M, MAX_VOXEL_M))
         return cls(voxel_m=voxel_m, fine_tuning_pictures=FINE_TUNING_PICTURES)
 
     def for_thick_field(self, brick_bytes: float) -> "BakeConfig":

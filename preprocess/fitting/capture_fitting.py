@@ -25,12 +25,12 @@ from preprocess.body.body_surface import SkinPoints
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.proportion_space import SIGMA_BETA, ProportionSpace
 from preprocess.capture_session import Capture
+from preprocess.fitting.capture_fit import CaptureFit
 from preprocess.fitting.clip_fitting import (
     SIGMA_LOG_ASSUMED_FOCAL,
     SIGMA_LOG_FOCAL,
     TRACKED_WEIGHTS,
     USUAL_WEIGHTS,
-    CaptureFit,
     ClipFitter,
     ClipFrame,
     EvidenceWeights,

@@ -4,27 +4,19 @@ A tracker's poses are off by several degrees and centimetres, slowly varying and
 its body has other proportions than the person, and the focal length is a guess. All of it is fitted
 at once by Gauss-Newton: residuals are distances between outlines (`preprocess.fitting.outlines`),
 priors hold what outlines leave undetermined, and corrections of neighboring frames are alike.
-What a fit changes of a capture is a `CaptureFit`, which is saved with a run.
+What a fit changes of a capture is a `CaptureFit` (`preprocess.fitting.capture_fit`).
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import NamedTuple, final
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
-from capture.atomic_files import atomic_file
 from capture.camera import Camera
-from capture.input_error import InputError
-from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.body.body_pose import BodyPose, Motion
-from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.proportion_space import ProportionSpace
-from preprocess.cameras.camera_file import CameraTrack
-from preprocess.file_content import read_npz
 from preprocess.fitting.clip_poses import POSE_SIGMA, ClipPoses, GivenPosePrior, HumanPosePrior
 from preprocess.fitting.keypoint_rows import ClipCameras, ClipKeypoints, KeypointModel
 from preprocess.fitting.normal_equations import ChainEquations
@@ -47,10 +39,6 @@ MAX_LOG_FOCAL_STEP = 0.1
 """Largest change of the logarithm of the focal length in one iteration."""
 USUAL_FPS = 30.0
 """Frames per second of a film that does not say."""
-MAX_USUAL_TURN_DEG = 5.0
-"""Mean rotation by which the fit changes joints of usual given poses, degrees. From poses that it
-changed by 3, avatars were better than from the built-in tracker's; from such of 7 worse, by 2 dB
-on held-out frames."""
 HELD_PRECISION = 1e9
 """Precision that holds a parameter that is not fitted."""
 
@@ -279,130 +267,3 @@ def _times_s(
     if track.times_s is None:
         return numbers / USUAL_FPS
     return np.interp(numbers, track.frames, track.times_s)
-
-
-def correct_pose(
-    pose: BodyPose,
-    correction: Float[np.ndarray, "75"],
-    camera_from_world: Float[np.ndarray, "4 4"],
-) -> BodyPose:
-    """A pose with a correction: rotations in the joints' axes, translation in the camera's."""
-    given = Rotation.from_rotvec(np.concatenate([pose.root_rotation[None], pose.joint_rotations]))
-    turned = (given * Rotation.from_rotvec(correction[:72].reshape(24, 3))).as_rotvec()
-    return BodyPose(
-        root_rotation=turned[0],
-        root_translation=pose.root_translation + correction[72:] @ camera_from_world[:3, :3],
-        joint_rotations=turned[1:],
-    )
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class CaptureFit:
-    """What the alignment of a capture changes.
-
-    Attributes:
-        coefficients: Proportions, in prior standard deviations.
-        focal_factor: Factor of the focal lengths.
-        corrections: Correction of each row of the motion: root and joint rotations, root position.
-        error_before_cm: Root mean square distance between outlines of body and masks, cm; of poses
-            that were made of key points: after a fit to these alone.
-        error_after_cm: The same with the whole of the changes.
-        share: Share of the changes that is made, in [0, 1], and how far the given poses are
-            estimates: none where they are exact, 1 where they were made of key points.
-        fits_body: Whether proportions could change; not those of a finished avatar's person.
-    """
-
-    coefficients: Float[np.ndarray, "coefficients"]
-    focal_factor: float
-    corrections: Float[np.ndarray, "poses 75"]
-    error_before_cm: float
-    error_after_cm: float
-    share: float
-    fits_body: bool
-
-    def shape(self, shaped: ShapedBody) -> ShapedBody:
-        """The person, with fitted proportions."""
-        return ProportionSpace.around(shaped).shape(self.coefficients)
-
-    def scale_focal_lengths(self, cameras: CameraTrack) -> CameraTrack:
-        """The cameras, with the fitted focal length."""
-        return cameras.scale_focal(self.focal_factor)
-
-    def correct_motion(self, geometry: CaptureGeometry) -> Motion:
-        """The motion of the geometry that was fitted, with a correction of each row."""
-        motion, cameras = geometry.motion, geometry.camera_rows()
-        poses = [
-            correct_pose(motion[row], self.corrections[row], geometry.extrinsics[cameras[row]])
-            for row in range(len(motion))
-        ]
-        return replace(
-            motion,
-            root_rotations=np.stack([pose.root_rotation for pose in poses]),
-            root_translations=np.stack([pose.root_translation for pose in poses]),
-            joint_rotations=np.stack([pose.joint_rotations for pose in poses]),
-        )
-
-    def describe(self) -> str:
-        """Describe the changes, for people."""
-        turned = self._mean_turns_deg()
-        return (
-            "Body, poses and focal length were fitted to the masks: their outlines were "
-            f"{self.error_before_cm:.1f} cm apart, and {self.error_after_cm:.1f} cm by the fit, of "
-            f"which {self.share:.0%} was made (the root turned by {turned[0]:.1f} "
-            f"degrees on average, other joints by {turned[1:].mean():.1f}; focal length times "
-            f"{self.focal_factor:.2f})."
-        )
-
-    def advice(self) -> str | None:
-        """Say that the given poses were far from the film; None if they were not."""
-        turn_deg = self._mean_turns_deg()[1:].mean()
-        if turn_deg <= MAX_USUAL_TURN_DEG:
-            return None
-        return (
-            f"The given poses disagree with the film: joints had to turn by {turn_deg:.1f} degrees "
-            "on average, those of good trackers by 2 to 4. The built-in tracker is likely nearer: "
-            "try it without --poses (and with the poses' file out of the video's folder)."
-        )
-
-    def _mean_turns_deg(self) -> Float[np.ndarray, "24"]:
-        """Mean rotation of the root and of each joint, degrees."""
-        vectors = self.corrections[:, :72].reshape(-1, 24, 3)
-        return np.degrees(np.linalg.norm(vectors, axis=2)).mean(axis=0)
-
-    def as_json(self) -> dict[str, float | bool]:
-        """Figures for the report."""
-        return {
-            "taken": self.share > 0.0,
-            "share": round(self.share, 3),
-            "outline_cm_before": round(self.error_before_cm, 3),
-            "outline_cm_after": round(self.error_after_cm, 3),
-            "focal_factor": round(self.focal_factor, 4),
-        }
-
-    def save(self, path: Path, video: str) -> None:
-        """Write the changes, for a run that is resumed.
-
-        Args:
-            path: File, .npz.
-            video: What identifies the capture's video.
-        """
-        with atomic_file(path) as unfinished:
-            np.savez(unfinished, **vars(self), video=video)
-
-
-def load_capture_fit(path: Path, video: str) -> CaptureFit | None:
-    """Read what `CaptureFit.save` wrote; None if there is nothing for this video."""
-    if not path.is_file():
-        return None
-    scalars = ("focal_factor", "error_before_cm", "error_after_cm", "share", "fits_body")
-    try:
-        read = read_npz(path, ("coefficients", "corrections", "video", *scalars))
-        if str(read["video"]) != video:
-            return None
-        return CaptureFit(
-            coefficients=read["coefficients"],
-            corrections=read["corrections"],
-            **{name: read[name].item() for name in scalars},
-        )
-    except (InputError, KeyError):
-        return None

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from baselines.systems.pose_alignment import align_pose
-from preprocess.fitting.clip_fitting import correct_pose
+from preprocess.fitting.capture_fit import correct_pose
 from preprocess.fitting.clip_poses import POSE_SIGMA
 from studio.actor import Actor
 

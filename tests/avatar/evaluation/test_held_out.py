@@ -74,7 +74,7 @@ def test_frames_are_prepared_in_order_and_those_left_out_pass_through(rig, clip)
         TrainingFrame,
     ]  # fmt: skip
     assert ready[5] is items[5]
-    assert ready[2].observation is items[2]
+    assert ready[2].observation.frame is items[2].frame
     indices = [item.index for item in ready if isinstance(item, TrainingFrame)]
     assert indices == [0, 1, 3, 4, 6]
 

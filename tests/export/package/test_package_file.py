@@ -244,9 +244,9 @@ def test_the_fog_of_an_untrained_avatar_is_written_with_a_warning(
 
 
 def test_voxels_follow_the_field_within_bounds():
-    assert BakeConfig.for_cell_size(0.001).voxel_m == MIN_VOXEL_M
-    assert MIN_VOXEL_M < BakeConfig.for_cell_size(0.009).voxel_m < MAX_VOXEL_M
-    assert BakeConfig.for_cell_size(0.1).voxel_m == MAX_VOXEL_M
+    assert BakeConfig.for_sample_step(0.001).voxel_m == MIN_VOXEL_M
+    assert MIN_VOXEL_M < BakeConfig.for_sample_step(0.009).voxel_m < MAX_VOXEL_M
+    assert BakeConfig.for_sample_step(0.1).voxel_m == MAX_VOXEL_M
 
 
 def test_a_quick_package_is_coarser_and_has_one_tier(export, exported, coarse, views):
@@ -257,7 +257,7 @@ def test_a_quick_package_is_coarser_and_has_one_tier(export, exported, coarse, v
         read_package(exported.path).tables["hq"].surfels.positions
     )
     assert Player(package).render(*views["bent"])[..., 3].max() > 200
-    assert BakeConfig.for_cell_size(0.1).quick().voxel_m == MAX_VOXEL_M
+    assert BakeConfig.for_sample_step(0.1).quick().voxel_m == MAX_VOXEL_M
 
 
 def test_a_full_disk_leaves_the_older_package(exported, tmp_path, monkeypatch):

@@ -10,13 +10,13 @@ import pytest
 from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.capture_session import CaptureInputs
+from preprocess.fitting.capture_fit import CaptureFit
 from preprocess.fitting.capture_fitting import (
     NOISE_DEG_PER_CM,
     apply_fit,
     fit_capture,
     share_beyond_noise,
 )
-from preprocess.fitting.clip_fitting import CaptureFit
 from preprocess.open_capture import open_capture
 from studio.shoot import ShootConfig, film_capture
 

@@ -11,7 +11,7 @@ from preprocess.body.body_surface import SkinPoints, splat_silhouette
 from preprocess.body.kinematics import joint_transforms, rotation_matrices
 from preprocess.body.parametric_body import load_body_model
 from preprocess.body.proportion_space import ProportionSpace
-from preprocess.fitting.clip_fitting import correct_pose
+from preprocess.fitting.capture_fit import correct_pose
 from preprocess.fitting.outlines import OUTLINE_SKIN_POINTS, OutlineDistances, OutlineModel
 
 VIEW = np.diag([1.0, -1.0, -1.0, 1.0])
