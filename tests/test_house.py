@@ -17,7 +17,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 STAGES = ("capture", "preprocess", "avatar", "export", "studio", "apps")
 """Production packages, in the order of the data flow; imports point the other way."""
-MAX_MODULE_LINES = 400
+MAX_MODULE_LINES = 600
 MAX_FUNCTION_LINES = 60
 MAX_ARGUMENTS = 10
 MAX_KERNEL_LINES = 100
@@ -196,7 +196,7 @@ def test_a_module_holds_one_idea():
         for path, _ in sources()
     }
     too_long = {path: count for path, count in lines.items() if count > MAX_MODULE_LINES}
-    assert not too_long, f"over {MAX_MODULE_LINES} lines (60 to 300 are the aim): {too_long}"
+    assert not too_long, f"over {MAX_MODULE_LINES} lines (60 to 400 are the aim): {too_long}"
 
 
 def test_a_function_fits_a_screen():
