@@ -20,6 +20,7 @@ from apps.evaluation.evaluation_frames import (
 )
 from apps.evaluation.frame_scoring import FrameJudge, FrameRenderer, PremultipliedImage, ShownFrame
 from apps.evaluation.score_table import AvatarEvaluation, ScoreRow
+from apps.report.report_page import data_uri
 from apps.report.report_writer import motion_animation
 from apps.run.run_folder import RunFolder
 from apps.run.session_start import resolve_device
@@ -297,7 +298,7 @@ class EvaluationSession:
         for path in self.arguments.dance:
             with self.console.status(f"drawing {path}"):
                 motion = load_driving_motion(path, player.manifest.rest_joints, self.console)
-                drawn[path.stem] = motion_animation(player, motion)
+                drawn[path.stem] = data_uri(motion_animation(player, motion))
         return drawn
 
     def _backgrounds(self, usual: tuple[str, ...]) -> tuple[str, ...]:

@@ -67,18 +67,23 @@ def to_uint8(
 
 def webp_data_uri(picture: UInt8[np.ndarray, "height width channels"]) -> str:
     """Encode an RGB or RGBA image as a data URI."""
-    return animated_webp_data_uri([picture], fps=1.0)
+    return data_uri(encode_webp([picture], fps=1.0))
 
 
-def animated_webp_data_uri(
+def data_uri(webp: bytes) -> str:
+    """Return the content of a WebP file as a data URI."""
+    return "data:image/webp;base64," + base64.b64encode(webp).decode("ascii")
+
+
+def encode_webp(
     pictures: Sequence[UInt8[np.ndarray, "height width channels"]], *, fps: float
-) -> str:
-    """Encode RGB or RGBA images as a data URI; several are a looping animation."""
+) -> bytes:
+    """Encode RGB or RGBA images as WebP; several are a looping animation."""
     first, *others = [Image.fromarray(picture) for picture in pictures]
     frame_ms, buffer = max(1, round(1000.0 / fps)), io.BytesIO()
     moving = {"save_all": True, "append_images": others, "duration": frame_ms, "loop": 0}
     first.save(buffer, format="WEBP", quality=82, method=3, **(moving if others else {}))
-    return "data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode("ascii")
+    return buffer.getvalue()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,7 +13,8 @@ from apps.cli.shared_options import option_words
 from apps.report.report_figures import CoverageMap
 from apps.report.report_page import (
     ComparisonPair,
-    animated_webp_data_uri,
+    data_uri,
+    encode_webp,
     report_page,
     to_uint8,
     webp_data_uri,
@@ -36,7 +37,7 @@ from avatar.evaluation.image_metrics import (
     ground_truth_on_white,
     overall_verdict,
 )
-from capture.atomic_files import write_text_atomically
+from capture.atomic_files import atomic_file, write_text_atomically
 from capture.live_sources import camera_address
 from capture.process_metrics import peak_memory_mb
 from export.player import Player
@@ -105,7 +106,7 @@ def write_report(
     startup_seconds: float,
     threads: int,
 ) -> Report:
-    """Write report.json, then report.html; each appears whole or not at all.
+    """Write report.json, turning.webp and report.html; each appears whole or not at all.
 
     Args:
         result: Baked and scored.
@@ -126,12 +127,17 @@ def write_report(
     )  # fmt: skip
     write_text_atomically(run.report_json, report.to_json())
     with console.status("drawing the report"):
+        animation = None
+        if package is not None:
+            animation = demo_animation(Player.load(run.package))
+            with atomic_file(run.animation) as part:
+                part.write_bytes(animation)
         page = report_page(
             report,
             name=capture.paths.video.name,
             body_map=CoverageMap(capture.shaped, result.coverage).svg(),
             pairs=comparison_pairs(result),
-            animation=None if package is None else demo_animation(Player.load(run.package)),
+            animation=None if animation is None else data_uri(animation),
             warnings=[*console.warnings, *filter(None, [_refusal(result)])],
             failure=diagnose_failure(report),
             present_files=[path.name for path in (run.cameras, run.poses) if path.exists()],
@@ -209,19 +215,17 @@ def comparison_pairs(result: TrainingResult) -> list[ComparisonPair]:
     return shown
 
 
-def demo_animation(player: Player) -> str:
-    """The avatar in a motion of our own, drawn by the player, as a moving picture."""
+def demo_animation(player: Player) -> bytes:
+    """The avatar in a motion of our own, drawn by the player, as an animated WebP."""
     return motion_animation(player, demo_motion(fps=ANIMATION_FPS))
 
 
-def motion_animation(player: Player, motion: Motion) -> str:
-    """Draw the first seconds of a motion by the player, as a moving picture."""
+def motion_animation(player: Player, motion: Motion) -> bytes:
+    """Draw the first seconds of a motion by the player, as an animated WebP."""
     camera = FollowingCamera.of(player, motion, ANIMATION_PX)
     frames = ResampledMotion.of(motion, fps=ANIMATION_FPS)
     poses = [frames.pose(frame) for frame in range(min(len(frames), ANIMATION_FRAMES))]
-    return animated_webp_data_uri(
-        [player.render(p, camera.camera_for(p)) for p in poses], fps=ANIMATION_FPS
-    )
+    return encode_webp([player.render(p, camera.camera_for(p)) for p in poses], fps=ANIMATION_FPS)
 
 
 def _fitted_pose_stats(result: TrainingResult) -> HeldOutStats | None:
@@ -236,6 +240,7 @@ def _package_stats(result: TrainingResult, run: RunFolder, console: Console) -> 
     exported = None if result.package is None else result.package.export_report
     if exported is None:
         run.remove(run.package)
+        run.remove(run.animation)
         return None
     for warning in exported.warnings:
         console.warning(warning)

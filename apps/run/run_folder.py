@@ -169,6 +169,11 @@ class RunFolder:
         return self.path / "report.html"
 
     @property
+    def animation(self) -> Path:
+        """The avatar in novel poses, as the report shows it."""
+        return self.path / "turning.webp"
+
+    @property
     def checkpoint(self) -> Path:
         """The folder from which training can continue."""
         return self.path / "checkpoint"
@@ -211,7 +216,8 @@ class RunFolder:
     @property
     def files(self) -> tuple[Path, ...]:
         """All files that a run may write, except for the stages of camera solving."""
-        top = (self.package, self.report_json, self.report_html, self.cameras, self.poses)
+        top = (self.package, self.report_json, self.report_html, self.animation)
+        top += (self.cameras, self.poses)
         return (*top, *(self.checkpoint / name for name in CHECKPOINT_FILES))
 
     def has_run(self) -> bool:

@@ -48,12 +48,13 @@ def report(run):
     return json.loads((run / "report.json").read_text())
 
 
-def test_a_run_leaves_four_things(run):
+def test_a_run_leaves_five_things(run):
     assert sorted(file.name for file in run.iterdir() if file.name != LIST) == [
         "avatar.iavatar",
         "checkpoint",
         "report.html",
         "report.json",
+        "turning.webp",
     ]
 
 

@@ -26,8 +26,9 @@ from apps.report.report_schema import (
     format_psnr,
 )
 from apps.report.report_writer import (
-    animated_webp_data_uri,
+    data_uri,
     diagnose_failure,
+    encode_webp,
     play_command,
     webp_data_uri,
 )
@@ -222,7 +223,7 @@ def test_the_page_is_whole_and_asks_for_no_other_file():
         report(),
         name="a <b> & c.mp4",
         pairs=[ComparisonPair(frame=9, psnr=30.0, verdict="soft", truth=white, render=white)],
-        animation=animated_webp_data_uri([np.zeros((4, 4, 4), np.uint8)] * 3, fps=10.0),
+        animation=data_uri(encode_webp([np.zeros((4, 4, 4), np.uint8)] * 3, fps=10.0)),
         warnings=["masks <turned>", "Frame 7 is left out: pose invalid."],
     )
     tags = Tags(page)
