@@ -278,7 +278,8 @@ def test_the_words_are_those_of_the_field():
     unclear = [
         f"{name}:{number}: {found.group()}"
         for name, text in tracked_texts()
-        if name.endswith((".py", ".md", ".js", ".css", ".html", ".toml")) and not name.startswith(QUOTED)
+        if name.endswith((".py", ".md", ".js", ".css", ".html", ".toml"))
+        and not name.startswith(QUOTED)
         for number, line in enumerate(text.splitlines(), start=1)
         for found in UNCLEAR_WORDS.finditer(line.replace("_", " "))
     ]
