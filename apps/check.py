@@ -34,7 +34,7 @@ from apps.run.person_tracking import (
     print_grade,
     track_person,
 )
-from capture.atomic_files import write_text_atomically
+from capture.atomic_files import OutputFileList, write_text_atomically
 from capture.input_error import InputError
 from capture.live_sources import camera_address
 from preprocess.alignment.silhouette_objective import GOOD_IOU, USABLE_IOU
@@ -101,10 +101,19 @@ class CheckArguments(CaptureArguments):
             raise InputError(
                 f"--sheet is {self.sheet}, but must end in {', '.join(IMAGE_SUFFIXES)}."
             )
-        check_output_file(self.sheet_path(), "--sheet", inputs, overwrite=self.overwrite)
+        path = self.sheet_path()
+        check_output_file(path, "--sheet", inputs, overwrite=self.may_replace_sheet)
         if self.fix is not None:
             check_disjoint_from_inputs(self.fix, "--fix", inputs)
             check_new_or_empty(self.fix)
+
+    @property
+    def may_replace_sheet(self) -> bool:
+        """Whether the sheet may replace a file: with --overwrite, or an earlier default one."""
+        path = self.sheet_path()
+        return self.overwrite or (
+            self.sheet is None and OutputFileList(path.parent).owns(path.name)
+        )
 
     def sheet_path(self) -> Path:
         """Return the path of the contact sheet."""

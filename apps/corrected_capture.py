@@ -61,7 +61,7 @@ def write_corrected_capture(check: CaptureValidation, out: Path) -> None:
     check_new_or_empty(out)
     source, healed = check.recording.source, check.diagnosis.corrected
     frames = source.frames_in_file
-    with atomic_folder(out, listed=False) as part:
+    with atomic_folder(out) as part:
         missing = _write_film(source, healed.video_transform, part)
         _write_masks(check, healed, part)
         claim = _to_film_frames(healed, frames)

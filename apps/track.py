@@ -138,7 +138,7 @@ class TrackArguments:
             raise InputError(f"{folder} holds a run of ia-ingest; {advice}")
         written = [poses, self.grade_path(), *([self.film_path()] if self.film else [])]
         for path in filter(os.path.lexists, written):
-            if path.is_file() and not _is_written_by_track(path):
+            if path.is_file() and not OutputFileList(folder).owns(path.name):
                 raise InputError(
                     f"{path} was not written by ia-track and would be replaced. Move it, or "
                     f"{advice}"
@@ -168,13 +168,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
     given = parse_arguments(TrackArguments, PROGRAM, argv)
     return run_command(PROGRAM, lambda: track(given, Console()))
-
-
-def _is_written_by_track(path: Path) -> bool:
-    """Whether a file is ia-track's own; other commands write poses, too, but no key points."""
-    if not OutputFileList(path.parent).owns(path.name):
-        return False
-    return path.suffix.lower() != ".npz" or "keypoint_frames" in np.load(path).files
 
 
 def next_command(arguments: TrackArguments, frames: slice | None) -> list[str]:

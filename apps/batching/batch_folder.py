@@ -161,10 +161,13 @@ class BatchFolder:
             if self.url is not None:
                 held.enter_context(self._remote_lock())
                 self._pull()
-            held.enter_context(claim_folder(self.path, console, shared=self.part is not None))
             if self.part is not None:
                 held.enter_context(claim_folder(own.parent, console))
+                held.enter_context(claim_folder(self.path, console, shared=True))
             else:
+                held.enter_context(claim_folder(self.path, console))
+                for part in sorted(self.path.glob(f"{PARTS_NAME}/*")):
+                    held.enter_context(claim_folder(part, console))
                 held.callback(OutputFileList(self.path).remove_if_empty)
             self._read()
             try:
@@ -264,7 +267,7 @@ class BatchFolder:
         wrong += [p for p in summaries if os.path.lexists(p) and not listed.owns(p.name)]
         for path in wrong:
             raise InputError(
-                f"{path} is not what ia-batch wrote (or was changed since), so it is not replaced. "
+                f"{path} is not what ia-batch wrote, so it is not replaced. "
                 "Move it elsewhere, or name another folder (--out)."
             )
 

@@ -1,16 +1,15 @@
 """Folder of a run: its files, which of them ia-ingest wrote, and the lock of its process."""
 
-import difflib
 import errno
 import json
 import os
-import re
 import shlex
-import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+
+from filelock import BaseFileLock, FileLock, Timeout
 
 from apps.cli.command_line import RESOURCE_UNAVAILABLE, CommandExit
 from apps.cli.console import Console
@@ -18,121 +17,63 @@ from apps.cli.shared_options import check_disjoint_from_inputs, check_writable, 
 from capture.atomic_files import RESERVED_PREFIX, OutputFileList
 from capture.input_error import InputError
 
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
-
 LOCK_FILE_NAME = f"{RESERVED_PREFIX}lock"
-"""Name of the locked file in the folder."""
-LOCK_LABEL_PATTERN = re.compile(r"instant-avatar-stream run, process (\d+), since (.+)\n?")
-"""Content of a lock file: process and time."""
-LOCKED_ERRNOS = frozenset({errno.EWOULDBLOCK, errno.EACCES})
-"""Errors of `flock` where another process holds the lock."""
+"""Name of the locked file in a folder."""
+NO_LOCKS_ERRNOS = frozenset({errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP})
+"""Errors of file systems without locks."""
+PROBE_S = 1.0
+"""How long a shared claim waits for another that only looks at the lock, seconds."""
 
 
 @contextmanager
 def claim_folder(folder: Path, console: Console, *, shared: bool = False) -> Iterator[None]:
     """Create and lock a folder during a block; remove the folders it made if they stayed empty.
 
+    After `kill -9` the lock file remains, but not the lock. File systems without locks cause a
+    warning.
+
     Args:
         folder: The folder.
         console: Shows warnings.
-        shared: As of `lock_folder`.
+        shared: Only check that no other process has locked the folder.
 
     Raises:
-        CommandExit, InputError: As `lock_folder`.
+        CommandExit: If another process has locked it.
     """
     made = [each for each in (folder, *folder.parents) if not each.exists()]
     folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / LOCK_FILE_NAME, timeout=PROBE_S if shared else 0.0)
     try:
-        with lock_folder(folder, console, shared=shared):
-            yield
+        _acquire(lock, folder, console)
+        if shared:
+            lock.release()
+        yield
     finally:
+        if lock.is_locked:
+            with suppress(OSError):  # Windows, where releasing it removes it
+                Path(lock.lock_file).unlink()
+            lock.release()
         for each in made:
             with suppress(OSError):  # not empty
                 each.rmdir()
 
 
-@contextmanager
-def lock_folder(folder: Path, console: Console, *, shared: bool = False) -> Iterator[None]:
-    """Lock a folder for this process; remove the lock file at the end.
-
-    After `kill -9` the file remains, but not the lock. File systems without locks cause a warning.
-
-    Args:
-        folder: An existing folder.
-        console: Shows warnings.
-        shared: Whether others may share the lock; its file is then left for them.
-
-    Raises:
-        CommandExit: If another process holds the lock.
-        InputError: If a foreign file has the lock's name.
-    """
-    path = folder / LOCK_FILE_NAME
-    descriptor = _acquire(path, console, shared=shared)
+def _acquire(lock: BaseFileLock, folder: Path, console: Console) -> None:
     try:
-        yield
-    finally:
-        if descriptor is not None:
-            if not shared:
-                path.unlink(missing_ok=True)
-            os.close(descriptor)
-
-
-def _acquire(path: Path, console: Console, *, shared: bool) -> int | None:
-    """Return the locked file's descriptor; None where files cannot be locked."""
-    while True:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
-        try:
-            label = os.read(descriptor, 1000).decode(errors="replace")
-            if label and LOCK_LABEL_PATTERN.fullmatch(label) is None:
-                raise InputError(
-                    f"{path} is not a lock of this program. Move it, or choose another folder "
-                    "(--out)."
-                )
-            if not _try_lock(descriptor, path.parent, label, console, shared=shared):
-                path.unlink(missing_ok=True)
-                os.close(descriptor)
-                return None
-            with suppress(FileNotFoundError):
-                if os.path.samestat(os.fstat(descriptor), path.stat()):
-                    break  # else a run that just ended has removed it
-        except BaseException:
-            os.close(descriptor)
-            raise
-        os.close(descriptor)
-    since = time.strftime("%Y-%m-%d %H:%M:%S")
-    text = f"instant-avatar-stream run, process {os.getpid()}, since {since}\n"
-    os.ftruncate(descriptor, 0)
-    os.pwrite(descriptor, text.encode(), 0)
-    return descriptor
-
-
-def _try_lock(descriptor: int, folder: Path, label: str, console: Console, *, shared: bool) -> bool:
-    """Lock a file; return False where the file system has no locks."""
-    try:
-        if fcntl is None:
-            raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
-        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-        return True
+        lock.acquire()
+    except Timeout:
+        raise CommandExit(
+            f"Another command is writing into {folder}. Wait until it ends, or choose another "
+            "folder (--out).",
+            RESOURCE_UNAVAILABLE,
+        ) from None
     except OSError as error:
-        if error.errno in LOCKED_ERRNOS:
-            raise CommandExit(_busy_message(folder, label), RESOURCE_UNAVAILABLE) from None
+        if error.errno not in NO_LOCKS_ERRNOS:
+            raise
         console.warning(
             f"The file system of {folder} has no locks ({error.strerror}): make sure that no other "
             "command writes into this folder at the same time."
         )
-        return False
-
-
-def _busy_message(folder: Path, label: str) -> str:
-    found = LOCK_LABEL_PATTERN.fullmatch(label)
-    who = f" (process {found[1]}, since {found[2]})" if found else ""
-    return (
-        f"Another command is writing into {folder}{who}. Wait until it ends, or choose another "
-        "folder (--out)."
-    )
 
 
 STATE_FILE = "state.pt"
@@ -145,7 +86,7 @@ CHECKPOINT_FILES = (STATE_FILE, "person.npz", "fit.npz", "frames.tensors", "earl
 class RunFolder:
     """A folder that holds one run of ia-ingest.
 
-    Files of the user may lie in it, but not where a run writes its own.
+    Files that the user puts there stay.
 
     Attributes:
         path: The folder.
@@ -237,33 +178,34 @@ class RunFolder:
             overwrite: Whether to replace an existing run.
 
         Raises:
-            InputError: If the path is a file, overlaps an input, holds foreign files where a run
-                writes, or cannot be written to.
+            InputError: If the path is a file, overlaps an input, holds files of others but no run,
+                or others where a run writes, or cannot be written to.
         """
         if resume and overwrite:
             raise InputError("--resume and --overwrite are mutually exclusive.")
         if self.path.exists() and not self.path.is_dir():
             raise InputError(f"{self.path} is a file; --out names the folder that holds the run.")
         check_disjoint_from_inputs(self.path, "--out", inputs)
-        if OutputFileList(self.path).owns("grade.json"):
-            free = shlex.quote(str(unused_path(self.path)))
+        marker, free = OutputFileList(self.path), shlex.quote(str(unused_path(self.path)))
+        if marker.owns("grade.json"):
             raise InputError(
                 f"{self.path} holds poses that ia-track wrote. Choose another folder: --out {free}"
             )
         foreign = self._foreign_file()
         if foreign is not None:
-            free = shlex.quote(str(unused_path(self.path)))
             raise InputError(
-                f"{foreign} was not written by ia-ingest and would be overwritten. Move it, or "
-                f"choose another folder: --out {free}"
+                f"{foreign} was not written by ia-ingest. Move it, or choose an empty or new "
+                f"folder: --out {free}"
             )
-        if resume and not (self.has_checkpoint() or self._was_started()):
-            raise InputError(self._nothing_to_resume_message())
+        if resume and not marker.exists():
+            raise InputError(
+                f"No run to --resume in {self.path}. To start a new run, omit --resume."
+            )
         check_writable(self.path, "--out")
 
     @contextmanager
     def claim(self, console: Console, *, resume: bool, overwrite: bool) -> Iterator[None]:
-        """Create and lock the folder during a block; remove it afterwards if it stayed empty.
+        """Create, lock and mark the folder during a block; remove it if it stayed empty.
 
         Args:
             console: Shows warnings.
@@ -280,13 +222,14 @@ class RunFolder:
                     f"{self.path} already holds a run. Continue it (--resume), replace it "
                     "(--overwrite), or choose another folder (--out)."
                 )
+            OutputFileList(self.path).create()
             try:
                 yield
             finally:
                 self.remove_empty_folders()
 
     def start_run(self, *, resume: bool) -> None:
-        """Start the lists of written files; remove an older run unless it is resumed.
+        """Mark the folders as ours; remove an older run unless it is resumed.
 
         Call it once the inputs have been found good.
 
@@ -295,9 +238,8 @@ class RunFolder:
         """
         self.checkpoint.mkdir(parents=True, exist_ok=True)
         for folder in (self.path, self.checkpoint):
-            listing = OutputFileList(folder)
-            listing.create()
-            listing.remove_temporaries()
+            OutputFileList(folder).create()
+            OutputFileList(folder).remove_temporaries()
         for path in () if resume else self.files:
             self.remove(path)
 
@@ -336,33 +278,16 @@ class RunFolder:
             with suppress(OSError):  # not empty, or missing
                 folder.rmdir()
 
-    def _was_started(self) -> bool:
-        """Whether a run was started here, even if it was killed before it wrote a file."""
-        lists = (OutputFileList(self.path), OutputFileList(self.tracking))
-        return any(each.exists() for each in lists) or (self.path / LOCK_FILE_NAME).is_file()
-
     def _foreign_file(self) -> Path | None:
-        """Return a foreign file where a run would write; None if there is none."""
+        """Return a foreign file that forbids a run here; None if there is none."""
+        if not OutputFileList(self.path).exists():
+            files = sorted(self.path.iterdir()) if self.path.exists() else []
+            return next((f for f in files if not f.name.startswith(RESERVED_PREFIX)), None)
         for path in (*self.files, self.tracked_poses, self.tracking_grade):
             if os.path.lexists(path) and not OutputFileList(path.parent).owns(path.name):
                 return path
-        for folder in (self.checkpoint, self.path / "cameras", self.tracking):
-            if os.path.lexists(folder) and not folder.is_dir():
-                return folder
-        lists = (OutputFileList(self.path), OutputFileList(self.checkpoint))
-        return next((listing.path for listing in lists if listing.path_is_foreign()), None)
-
-    def _nothing_to_resume_message(self) -> str:
-        """Tell that there is no run to resume, and suggest the one probably meant."""
-        beside = self.path.absolute().parent
-        runs = [p.parent.parent.name for p in sorted(beside.glob(f"*/checkpoint/{STATE_FILE}"))]
-        near = difflib.get_close_matches(self.path.absolute().name, runs, n=1, cutoff=0.5)
-        meant = [shlex.quote(str(self.path.with_name(name))) for name in near]
-        return (
-            f"No run to --resume in {self.path}."
-            + "".join(f" Did you mean --out {path}?" for path in meant)
-            + " To start a new run, omit --resume."
-        )
+        folders = (self.checkpoint, self.path / "cameras", self.tracking)
+        return next((f for f in folders if os.path.lexists(f) and not f.is_dir()), None)
 
 
 def is_run_report(path: Path) -> bool:

@@ -18,15 +18,11 @@ COMMANDS = {
 
 OTHERS = (
     "poses.npz", "cameras.npz", "report.json", "report.html", "avatar.iavatar", "avatar.webm",
-    "checkpoint/state.pt", "checkpoint/person.npz", "checkpoint/frames.tensors", "video.mp4",
-    "checkpoint/step_100.ckpt", "checkpoint/state.pt.part", "masks/0000.png", "images/0000.png",
-    "cameras/01/intri.yml", "0000.png", "0001.png", "dance.npz", "truth/poses.npz", "index.html",
-    "avatar.json", "mesh.glb", "mesh.ply", "clip.webm", "letter.txt", "table.md", "runs/a.png",
-    ".avatar.iavatar.swp", ".report.1234.part.json", ".capture.99.old/letter.txt", "job.json",
-    "batch0/results.jsonl", "batch1/summary.html", "batch2/summary.csv", "batch3/_failed/bad/a.txt",
-    "batch4/_failed", "batch5/bad/b.txt", "batch6/_parts/0-of-2/results.jsonl",
-    "grade.json", "skeleton.webm", "sub/grade.json", "film/skeleton.webm",
-    ".masks.1234.part/letter.txt", "_failed/capture/ingest.log", "capture/notes.txt",
+    "checkpoint/state.pt", "checkpoint/step_100.ckpt", "video.mp4", "masks/0000.png",
+    "images/0000.png", "cameras/01/intri.yml", "0000.png", "dance.npz", "truth/poses.npz",
+    "mesh.glb", "clip.webm", "letter.txt", "runs/a.png", ".avatar.iavatar.swp", "grade.json",
+    "skeleton.webm", "sub/grade.json", "batch0/results.jsonl", "batch1/summary.html",
+    "batch2/_failed/bad/a.txt", "batch3/_failed", "batch4/bad/b.txt", "_failed/capture/ingest.log",
 )  # fmt: skip
 """Names of our own, and of others, that other people's files have."""
 
@@ -74,50 +70,35 @@ def called(line, **places):
     [
         "ia-ingest {film} --out {hoard}",
         "ia-ingest {film} --out {hoard} --overwrite",
-        "ia-ingest {film} --out {hoard} --resume",
+        "ia-ingest {film} --out {hoard}/truth --resume",
         "ia-ingest {film} --out {hoard}/letter.txt",
-        "ia-ingest {film} --out new --json {hoard}/poses.npz",
         "ia-ingest {film} --out new --json {hoard}/report.json",
-        "ia-sample {hoard}",
         "ia-sample {hoard} --overwrite",
         "ia-sample {hoard}/masks --overwrite",
         "ia-sample {hoard}/video.mp4 --overwrite",
-        "ia-check {film} --fix {hoard}",
         "ia-check {film} --fix {hoard}/masks",
         "ia-check {film} --sheet {hoard}/0000.png",
         "ia-check {film} --json {hoard}/report.json",
-        "ia-play {package} --out {hoard}",
         "ia-play {package} --out {hoard}/images",
-        "ia-play {package} --out {hoard}/masks",
         "ia-play {package} --out {hoard}/clip.webm",
-        "ia-play {package} --out {hoard}/video.mp4",
         "ia-play {package} --out {hoard}/0000.png",
         "ia-play {hoard}/avatar.iavatar",
-        "ia-play {package} --verify --json {hoard}/report.json",
         "ia-play {package} --bench --json {hoard}/poses.npz",
-        "ia-play {package} --web --out {hoard}",
         "ia-play {package} --web --out {hoard}/truth",
         "ia-export {run} --out {hoard}/avatar.iavatar",
         "ia-export {package} --to glb --out {hoard}/mesh.glb",
-        "ia-export {package} --to ply --out {hoard}/mesh.ply",
         "ia-evaluate {run} --json {hoard}/report.json",
-        "ia-evaluate {run} --markdown {hoard}/table.md",
-        "ia-track {film} --out {hoard}/poses.npz",
         "ia-track {film} --out {hoard}/poses.npz --overwrite",
-        "ia-track {film} --out {hoard}/new.npz --overwrite",
         "ia-track {film} --out {hoard}/sub/new.npz --overwrite",
-        "ia-track {film} --out {hoard}/film/new.npz --overwrite",
         "ia-track {film} --out {hoard}/images/0000.png",
         "ia-track {film} --out {hoard}",
         "ia-batch {film} --out {hoard}",
         "ia-batch {film} --out {hoard}/letter.txt",
         "ia-batch bad.mp4 --out {hoard}/batch0",
         "ia-batch bad.mp4 --out {hoard}/batch1",
-        "ia-batch bad.mp4 --out {hoard}/batch2 --merge",
+        "ia-batch bad.mp4 --out {hoard}/batch2",
         "ia-batch bad.mp4 --out {hoard}/batch3",
         "ia-batch bad.mp4 --out {hoard}/batch4",
-        "ia-batch bad.mp4 --out {hoard}/batch5",
-        "ia-batch bad.mp4 --out {hoard}/batch6 --merge",
     ],
 )
 def test_a_place_with_other_peoples_files_is_refused(
@@ -135,52 +116,30 @@ def test_a_place_with_other_peoples_files_is_refused(
 @pytest.mark.parametrize(
     "line",
     [
-        "ia-ingest {capture} --out {capture}",
         "ia-ingest {capture} --out {capture} --overwrite",
-        "ia-ingest {capture} --out {capture} --resume",
-        "ia-ingest . --out .",
         "ia-ingest .",
         "ia-ingest {capture} --out {capture}/run",
-        "ia-ingest {capture} --out {capture}/masks --overwrite",
         "ia-ingest {capture} --out {above} --overwrite",
         "ia-ingest {above}/link --out {capture}",
-        "ia-ingest {capture}/video.mp4 --poses {capture}/poses.npz --out {capture}",
         "ia-ingest {above}/film.mp4 --poses {capture}/poses.npz --out {capture} --overwrite",
-        "ia-ingest {above}/film.mp4 --poses {capture}/poses.npz --out {capture}/masks",
         "ia-ingest {capture} --out new --json {capture}/poses.npz --overwrite",
-        "ia-check {capture} --sheet {capture}/masks/0001.png --overwrite",
         "ia-check {capture} --sheet {capture}/masks/9999.png",
         "ia-check {capture} --json {capture}/cameras.npz --overwrite",
-        "ia-check {capture} --json {capture}/transforms.json",
-        "ia-check {capture} --fix {capture}",
         "ia-check {capture} --fix {capture}/mended",
-        "ia-play {package} --poses {capture}/poses.npz --out {capture}/poses.png --json x",
         "ia-play {package} --background {capture}/masks/0001.png --out {capture}/masks/0001.png"
         " --overwrite",
         "ia-play {package} --bench --json {package} --overwrite",
-        "ia-export {package} --to ply --out {capture}/video.mp4 --overwrite",
+        "ia-export {package} --to ply --out {package} --overwrite",
         "ia-evaluate {run} --on {capture} --json {capture}/poses.npz --overwrite",
-        "ia-evaluate {run} --on {capture} --markdown {capture}/masks/0000.png --overwrite",
-        "ia-evaluate {package} --on {capture} --json {package} --overwrite",
-        "ia-track {capture} --out {capture}/new.npz --overwrite",
         "ia-track {capture} --out {capture}/sub/new.npz",
-        "ia-track . --out sub/new.npz",
         "ia-track .",
-        "ia-track {capture}/video.mp4 --out {capture}/poses.npz --overwrite",
         "ia-track {capture}/video.mp4 --out {capture}/masks/new.npz",
-        "ia-track {above}/film.mp4 --masks {capture}/masks --out {capture}/masks/sub/new.npz",
         "ia-track {above}/film.mp4 --body {above}/body.npz --out {above}/body.npz --overwrite",
         "ia-track {above}/film.mp4 --out {run}/poses.npz",
-        "ia-batch {capture} --out {capture}",
         "ia-batch {capture} --out {capture}/runs",
-        "ia-batch . --out .",
         "ia-batch {capture} --out {above}",
-        "ia-batch {above}/link --out {capture}",
-        "ia-batch {capture}/video.mp4 --out {capture}",
-        "ia-batch {above}/rows.csv --out {capture}/runs",
         "ia-batch {above}/rows.csv --out {above}/others",
         "ia-batch {above}/film.mp4 --out {above}/new --scratch {above}/film.mp4",
-        "ia-batch {capture} --out {above}/new --scratch {capture}",
         "ia-batch {capture} --out {above}/new --scratch {capture}/masks",
         "ia-batch {above}/film.mp4 --out {capture}/masks -- --masks {capture}/masks",
     ],
@@ -210,25 +169,20 @@ def test_a_batch_beside_other_peoples_files_leaves_them(hoard, tmp_path, monkeyp
     before = contents(tmp_path)
     monkeypatch.chdir(tmp_path)
     line = "ia-batch bad.mp4 --out {hoard} --scratch {hoard} --retries 0"
-    for again in ("", " --again", " --index 0 --of 1", " --merge"):
+    for again in ("", " --again"):
         assert called(line + again, hoard=hoard) == 1, capsys.readouterr().err
         assert unchanged(before, tmp_path), again
-    kept = contents(hoard)
-    assert kept["_failed/bad/ingest.log"]
-    for name in ("results.jsonl", "summary.html"):
-        (hoard / name).write_text("mine")
-        before = contents(hoard)
-        assert called(line + " --again", hoard=hoard) == 2
-        assert contents(hoard) == before
-        (hoard / name).write_bytes(kept[name])
+    assert (hoard / "_failed" / "bad" / "ingest.log").is_file()
+    (hoard / "results.jsonl").write_text("mine")
+    before = contents(hoard)
+    assert called(line + " --again", hoard=hoard) == 2
+    assert contents(hoard) == before
 
 
 @pytest.mark.slow
 def test_what_is_written_beside_other_peoples_files_leaves_them(
     hoard, film, package, monkeypatch, capsys
 ):
-    for name in ("0001.png", "avatar.webm"):
-        (hoard / name).unlink()
     before = contents(hoard)
     monkeypatch.chdir(hoard)
     for line, made in (
@@ -256,10 +210,11 @@ from pathlib import Path
 from apps.cli.console import Console
 from apps.run.run_folder import RunFolder
 from apps.track import claim_outputs
-from capture.atomic_files import AtomicFile, atomic_file, atomic_folder, write_text_atomically
+from capture.atomic_files import atomic_file, atomic_folder, write_text_atomically
 
 EVENTS = {"open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "os.link"}
 folder, left = Path(sys.argv[1]), -1
+run = RunFolder(path=folder / "run")
 
 def count(event, arguments):
     global left
@@ -268,43 +223,38 @@ def count(event, arguments):
         if left < 0:
             os.kill(os.getpid(), signal.SIGKILL)
 
-def train():
-    run = RunFolder(path=folder)
-    run.check_usable([], resume=False, overwrite=True)
-    run.start_run(resume=False)
-    for _ in range(2):
-        write_text_atomically(run.checkpoint / "state.pt", "learnt")
-    package = AtomicFile(run.package)
-    package.temporary_path.write_bytes(b"avatar")
-    package.commit()
-    write_text_atomically(run.report_json, "{}")
-
-def recover_run():
-    run = RunFolder(path=folder)
+def start():
     run.check_usable([], resume=False, overwrite=True)
     run.start_run(resume=False)
 
-def track():
+def work():
+    with run.claim(Console(), resume=False, overwrite=True):
+        start()
+        for _ in range(2):
+            write_text_atomically(run.checkpoint / "state.pt", "learnt")
+        write_text_atomically(run.report_json, "{}")
     with claim_outputs(folder, Console()):
-        with atomic_folder(folder / "masks") as part:
-            (part / "000000.png").write_bytes(b"new")
-        with atomic_file(folder / "poses.npz") as part:
-            part.write_bytes(b"found")
+        for _ in range(2):
+            with atomic_folder(folder / "masks") as part:
+                (part / "000000.png").write_bytes(b"new")
         write_text_atomically(folder / "grade.json", "{}")
 
-def recover_tracking():
-    track()
-    for name in ("poses.npz", "grade.json", "masks/000000.png", "masks/.instant-avatar-files"):
-        (folder / name).unlink()
+def check(events):
+    for file in mine:
+        assert file.read_bytes() == b"mine", (events, file)
+    for path, whole in (
+        (run.checkpoint / "state.pt", b"learnt"), (run.report_json, b"{}"),
+        (folder / "masks" / "000000.png", b"new"), (folder / "grade.json", b"{}"),
+    ):
+        assert not path.exists() or path.read_bytes() == whole, (events, path)
 
-work, recover = {"run": (train, recover_run), "track": (track, recover_tracking)}[sys.argv[2]]
 sys.addaudithook(count)
-work()
-others = ["letter.txt", "checkpoint/step_100.ckpt", ".avatar.iavatar.swp", "0000.png"]
-others += [".masks.1234.part/letter.txt"]
-for name in others:
-    (folder / name).parent.mkdir(exist_ok=True)
-    (folder / name).write_bytes(b"mine")
+mine = [folder / name for name in ("letter.txt", ".a.1234.part/letter.txt", "0000.png")]
+mine += [run.path / "notes.txt", run.checkpoint / "step_100.ckpt"]
+start()
+for file in mine:
+    file.parent.mkdir(exist_ok=True)
+    file.write_bytes(b"mine")
 before = shutil.copytree(folder, folder.with_name("before"))
 events = 0
 while True:
@@ -314,12 +264,11 @@ while True:
         work()
         os._exit(0)
     killed = os.waitpid(child, 0)[1] != 0
-    assert all((folder / name).read_bytes() == b"mine" for name in others), events
-    recover()
-    rest = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
-    rest -= {name for name in rest if name.endswith((".instant-avatar-files", "-lock"))}
-    rest -= {name for name in rest if name.startswith(".masks.") and ".old/" in name}
-    assert rest == set(others), (events, rest)
+    check(events)
+    work()
+    check(events)
+    rest = {p for p in folder.rglob("*") if p.is_file() and not p.name.startswith(".instant")}
+    assert len(rest) == len(mine) + 4, (events, rest)
     if not killed:
         break
     shutil.rmtree(folder)
@@ -331,9 +280,8 @@ print(events)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are not forked here")
-@pytest.mark.parametrize("what", ["run", "track"])
-def test_wherever_a_command_is_killed_other_peoples_files_stay_and_ours_are_known(what, tmp_path):
-    command = [sys.executable, "-c", KILLED, str(tmp_path / "run"), what]
+def test_wherever_a_command_is_killed_other_peoples_files_stay_and_ours_are_whole(tmp_path):
+    command = [sys.executable, "-c", KILLED, str(tmp_path / "work")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert int(done.stdout) > 40
+    assert int(done.stdout) > 60
