@@ -176,7 +176,6 @@ def _train_subject(
         steps=arguments.steps,
         size=arguments.size or subject.size_px,
         hold_out=0,
-        device=arguments.device,
     )
     try:
         return ingest(words, console) != INTERRUPTED

@@ -188,12 +188,10 @@ def _export_package(folder: Path, out: Path, console: Console, *, fine_tune: boo
             "saves the first checkpoint five seconds after the first frame."
         )
     with console.status("loading the checkpoint"):
-        import torch
-
         from apps.run.snapshot_writer import write_package_snapshot
         from avatar.training import checkpoint
 
-        trainer, _ = checkpoint.load(run.checkpoint, torch.device("cpu"))
+        trainer, _ = checkpoint.load(run.checkpoint)
     with console.progress("writing the package", 1.0) as bar:
         shots = synthetic_views(trainer.avatar.rig)
         taken = write_package_snapshot(

@@ -86,13 +86,13 @@ def ingest(arguments: IngestArguments, console: Console) -> int:
 
 
 def _load_trainer_code(arguments: IngestArguments, run: RunFolder, console: Console) -> int:
-    """Import torch and load the compiled kernels; return the number of threads."""
-    with exit_on_interrupt(console, PROGRAM, run.release):
-        with console.status("loading torch"):
-            from apps.report import report_writer  # noqa: F401
-            from apps.run import training_session  # noqa: F401
-            from apps.run.session_start import load_kernels
-        return load_kernels(arguments, console)
+    """Import torch, and set and return the number of its threads."""
+    with exit_on_interrupt(console, PROGRAM, run.release), console.status("loading torch"):
+        from apps.report import report_writer  # noqa: F401
+        from apps.run import training_session  # noqa: F401
+        from apps.run.session_start import set_threads
+
+        return set_threads(arguments.threads)
 
 
 def _open_checked(arguments: IngestArguments, run: RunFolder, console: Console) -> Capture:

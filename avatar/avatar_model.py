@@ -17,8 +17,10 @@ from jaxtyping import Float32, Float64
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
-from avatar.kernels.backend_protocol import (
-    Backend,
+from avatar.kernels import operations
+from avatar.kernels.numba_shading import add_light, light_factors
+from avatar.kernels.operands import (
+    MAX_LOG_DENSITY,
     CorrespondenceTables,
     DensityGrid,
     NormalVolume,
@@ -27,8 +29,6 @@ from avatar.kernels.backend_protocol import (
     RayBatch,
     RaySamples,
 )
-from avatar.kernels.numba_shading import add_light, light_factors
-from avatar.kernels.torch_reference import activate
 from avatar.occupancy_grid import OccupancyGrid, in_occupied_cells
 from avatar.radiance_field import RadianceField
 from avatar.rig import Rig
@@ -63,26 +63,25 @@ class OrientationShading:
         is_neutral: Whether no shading has been found; the factor is then 1 everywhere.
     """
 
-    def __init__(self, rig: Rig, device: torch.device) -> None:
+    def __init__(self, rig: Rig) -> None:
         """Starts from light that is the same from everywhere."""
         distance = np.where(rig.inside_skin, -rig.skin_distance, rig.skin_distance)
         distance = gaussian_filter(distance.astype(np.float32), 1.0)
         slope = np.stack([np.gradient(distance, axis=axis) for axis in range(3)], axis=-1)
         slope /= np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-6)
         self._normals = NormalVolume(
-            torch.from_numpy(slope.astype(np.float32)).to(device),
-            torch.from_numpy(rig.box_low).to(device),
-            torch.from_numpy(rig.cells_per_m).to(device),
+            torch.from_numpy(slope.astype(np.float32)),
+            torch.from_numpy(rig.box_low),
+            torch.from_numpy(rig.cells_per_m),
         )
         self._sums: Float64[np.ndarray, "5 5"] = np.zeros((HARMONICS + 1, HARMONICS + 1))
         self._rays = 0.0
-        self.coefficients = torch.tensor([1.0, 0.0, 0.0, 0.0], device=device)
+        self.coefficients = torch.tensor([1.0, 0.0, 0.0, 0.0])
         self.is_neutral = True
         self._steps = 1  # not an observation's turn, where none is ever asked for
 
     def body_normals(
         self,
-        backend: Backend,
         rays: RayBatch,
         samples: RaySamples,
         raw: RawOutputs,
@@ -95,8 +94,8 @@ class OrientationShading:
         zero in steps that need none.
         """
         if self.is_neutral and self._steps % OBSERVATION_INTERVAL:
-            return torch.zeros(len(rays.slots), 3, device=raw.device)
-        return backend.mean_normals(raw, samples, step_m, rays.slots, cells, self._normals)
+            return torch.zeros(len(rays.slots), 3)
+        return operations.mean_normals(raw, samples, step_m, rays.slots, cells, self._normals)
 
     def factors(self, normals: Float32[Tensor, "rays 3"]) -> PremultipliedPixels:
         """Factors of the neutral color, and of alpha (1), where surfaces have these world normals.
@@ -105,10 +104,10 @@ class OrientationShading:
         """
         factors = np.empty((len(normals), 4), dtype=np.float32)
         light_factors(
-            normals.cpu().numpy(), self.coefficients.cpu().numpy(), MIN_NORMAL_LENGTH,
+            normals.numpy(), self.coefficients.numpy(), MIN_NORMAL_LENGTH,
             (MIN_FACTOR, MAX_FACTOR), factors,
         )  # fmt: skip
-        return torch.from_numpy(factors).to(normals)
+        return torch.from_numpy(factors)
 
     def restore(self, coefficients: Float32[Tensor, "harmonics"]) -> None:
         """Continues from coefficients that were found earlier."""
@@ -132,9 +131,8 @@ class OrientationShading:
         if (self._steps - 1) % OBSERVATION_INTERVAL:
             return
         rays = add_light(
-            normals.cpu().numpy(), target.cpu().numpy(), rendered.cpu().numpy(),
-            self.coefficients.cpu().numpy(), MIN_ALPHA, MIN_NORMAL_LENGTH,
-            (MIN_FACTOR, MAX_FACTOR), MEMORY_RAYS, self._sums,
+            normals.numpy(), target.numpy(), rendered.numpy(), self.coefficients.numpy(),
+            MIN_ALPHA, MIN_NORMAL_LENGTH, (MIN_FACTOR, MAX_FACTOR), MEMORY_RAYS, self._sums,
         )  # fmt: skip
         self._rays = math.exp(-rays / MEMORY_RAYS) * self._rays + rays
         if self._rays > MIN_RAYS:
@@ -181,7 +179,8 @@ class Avatar:
     ) -> tuple[Float32[Tensor, "points 3"], Float32[Tensor, "points"]]:
         """Color in [0, 1] and density, 1/m, at canonical points; zero in empty cells."""
         held = in_occupied_cells(self.rendering_grid(), points).nonzero()[:, 0]
-        color, density = activate(self.field.raw_outputs_at(points[held].contiguous()))
+        raw = self.field.raw_outputs_at(points[held].contiguous())
         all_colors, all_densities = torch.zeros_like(points), torch.zeros_like(points[:, 0])
-        all_colors[held], all_densities[held] = color, density
+        all_colors[held] = torch.sigmoid(raw[:, :3])
+        all_densities[held] = torch.exp(raw[:, 3].clamp(max=MAX_LOG_DENSITY))
         return all_colors, all_densities

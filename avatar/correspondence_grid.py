@@ -23,8 +23,7 @@ from jaxtyping import Bool, Float, Float32, Int32, Int64
 from scipy.ndimage import distance_transform_cdt
 from torch import Tensor
 
-from avatar.backends import backend_for
-from avatar.kernels.backend_protocol import DensityGrid, RayBatch, RaySamples
+from avatar.kernels import operations
 from avatar.kernels.numba_correspondence import (
     SEARCH_MARGIN_M,
     blended_transform_volume,
@@ -33,12 +32,12 @@ from avatar.kernels.numba_correspondence import (
 )
 from avatar.kernels.numba_correspondence import cull_cells as cull_cells_numba
 from avatar.kernels.numba_skinning import MATRIX_LANES
+from avatar.kernels.operands import DensityGrid, RayBatch, RaySamples
 from avatar.rig import CLOTHING_BAND_M, Rig
 from capture.camera import Camera
 
 CORRESPONDENCE_CELL_M = 0.03
 """Edge of a cell, metres."""
-CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -67,7 +66,6 @@ class CorrespondenceGrid:
         *,
         band_m: float = CLOTHING_BAND_M,
         cell_m: float = CORRESPONDENCE_CELL_M,
-        device: torch.device = CPU,
     ) -> "CorrespondenceGrid":
         """Solves the correspondences of one pose.
 
@@ -76,15 +74,12 @@ class CorrespondenceGrid:
             joint_rotations: Axis-angle rotations of joints 1 to 23; the root plays no part.
             band_m: Distance from the skin that is covered, metres; at most to the rig's box.
             cell_m: Edge of a cell, metres.
-            device: Device that solves.
         """
         bones = rig.body_from_canonical(joint_rotations)[:, :3].reshape(24, 12)
-        solved = backend_for(device).solve_correspondences(
-            rig, bones.astype(np.float32), band_m, cell_m, device
+        low, packed_cells, roots = operations.solve_correspondences(
+            rig, bones.astype(np.float32), band_m, cell_m
         )
-        return cls(
-            low=solved.low, cell_m=cell_m, packed_cells=solved.packed_cells, roots=solved.roots
-        )
+        return cls(low=low, cell_m=cell_m, packed_cells=packed_cells, roots=roots)
 
 
 MIN_DEPTH_M = 0.05
@@ -100,7 +95,7 @@ def cull_cells(cells: CorrespondenceGrid, grid: DensityGrid) -> CorrespondenceGr
     index = np.empty_like(cells.packed_cells)
     cull_cells_numba(
         cells.packed_cells.reshape(-1), cells.roots, np.float32(cells.cell_m),
-        *(part.cpu().numpy() for part in (grid.occupied, grid.low, grid.cells_per_m)),
+        *(part.numpy() for part in (grid.occupied, grid.low, grid.cells_per_m)),
         index.reshape(-1),
     )  # fmt: skip
     if not index.any():
@@ -157,7 +152,6 @@ class CorrespondenceCheck:
         rig: Rig,
         joint_rotations: Float[np.ndarray, "23 3"],
         cells: CorrespondenceGrid,
-        device: torch.device,
     ) -> "CorrespondenceCheck":
         """Checks the corners of every full cell.
 
@@ -165,7 +159,6 @@ class CorrespondenceCheck:
             rig: Rig of the person.
             joint_rotations: Pose of the cells.
             cells: Correspondence grid of the pose, culled.
-            device: Device of the samples.
         """
         bones = rig.body_from_canonical(joint_rotations)[:, :3].reshape(24, 12)
         volume = blended_transform_volume(
@@ -178,7 +171,7 @@ class CorrespondenceCheck:
         )  # fmt: skip
         transforms, low, nodes_per_m = volume
         return cls(
-            unreliable_rows=torch.from_numpy(unreliable).to(device),
+            unreliable_rows=torch.from_numpy(unreliable),
             transforms=transforms,
             low=low,
             nodes_per_m=nodes_per_m,
@@ -191,7 +184,7 @@ class CorrespondenceCheck:
         parts = (samples.points[asked], rays.origins[ray], rays.directions[ray])
         found = np.empty(len(asked), dtype=bool)
         find_off_ray_points(
-            *(part.cpu().numpy() for part in parts), self.transforms, self.low, self.nodes_per_m,
+            *(part.numpy() for part in parts), self.transforms, self.low, self.nodes_per_m,
             np.float32(MAX_RAY_DISTANCE_M), found, np.empty(MATRIX_LANES, dtype=np.float32),
         )  # fmt: skip
-        return asked[torch.from_numpy(found).to(asked.device)]
+        return asked[torch.from_numpy(found)]

@@ -14,8 +14,7 @@ from jaxtyping import Bool, Float32, Int64, UInt8
 from scipy.ndimage import label
 from torch import Tensor
 
-from avatar.kernels.backend_protocol import DensityGrid
-from avatar.kernels.torch_reference import MAX_LOG_DENSITY
+from avatar.kernels.operands import MAX_LOG_DENSITY, DensityGrid
 from avatar.rig import CLOTHING_BAND_M, HEAD_JOINT, Rig
 
 OCCUPANCY_DECAY = 0.9
@@ -49,28 +48,26 @@ class OccupancyGrid:
         band_cells: Flat indices of the cells in the clothing band about the skin.
     """
 
-    def __init__(self, rig: Rig, device: torch.device) -> None:
+    def __init__(self, rig: Rig) -> None:
         """Starts with the whole clothing band occupied."""
-        band = torch.from_numpy(rig.skin_distance <= CLOTHING_BAND_M).to(device)
+        band = torch.from_numpy(rig.skin_distance <= CLOTHING_BAND_M)
         self.density_grid = DensityGrid(
             occupied=band.to(torch.uint8),
             density=torch.where(band, INITIAL_DENSITY, 0.0),
-            low=torch.from_numpy(rig.box_low).to(device),
-            cells_per_m=torch.from_numpy(rig.cells_per_m).to(device),
+            low=torch.from_numpy(rig.box_low),
+            cells_per_m=torch.from_numpy(rig.cells_per_m),
         )
         self.band_cells: Int64[Tensor, " band"] = band.flatten().nonzero()[:, 0]
         self._in_band = band.to(torch.uint8)
         self._interior_cells = torch.from_numpy(
             rig.inside_skin & (rig.skin_distance > INTERIOR_DEPTH_M)
-        ).to(device)
-        self._interior_cells = self._interior_cells.flatten().nonzero()[:, 0]
-        centers = (
-            np.stack(np.unravel_index(self._interior_cells.cpu().numpy(), band.shape), axis=1) + 0.5
         )
+        self._interior_cells = self._interior_cells.flatten().nonzero()[:, 0]
+        centers = np.stack(np.unravel_index(self._interior_cells.numpy(), band.shape), axis=1) + 0.5
         weights = rig.weights_at(rig.box_low + centers / rig.cells_per_m)
-        in_head = torch.from_numpy(weights[:, HEAD_JOINT] > 0.5).to(device)
+        in_head = torch.from_numpy(weights[:, HEAD_JOINT] > 0.5)
         self._head_cells = self._interior_cells[in_head]
-        off_skin = torch.from_numpy(~rig.inside_skin & (rig.skin_distance > OFF_SKIN_M)).to(device)
+        off_skin = torch.from_numpy(~rig.inside_skin & (rig.skin_distance > OFF_SKIN_M))
         self._off_skin_cells = (band & off_skin).flatten().nonzero()[:, 0]
         self._near_skin = rig.skin_distance <= NEAR_SKIN_M
         self._cached_empty_cells: tuple[int, Tensor] | None = None
@@ -171,27 +168,23 @@ class OccupancyGrid:
         self, cells: Int64[Tensor, "cells"], count: int, generator: torch.Generator
     ) -> Int64[Tensor, "drawn"]:
         count = count if len(cells) else 0
-        drawn = torch.randint(
-            max(len(cells), 1), (count,), generator=generator, device=generator.device
-        )
-        return cells[drawn.to(cells.device)]
+        drawn = torch.randint(max(len(cells), 1), (count,), generator=generator)
+        return cells[drawn]
 
     def _jittered_points(
         self, cells: Int64[Tensor, "cells"], generator: torch.Generator
     ) -> Float32[Tensor, "cells 3"]:
         _, ny, nz = self.density_grid.occupied.shape
         corner = torch.stack([cells // (ny * nz), cells // nz % ny, cells % nz], dim=1)
-        within = torch.rand(len(cells), 3, generator=generator, device=generator.device)
-        return (
-            corner + within.to(cells.device)
-        ) / self.density_grid.cells_per_m + self.density_grid.low
+        within = torch.rand(len(cells), 3, generator=generator)
+        return (corner + within) / self.density_grid.cells_per_m + self.density_grid.low
 
 
 def in_occupied_cells(
     grid: DensityGrid, points: Float32[Tensor, "points 3"]
 ) -> Bool[Tensor, "points"]:
     """Which points lie in occupied cells."""
-    shape = torch.tensor(grid.occupied.shape, device=points.device)
+    shape = torch.tensor(grid.occupied.shape)
     cell = torch.floor((points - grid.low) * grid.cells_per_m).long()
     x, y, z = torch.minimum(cell.clamp(min=0), shape - 1).unbind(dim=1)
     return ((cell >= 0) & (cell < shape)).all(dim=1) & (grid.occupied[x, y, z] != 0)
@@ -217,7 +210,7 @@ def find_floaters(
         near_skin: Cells that count towards a component's size.
     """
     # scipy has no types, and what pyright guesses of this function is wrong
-    pieces, count = label(solid.cpu().numpy())  # pyright: ignore[reportGeneralTypeIssues]
+    pieces, count = label(solid.numpy())  # pyright: ignore[reportGeneralTypeIssues]
     if count < 2:
         return torch.zeros_like(solid, dtype=torch.uint8)
     sizes = np.bincount(pieces[near_skin], minlength=count + 1)
@@ -226,6 +219,6 @@ def find_floaters(
     kept[0] = False
 
     def about(cells: Bool[np.ndarray, "x y z"]) -> UInt8[Tensor, "x y z"]:
-        return dilate(dilate(torch.from_numpy(cells.astype(np.uint8)).to(solid.device)))
+        return dilate(dilate(torch.from_numpy(cells.astype(np.uint8))))
 
     return about((pieces > 0) & ~kept[pieces]) & (1 - about(kept[pieces]))

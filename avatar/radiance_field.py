@@ -15,8 +15,8 @@ from jaxtyping import Float32, Int64
 from torch import Tensor
 
 from avatar.config import TrainConfig
-from avatar.kernels.backend_protocol import FEATURES_PER_LEVEL, Backend, HashLevels
-from avatar.kernels.torch_reference import MAX_LOG_DENSITY
+from avatar.kernels import operations
+from avatar.kernels.operands import FEATURES_PER_LEVEL, MAX_LOG_DENSITY, HashLevels
 
 HIDDEN_WIDTH = 64
 """Width of the hidden layer."""
@@ -63,11 +63,11 @@ def _linear(
     bias: Float32[Tensor, "outputs"] | None = None,
     activation: Literal["none", "relu"] = "none",
 ) -> Float32[Tensor, "points outputs"]:
-    """A layer of the network, or its transpose; on the CPU by oneDNN.
+    """A layer of the network, or its transpose; by oneDNN where torch has it.
 
     torch takes MKL for single precision, which takes twice as long on AMD's processors.
     """
-    if HAS_ONEDNN and values.device.type == "cpu":
+    if HAS_ONEDNN:
         product: Tensor = torch.ops.mkldnn._linear_pointwise(
             values, weight.T, bias, activation, [], ""
         )
@@ -88,16 +88,9 @@ class RadianceField:
         layers: Weights and biases of both layers.
     """
 
-    def __init__(
-        self,
-        levels: HashLevels,
-        backend: Backend,
-        device: torch.device,
-        generator: torch.Generator,
-    ) -> None:
-        """Draws the initial parameters from `generator`, on the CPU."""
+    def __init__(self, levels: HashLevels, generator: torch.Generator) -> None:
+        """Draws the initial parameters from `generator`."""
         self.levels = levels
-        self.backend = backend
 
         def normal(rows: int, columns: int, spread: float) -> Tensor:
             return torch.randn(rows, columns, generator=generator) * spread
@@ -109,7 +102,7 @@ class RadianceField:
         second = normal(HIDDEN_WIDTH, 4, math.sqrt(1.0 / HIDDEN_WIDTH))
         bias = torch.tensor([0.0, 0.0, 0.0, INITIAL_LOG_DENSITY])
         self.table, *self.layers = (
-            torch.nn.Parameter(values.to(device))
+            torch.nn.Parameter(values)
             for values in (table, first, torch.zeros(HIDDEN_WIDTH), second, bias)
         )
         for parameter in self.parameters():
@@ -139,7 +132,7 @@ class RadianceField:
     def forward(self, points: Float32[Tensor, "points 3"]) -> Activations:
         """Raw outputs at canonical points, and what their gradient will need."""
         first, first_bias, second, second_bias = self.layers
-        features = self.backend.encode(points, self.table, self.levels)
+        features = operations.encode(points, self.table, self.levels)
         hidden = _linear(_padded(features), first, first_bias, "relu")
         raw = _linear(hidden, second, second_bias)
         return Activations(points, features, hidden[: len(points)], raw[: len(points)])
@@ -164,9 +157,7 @@ class RadianceField:
             assert parameter.grad is not None, "a gradient is overwritten, never taken away"
             parameter.grad.copy_(grad)
         grad_features = _linear(padded, first.T)[: len(grad_raw)]
-        self.backend.encode_backward(
-            activations.points, grad_features, self.levels, self.table_grad
-        )
+        operations.encode_backward(activations.points, grad_features, self.levels, self.table_grad)
         return grad_features
 
     @torch.no_grad()
@@ -255,12 +246,10 @@ def _sample_pairs(
     points: Float32[Tensor, "samples 3"], count: int, sigma_m: float, generator: torch.Generator
 ) -> Float32[Tensor, "points 3"]:
     size = (count if len(points) else 0, 3)
-    chosen = torch.randint(
-        max(len(points), 1), size[:1], generator=generator, device=generator.device
-    )
-    apart = sigma_m * torch.randn(size, generator=generator, device=generator.device)
-    first = points[chosen.to(points.device)]
-    return torch.cat([first, first + apart.to(points)])
+    chosen = torch.randint(max(len(points), 1), size[:1], generator=generator)
+    apart = sigma_m * torch.randn(size, generator=generator)
+    first = points[chosen]
+    return torch.cat([first, first + apart])
 
 
 def density_tv_gradient(

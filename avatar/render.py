@@ -21,7 +21,8 @@ from avatar.correspondence_grid import (
     cull_cells,
     screen_bounds,
 )
-from avatar.kernels.backend_protocol import (
+from avatar.kernels import operations
+from avatar.kernels.operands import (
     CorrespondenceTables,
     DensityGrid,
     MarchSettings,
@@ -107,8 +108,7 @@ class PosedAvatar:
         shaded: bool = False,
     ) -> "PosedAvatar":
         """Culls the correspondence grid of a pose, and solves it unless it is given."""
-        device = avatar.field.table.device
-        cells = cells or CorrespondenceGrid.solve(avatar.rig, pose.joint_rotations, device=device)
+        cells = cells or CorrespondenceGrid.solve(avatar.rig, pose.joint_rotations)
         world_from_body = avatar.rig.world_from_body(pose)
         grid = avatar.rendering_grid()
         cells = cull_cells(cells, grid)
@@ -117,8 +117,8 @@ class PosedAvatar:
             camera=camera,
             world_from_body=world_from_body,
             grid=grid,
-            tables=correspondence_tables(cells, device),
-            check=CorrespondenceCheck.for_pose(avatar.rig, pose.joint_rotations, cells, device),
+            tables=correspondence_tables(cells),
+            check=CorrespondenceCheck.for_pose(avatar.rig, pose.joint_rotations, cells),
             bounds=screen_bounds(cells, camera, world_from_body),
             shaded=shaded,
         )
@@ -131,13 +131,13 @@ class PosedAvatar:
         shading = self.avatar.shading
         shading = shading if self.shaded and not shading.is_neutral else None
         colors, normals = trace_rays(
-            field, ray_batch(rays, field.table.device), self.tables, grid=self.grid,
+            field, ray_batch(rays), self.tables, grid=self.grid,
             check=self.check, sample_step_m=self.avatar.sample_step_m, shading=shading,
         )  # fmt: skip
         if shading is not None:
             rotation = torch.from_numpy(self.world_from_body[:3, :3]).to(normals)
             colors *= shading.factors(normals @ rotation.T)
-        return colors.cpu().numpy()
+        return colors.numpy()
 
 
 def render(
@@ -204,19 +204,19 @@ def trace_rays(
         sample_step_m: Distance between samples, metres.
         shading: Has the normals, in the body frame; all are zero without it.
     """
-    normals = torch.zeros(len(rays.slots), 3, device=rays.origins.device)
-    colors = torch.zeros(len(rays.slots), 4, device=rays.origins.device)
-    alive = torch.arange(len(colors), device=colors.device)
+    normals = torch.zeros(len(rays.slots), 3)
+    colors = torch.zeros(len(rays.slots), 4)
+    alive = torch.arange(len(colors))
     while len(alive):
         most = min(max(SAMPLES_PER_CHUNK // len(alive), MIN_SAMPLES_PER_PASS), MAX_SAMPLES_PER_PASS)
         how = MarchSettings(sample_step_m, math.inf, most)
-        samples, jitter = field.backend.march_resumable(rays, cells, grid, how)
+        samples, jitter = operations.march_resumable(rays, cells, grid, how)
         nearer = colors[alive]
         raw = field.raw_outputs_at(samples.points)
         raw[check.find_spurious(samples, rays), 3] = EMPTY_LOG_DENSITY
-        part = field.backend.composite(raw, samples, sample_step_m)
+        part = operations.composite(raw, samples, sample_step_m)
         if shading is not None:
-            found = shading.body_normals(field.backend, rays, samples, raw, cells, sample_step_m)
+            found = shading.body_normals(rays, samples, raw, cells, sample_step_m)
             normals[alive] += (1.0 - nearer[:, 3:]) * found
         nearer = nearer + (1.0 - nearer[:, 3:]) * part
         colors[alive] = nearer
@@ -226,24 +226,24 @@ def trace_rays(
     return colors, normals
 
 
-def ray_batch(rays: BodyFrameRays, device: torch.device) -> RayBatch:
+def ray_batch(rays: BodyFrameRays) -> RayBatch:
     """Rays of one frame with samples in the middle of their steps."""
-    directions = torch.from_numpy(rays.directions).to(device)
+    directions = torch.from_numpy(rays.directions)
     count = len(directions)
     return RayBatch(
-        torch.from_numpy(rays.origin).to(device).expand(count, 3).contiguous(),
+        torch.from_numpy(rays.origin).expand(count, 3).contiguous(),
         directions,
-        torch.zeros(count, dtype=torch.int32, device=device),
-        torch.full((count,), 0.5, device=device),
+        torch.zeros(count, dtype=torch.int32),
+        torch.full((count,), 0.5),
     )
 
 
-def correspondence_tables(cells: CorrespondenceGrid, device: torch.device) -> CorrespondenceTables:
+def correspondence_tables(cells: CorrespondenceGrid) -> CorrespondenceTables:
     """Correspondence tables with one slot, which holds the given grid."""
     return CorrespondenceTables(
-        torch.from_numpy(cells.packed_cells.reshape(1, -1)).to(device),
-        torch.from_numpy(cells.roots[None]).to(device),
-        torch.from_numpy(cells.low[None]).to(device),
-        torch.tensor([cells.packed_cells.shape], dtype=torch.int32, device=device),
+        torch.from_numpy(cells.packed_cells.reshape(1, -1)),
+        torch.from_numpy(cells.roots[None]),
+        torch.from_numpy(cells.low[None]),
+        torch.tensor([cells.packed_cells.shape], dtype=torch.int32),
         cells.cell_m,
     )

@@ -20,7 +20,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-import torch
 import tyro
 
 from avatar.avatar_model import Avatar
@@ -127,8 +126,6 @@ class Ablation:
     """Steps for each variant, where they are counted."""
     mechanism_steps: int = 600
     """Steps without each mechanism."""
-    device: str = "cpu"
-    """Where to train."""
     json: Path | None = None
     """File for the figures."""
     write: Path | None = None
@@ -198,26 +195,25 @@ def film_by_phone(folder: Path, subject: Literal[1, 2, 3], *, quick: bool) -> Pa
 
 def run_ablation(job: Ablation, hardware: Hardware, folder: Path) -> AblationPage:
     """Measures all tables, and prints each row on standard error when it is ready."""
-    began, device = time.process_time(), torch.device(job.device)
-    scene = load_data(film_sample(folder / f"sample{job.size}", job.size), device)
+    began = time.process_time()
+    scene = load_data(film_sample(folder / f"sample{job.size}", job.size))
     runs = train_on_scene(
         scene,
         [*LOSS_VARIANTS, *CORRESPONDENCE_VARIANTS, *BROYDEN_VARIANTS],
         TrainingBudget(seconds=job.seconds),
-        device,
     )
     by_time = outcomes_of(runs, scene)
     occupancy_ms, ours = occupancy_update_ms(runs[0]), runs[0].trainer.avatar
     del runs
     counted = TrainingBudget(steps=job.steps)
     runs = train_on_scene(
-        scene, [LOSS_VARIANTS[0], *CORRESPONDENCE_VARIANTS, *BROYDEN_VARIANTS], counted, device
+        scene, [LOSS_VARIANTS[0], *CORRESPONDENCE_VARIANTS, *BROYDEN_VARIANTS], counted
     )
     by_steps = outcomes_of(runs, scene)
     schemes = time_schemes(ours, _run_named(runs, PAPER).trainer.avatar, scene)
     del runs
     noisy_capture = film_sample(folder / f"noisy{job.size}", job.size, **NOISE)
-    noisy = load_data(noisy_capture, device)
+    noisy = load_data(noisy_capture)
     noisy = noisy._replace(held_out=with_true_poses(noisy_capture, noisy.held_out, noisy.rig))
     budget = TrainingBudget(seconds=job.seconds)
     return AblationPage(
@@ -231,26 +227,26 @@ def run_ablation(job: Ablation, hardware: Hardware, folder: Path) -> AblationPag
         by_time=[by_time[0], *by_time[len(LOSS_VARIANTS) :]],
         by_steps=by_steps,
         scheme_timings=schemes,
-        exact=outcomes_of(train_on_scene(scene, REFINEMENT_VARIANTS, budget, device), scene),
-        noisy=outcomes_of(train_on_scene(noisy, REFINEMENT_VARIANTS, budget, device), noisy),
+        exact=outcomes_of(train_on_scene(scene, REFINEMENT_VARIANTS, budget), scene),
+        noisy=outcomes_of(train_on_scene(noisy, REFINEMENT_VARIANTS, budget), noisy),
         core_minutes=(time.process_time() - began) / 60.0,
     )
 
 
-def load_data(capture: Path, device: torch.device) -> AblationData:
+def load_data(capture: Path) -> AblationData:
     """A filmed sample, every frame made ready."""
     limit_threads(1)
     recording = open_sample(capture)
     rig = Rig.from_shaped_body(recording.shaped)
-    seen = load_trainer(recording, rig, training_config(recording, 60.0), device)
+    seen = load_trainer(recording, rig, training_config(recording, 60.0))
     return AblationData(recording, rig, seen.frames, seen.held_out, novel_pose_frames(capture, rig))
 
 
 def train_on_scene(
-    scene: AblationData, variants: list[Variant], budget: TrainingBudget, device: torch.device
+    scene: AblationData, variants: list[Variant], budget: TrainingBudget
 ) -> list[VariantRun]:
     """Every variant after its budget."""
-    return train_variants(variants, budget, scene.recording, scene.rig, scene.frames, device)
+    return train_variants(variants, budget, scene.recording, scene.rig, scene.frames)
 
 
 def outcomes_of(runs: Iterable[VariantRun], scene: AblationData) -> list[VariantOutcome]:

@@ -22,7 +22,6 @@ from typing import Annotated, Literal
 
 import cv2
 import numpy as np
-import torch
 import tyro
 
 from apps.run.session_start import new_trainer
@@ -175,7 +174,6 @@ def measure_film(job: AnyFilmJob, folder: Path, frames: slice | None, name: str)
     compared = ComparedCapture.open(folder, size_px, frames=frames)
     trainer = new_trainer(
         compared.capture, seconds=60.0, steps=job.steps, seed=job.seed, refine_poses=True,
-        device=torch.device("cpu"),
     )  # fmt: skip
     for frame in compared.frames:
         trainer.add_frame(frame)

@@ -8,8 +8,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import torch
-
 from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.rig import Rig
 from benchmarks.hardware import ROOT
@@ -42,7 +40,7 @@ def built(capture: Path) -> dict[str, float]:
         for name, pose in poses.items()
         for band_m in BANDS_M
     }
-    times = time_interleaved(work, torch.device("cpu"), rounds=ROUNDS)
+    times = time_interleaved(work, rounds=ROUNDS)
     roots = {
         f"roots {band_m}": float(
             (CorrespondenceGrid.solve(rig, poses["training"], band_m=band_m).packed_cells & 3).sum()

@@ -172,7 +172,6 @@ def scale_errors_by_height(capture: Path, runs: Path) -> tuple[float, float]:
 
 def psnr_by_cameras(capture: Path, runs: Path) -> dict[str, float]:
     """Held-out PSNR, dB, of short runs that differ in their cameras alone."""
-    import torch
 
     from avatar.rig import Rig
     from avatar.training.train import warm_up
@@ -204,7 +203,7 @@ def psnr_by_cameras(capture: Path, runs: Path) -> dict[str, float]:
         each = replace(each, paths=paths, size_px=TRAINED_PX)
         rig = Rig.from_shaped_body(each.shaped)
         config = replace(training_config(each, TRAINED_CORE_S), refine_poses=False)
-        seen = load_trainer(each, rig, config, torch.device("cpu"))
+        seen = load_trainer(each, rig, config)
         warm_up(seen.trainer)
         train_for_core_seconds(seen.trainer, TRAINED_CORE_S)
         found[name] = mean_psnr(seen.trainer.avatar, seen.held_out).psnr

@@ -14,15 +14,16 @@ import torch
 from jaxtyping import Float, Float32
 
 from avatar.correspondence_grid import CorrespondenceGrid
-from avatar.kernels.backend_protocol import (
+from avatar.kernels import operations
+from avatar.kernels.kernel_compiler import FAST_MATH, compile_kernel
+from avatar.kernels.numba_skinning import MATRIX_LANES, solve_root, transform_point
+from avatar.kernels.operands import (
     CorrespondenceTables,
     DensityGrid,
     MarchSettings,
     RayBatch,
     RaySamples,
 )
-from avatar.kernels.kernel_compiler import FAST_MATH, compile_kernel
-from avatar.kernels.numba_skinning import MATRIX_LANES, solve_root, transform_point
 from avatar.render import correspondence_tables
 from avatar.rig import Rig
 from baselines.instant_avatar.broyden_kernels import START_BONES
@@ -51,14 +52,14 @@ class PosedPoints(NamedTuple):
 
 def warp_marks(seen: LoadedTrainer, novel: Float[np.ndarray, "23 3"]) -> list[Measurement]:
     """Speed and error of the look-up in a training pose and in one that was never filmed."""
-    rig, cpu = seen.trainer.avatar.rig, torch.device("cpu")
+    rig = seen.trainer.avatar.rig
     poses = {"training": seen.frames[len(seen.frames) // 3].pose.joint_rotations, "novel": novel}
     marks: list[Measurement] = []
     for name, pose in poses.items():
         points = draw_points(seen, pose)
         rays = one_sample_rays(points)
         solved = CorrespondenceGrid.solve(rig, pose)
-        cells = correspondence_tables(solved, cpu)
+        cells = correspondence_tables(solved)
         broyden = BroydenLookup(rig, pose, _grid(seen))
         times = time_interleaved(
             {
@@ -101,9 +102,7 @@ def one_sample_rays(points: PosedPoints) -> RayBatch:
 
 def march_once(seen: LoadedTrainer, rays: RayBatch, cells: CorrespondenceTables) -> RaySamples:
     """The trainer's own march, asked for one sample a ray."""
-    return seen.trainer.backend.march(
-        rays, cells, _grid(seen), MarchSettings(ONE_SAMPLE_STEP_M, math.inf, 1)
-    )
+    return operations.march(rays, cells, _grid(seen), MarchSettings(ONE_SAMPLE_STEP_M, math.inf, 1))
 
 
 def canonical_points(samples: RaySamples) -> Float32[np.ndarray, "points 3"]:
@@ -123,11 +122,9 @@ def lookups_per_second(seen: LoadedTrainer, cells: CorrespondenceTables) -> floa
     how = MarchSettings(trainer.config.sample_step_m, math.inf, 256)
 
     def march() -> int:
-        return sum(
-            len(trainer.backend.march(rays, cells, everywhere, how).points) for rays in batches
-        )
+        return sum(len(operations.march(rays, cells, everywhere, how).points) for rays in batches)
 
-    return march() / time_interleaved({"march": march}, torch.device("cpu"))["march"]
+    return march() / time_interleaved({"march": march})["march"]
 
 
 def _grid(seen: LoadedTrainer) -> DensityGrid:

@@ -19,8 +19,8 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from avatar.correspondence_grid import CorrespondenceGrid
-from avatar.kernels.backend_protocol import (
-    Backend,
+from avatar.kernels import operations
+from avatar.kernels.operands import (
     CorrespondenceTables,
     DensityGrid,
     MarchSettings,
@@ -51,21 +51,19 @@ class DenseSampler(NamedTuple):
     own: CorrespondenceTables
     center: Float32[Tensor, "3"] | None
 
-    def samples(
-        self, backend: Backend, rays: RayBatch, grid: DensityGrid, step_m: float
-    ) -> RaySamples:
+    def samples(self, rays: RayBatch, grid: DensityGrid, step_m: float) -> RaySamples:
         """Every sample along rays, none left out and no end before the last."""
         everywhere = grid._replace(occupied=torch.ones_like(grid.occupied))
         if self.center is None:
             how = MarchSettings(step_m, math.inf, MAX_DENSE_SAMPLES)
-            return backend.march(rays, self.cells, everywhere, how)
+            return operations.march(rays, self.cells, everywhere, how)
         own, wide = ray_entry(rays, self.own), ray_entry(rays, self.cells)
         near = (rays.origins - self.center).norm(dim=1) - REACH_M
         same_lattice = ((own - wide) / step_m + rays.jitter) % 1.0
         passed = torch.floor((near - wide) / step_m).clamp(min=0.0)
         how = MarchSettings(step_m, math.inf, math.ceil(2.0 * REACH_M / step_m))
         later = rays._replace(jitter=same_lattice + passed)
-        return backend.march(later, self.cells, everywhere, how)
+        return operations.march(later, self.cells, everywhere, how)
 
     def clear_substitutes(
         self, raw: Float32[Tensor, "samples 4"], rows: Int32[Tensor, "samples"]
@@ -78,7 +76,7 @@ class DenseSampler(NamedTuple):
 def dense_in_box(cells: CorrespondenceTables, inside: Float32[Tensor, "3"]) -> DenseSampler:
     """Between the walls of each frame's box; a sample without a root is queried at one point."""
     slots, row, _ = cells.roots.shape
-    stand_in = torch.zeros(slots, 1, 12, device=cells.roots.device)
+    stand_in = torch.zeros(slots, 1, 12)
     stand_in[:, 0, :3] = inside
     index = torch.where(cells.packed_cells <= 0, row * 8 + 1, cells.packed_cells)
     filled = cells._replace(packed_cells=index, roots=torch.cat([cells.roots, stand_in], dim=1))
@@ -86,13 +84,13 @@ def dense_in_box(cells: CorrespondenceTables, inside: Float32[Tensor, "3"]) -> D
 
 
 def dense_as_in_paper(
-    frames: Sequence[TrainingFrame], center: Float32[np.ndarray, "3"], device: torch.device
+    frames: Sequence[TrainingFrame], center: Float32[np.ndarray, "3"]
 ) -> tuple[DenseSampler, ReplayBuffer]:
     """A metre before to a metre behind the body, and a store of the frames to draw rays from."""
     ends = np.concatenate([_ends(frame, center) for frame in frames])
     low, high = ends.min(axis=0), ends.max(axis=0)
     most = max(len(frame.correspondences.roots) for frame in frames)
-    own, wide = ReplayBuffer(len(frames), device), ReplayBuffer(len(frames), device)
+    own, wide = ReplayBuffer(len(frames)), ReplayBuffer(len(frames))
     for frame in frames:
         own.add(frame)
         wide.add(
@@ -101,7 +99,7 @@ def dense_as_in_paper(
                 correspondences=extend_correspondences(frame.correspondences, low, high, most),
             )
         )
-    middle = torch.from_numpy(center).to(device)
+    middle = torch.from_numpy(center)
     return DenseSampler(wide.correspondences, most, own.correspondences, middle), wide
 
 

@@ -14,7 +14,8 @@ from jaxtyping import Float32
 
 from avatar.evaluation.held_out import HeldOutFrame
 from avatar.evaluation.image_metrics import composite_on_white, psnr
-from avatar.kernels.backend_protocol import RayBatch
+from avatar.kernels import operations
+from avatar.kernels.operands import RayBatch
 from avatar.render import correspondence_tables, render
 from avatar.training.frame_stream import TrainingFrame, rebuild_frame
 from avatar.training.replay_buffer import ReplayBuffer
@@ -34,19 +35,19 @@ PAPER = "off as in the paper: ±1 m about the body on every ray"
 BOX = "off: between the walls of the person's box only"
 
 
-def skipping_marks(seen: LoadedTrainer, device: torch.device) -> list[Measurement]:
+def skipping_marks(seen: LoadedTrainer) -> list[Measurement]:
     """All ratios."""
     held = seen.held_out[len(seen.held_out) // 2].with_correspondences(seen.trainer.avatar.rig)
-    return [*_training(seen, device), *_rendering(seen, held, device)]
+    return [*_training(seen), *_rendering(seen, held)]
 
 
-def _training(seen: LoadedTrainer, device: torch.device) -> list[Measurement]:
+def _training(seen: LoadedTrainer) -> list[Measurement]:
     trainer, every = seen.trainer, seen.trainer.config.occupancy_interval
     rays, counts = trainer.config.rays, {"paper": [], "box": []}
     grid = trainer.avatar.occupancy.density_grid
     box = dense_in_box(trainer.replay.correspondences, grid.low + 0.5 / grid.cells_per_m)
     some = seen.frames[:: max(1, len(seen.frames) // PAPER_FRAMES)]
-    paper, store = dense_as_in_paper(some, trainer.avatar.rig.rest_joints[0], device)
+    paper, store = dense_as_in_paper(some, trainer.avatar.rig.rest_joints[0])
     boxed, papers = dense_step(seen, box, trainer.replay), dense_step(seen, paper, store)
 
     def skipping() -> None:
@@ -59,8 +60,7 @@ def _training(seen: LoadedTrainer, device: torch.device) -> list[Measurement]:
             "on": skipping,
             "box": lambda: counts["box"].append(boxed()),
             "paper": lambda: counts["paper"].append(papers()),
-        },
-        device,
+        }
     )
     on = times["on"] / every
     asked = (trainer.samples - before) / (6 * every * rays)
@@ -90,32 +90,32 @@ def dense_step(
     """A training step without skipping; it returns how many samples it had."""
     trainer, config, field = seen.trainer, seen.trainer.config, seen.trainer.avatar.field
     grid = trainer.avatar.occupancy.density_grid
-    chance = torch.Generator(device=replay.device).manual_seed(0)
+    chance = torch.Generator().manual_seed(0)
 
     def step() -> int:
         batch = replay.sample_rays(config.rays, chance)
-        samples = unskipped.samples(field.backend, batch.rays, grid, config.sample_step_m)
+        samples = unskipped.samples(batch.rays, grid, config.sample_step_m)
         activations = field.forward(samples.points)
         unskipped.clear_substitutes(activations.raw, samples.root_rows)
-        _, _, grad = field.backend.composite_loss(
+        _, _, grad = operations.composite_loss(
             activations.raw, samples, config.sample_step_m, batch.target,
             config.alpha_weight, config.hard_surface_weight,
         )  # fmt: skip
         field.backward(activations, grad)
-        step_optimizer(trainer.optimizer, trainer.backend)
+        step_optimizer(trainer.optimizer)
         return len(samples.points)
 
     return step
 
 
-def _rendering(seen: LoadedTrainer, held: HeldOutFrame, device: torch.device) -> list[Measurement]:
+def _rendering(seen: LoadedTrainer, held: HeldOutFrame) -> list[Measurement]:
     avatar, observation = seen.trainer.avatar, held.observation
     pose, camera = observation.pose, observation.camera
     grid, pictures = avatar.occupancy.density_grid, dict[str, np.ndarray]()
     box = dense_in_box(
-        correspondence_tables(held.correspondences, device), grid.low + 0.5 / grid.cells_per_m
+        correspondence_tables(held.correspondences), grid.low + 0.5 / grid.cells_per_m
     )
-    paper, _ = dense_as_in_paper([whole_frame(seen, held)], avatar.rig.rest_joints[0], device)
+    paper, _ = dense_as_in_paper([whole_frame(seen, held)], avatar.rig.rest_joints[0])
 
     def skipping() -> None:
         pictures["on"] = render(avatar, pose, camera, cells=held.correspondences)
@@ -129,7 +129,7 @@ def _rendering(seen: LoadedTrainer, held: HeldOutFrame, device: torch.device) ->
             "box": lambda: without(box, "box"),
             "paper": lambda: without(paper, "paper"),
         },
-        device, rounds=5, fewer_rounds={"box": 3, "paper": 2},
+        rounds=5, fewer_rounds={"box": 3, "paper": 2},
     )  # fmt: skip
     width, height = camera.size_px
 
@@ -176,11 +176,11 @@ def dense_picture(
         rays = RayBatch(
             origin.expand(count, 3).contiguous(),
             chunk,
-            torch.zeros(count, dtype=torch.int32, device=grid.low.device),
-            torch.full((count,), 0.5, device=grid.low.device),
+            torch.zeros(count, dtype=torch.int32),
+            torch.full((count,), 0.5),
         )
-        samples = unskipped.samples(field.backend, rays, grid, avatar.sample_step_m)
+        samples = unskipped.samples(rays, grid, avatar.sample_step_m)
         raw = unskipped.clear_substitutes(field.raw_outputs_at(samples.points), samples.root_rows)
-        parts.append(field.backend.composite(raw, samples, avatar.sample_step_m))
+        parts.append(operations.composite(raw, samples, avatar.sample_step_m))
     width, height = held.observation.camera.size_px
-    return torch.cat(parts).reshape(height, width, 4).cpu().numpy()
+    return torch.cat(parts).reshape(height, width, 4).numpy()

@@ -168,12 +168,11 @@ def training_rows(report: dict[str, Any]) -> list[EndToEndRow]:
 
 def novel_rows(run: Path, unseen: list[Observation]) -> list[EndToEndRow]:
     """Poses never filmed: by the player, by the volume renderer, and as a white sheet."""
-    import torch
 
     from avatar.render import render
     from avatar.training import checkpoint
 
-    trainer, _ = checkpoint.load(run / "checkpoint", torch.device("cpu"))
+    trainer, _ = checkpoint.load(run / "checkpoint")
     exact = score_images(
         unseen, lambda seen: composite_on_white(render(trainer.avatar, seen.pose, seen.camera))
     )

@@ -18,8 +18,6 @@ def main() -> None:
     capture, began = Path(sys.argv[1]), float(sys.argv[2])
     recording = open_capture(CaptureInputs(video=capture))
 
-    import torch
-
     from apps.run.session_start import set_threads
     from avatar.config import TrainConfig
     from avatar.evaluation.held_out import HeldOutFrame
@@ -32,7 +30,7 @@ def main() -> None:
     set_threads(None)
     rig = Rig.from_shaped_body(recording.shaped)
     config = TrainConfig.for_budget(60.0, footprint_m=recording.pixel_footprint_m())
-    trainer = Trainer(rig, config, torch.device("cpu"))
+    trainer = Trainer(rig, config)
     warm_up(trainer)
     total, held = recording.source.frame_count, list[HeldOutFrame]()
     begun = time.time()

@@ -16,7 +16,7 @@ from typing import final
 from apps.cli.command_line import parse_arguments
 from apps.cli.console import Console
 from apps.run.ingest_arguments import IngestArguments
-from apps.run.session_start import load_kernels, prepare_trainer
+from apps.run.session_start import prepare_trainer, set_threads
 from apps.run.training_session import TrainingSession
 from avatar.events import Stepped, TrainEvent
 from preprocess.observation import Observation
@@ -51,7 +51,7 @@ class FirstStep:
 def time_first_step(arguments: IngestArguments) -> tuple[float, float]:
     """Seconds from the first frame of a stream to the first step, and CPU time for it."""
     run, console, stop = arguments.run_folder(), Console(), threading.Event()
-    load_kernels(arguments, console)
+    set_threads(arguments.threads)
     began_cpu_s = time.process_time()
     capture = arguments.open_capture()
     start = prepare_trainer(arguments, capture, run, console)

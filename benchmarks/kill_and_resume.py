@@ -11,8 +11,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-import torch
-
 from avatar.training import checkpoint
 from benchmarks.hardware import ROOT
 from benchmarks.measurements import Measurement
@@ -69,7 +67,7 @@ def kill_and_resume(capture: Path, run: Path, after_s: float) -> ResumedRun:
     for path in (p for p in run.rglob("*") if p.is_file() and not p.name.startswith(".")):
         try:
             if path.name == "state.pt":
-                had_s = checkpoint.load(path.parent, torch.device("cpu"))[0].wall_seconds
+                had_s = checkpoint.load(path.parent)[0].wall_seconds
             elif path.suffix == ".iavatar":
                 Player.load(path)
             elif path.name == "report.json":

@@ -85,14 +85,13 @@ def resident_bytes() -> int:
 
 def main() -> None:
     """Learns, and prints what was resident at two frames, and how many were read."""
-    import torch
 
     from apps.run.session_start import new_trainer
     from apps.run.training_session import TrainingSession
 
     capture, run = Path(sys.argv[1]), RunFolder(path=Path(sys.argv[2]))
-    recording, device = open_sample(capture), torch.device("cpu")
-    trainer = new_trainer(recording, seconds=SECONDS, seed=0, refine_poses=True, device=device)
+    recording = open_sample(capture)
+    trainer = new_trainer(recording, seconds=SECONDS, seed=0, refine_poses=True)
     warm_up(trainer)
     at: dict[int, int] = {}
     add = trainer.add_frame

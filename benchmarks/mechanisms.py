@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 from unittest import mock
 
 import numpy as np
-import torch
 
 from apps.run.session_start import new_trainer
 from avatar.avatar_model import Avatar
@@ -145,11 +144,10 @@ MECHANISMS = [
     ),
     Mechanism(
         name="densities cached by samples",
-        patched={"avatar.kernels.numba_backend.NumbaBackend.scatter_max_density": lambda *_: None},
+        patched={"avatar.kernels.operations.scatter_max_density": lambda *_: None},
         code=(
-            "avatar.kernels.backend_protocol.Backend.scatter_max_density",
-            "avatar.kernels.numba_backend.NumbaBackend.scatter_max_density",
-            "avatar.kernels.torch_reference.scatter_max_density",
+            "avatar.kernels.operations.scatter_max_density",
+            "avatar.kernels.numba_rendering.scatter_max_density",
         ),
     ),
     Mechanism(
@@ -368,11 +366,8 @@ def _begin(compared: ComparedCapture, mechanism: Mechanism, steps: int, seed: in
     total = round(steps * mechanism.steps_factor)
     trainer = new_trainer(
         compared.capture, seconds=60.0, steps=total, seed=seed, refine_poses=True,
-        device=torch.device("cpu"),
     )  # fmt: skip
-    trainer = Trainer(
-        trainer.avatar.rig, replace(trainer.config, **mechanism.off), torch.device("cpu")
-    )
+    trainer = Trainer(trainer.avatar.rig, replace(trainer.config, **mechanism.off))
     with mechanism.turned_off():
         for frame in compared.frames:
             trainer.add_frame(frame)

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-import torch
 
 from avatar.config import TrainConfig
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
@@ -123,7 +122,6 @@ def train_variants(
     recording: Any,
     rig: Rig,
     frames: Sequence[TrainingFrame],
-    device: torch.device,
 ) -> list[VariantRun]:
     """Every variant after its budget, with one thread."""
     limit_threads(1)
@@ -131,8 +129,8 @@ def train_variants(
     for variant in variants:
         seconds = budget.seconds or 60.0
         config = training_config(recording, seconds, **variant.changes)
-        compile_kernels(rig, config, device, variant.scheme, frames[0])
-        trainer = BaselineTrainer(rig, config, device, variant.scheme)
+        compile_kernels(rig, config, variant.scheme, frames[0])
+        trainer = BaselineTrainer(rig, config, variant.scheme)
         for frame in frames:
             trainer.add_frame(frame)
         runs.append(VariantRun(variant=variant, scheme_trainer=trainer))
@@ -145,12 +143,11 @@ def train_variants(
 def compile_kernels(
     rig: Rig,
     config: TrainConfig,
-    device: torch.device,
     scheme: BaselineScheme,
     frame: TrainingFrame,
 ) -> None:
     """Compiles every kernel that a variant uses, in a trainer that is thrown away."""
-    trainer = BaselineTrainer(rig, replace(config, rays=64), device, scheme)
+    trainer = BaselineTrainer(rig, replace(config, rays=64), scheme)
     trainer.add_frame(frame)
     warm_up(trainer.trainer)
     for _ in range(config.occupancy_interval):

@@ -19,7 +19,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import torch
 import tyro
 
 from apps.cli.command_line import run_command
@@ -127,7 +126,7 @@ def train_or_load(
         command += [] if frames is None else ["--frames", f"0:{frames}"]
         command += [] if size is None else ["--size", str(size)]
         subprocess.run(command, cwd=ROOT, stdout=sys.stderr, check=True)
-    return checkpoint.load(run / "checkpoint", torch.device("cpu"))[0]
+    return checkpoint.load(run / "checkpoint")[0]
 
 
 if __name__ == "__main__":

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from jaxtyping import Float
 
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
@@ -70,7 +69,7 @@ def given_pose_error_deg(capture: Path) -> float:
 
 def learnt_pose_error_deg(run: Path, capture: Path) -> float:
     """Mean error of the corrected poses of the frames that were trained on, degrees."""
-    trainer, _ = checkpoint.load(run / "checkpoint", torch.device("cpu"))
+    trainer, _ = checkpoint.load(run / "checkpoint")
     truth = read_motion(capture / "truth" / "poses.npz")
     true_camera = _camera(capture / "truth" / "cameras.npz")
     saved = SavedFrames.load(run / "checkpoint" / LAST_RUN_FILE)
@@ -83,7 +82,7 @@ def learnt_pose_error_deg(run: Path, capture: Path) -> float:
 
 def corrected_pose(trainer: Trainer, index: int, given: BodyPose) -> BodyPose:
     """The pose of a frame after the corrections of training."""
-    poses = PoseOptimizer(trainer.avatar.rig, 1, torch.device("cpu"))
+    poses = PoseOptimizer(trainer.avatar.rig, 1)
     poses.set_pose(0, given, correction=trainer.pose_corrections.get(index))
     return poses.pose(0)
 
@@ -97,7 +96,7 @@ def pose_error_deg(one: tuple[BodyPose, Camera], other: tuple[BodyPose, Camera])
 
 def score_novel_poses(run: Path, capture: Path) -> NovelPoseFit:
     """How well the avatar shows the true pictures of poses that were never filmed."""
-    trainer, _ = checkpoint.load(run / "checkpoint", torch.device("cpu"))
+    trainer, _ = checkpoint.load(run / "checkpoint")
     person = read_shaped_body(run / "checkpoint" / "person.npz", load_body_model())
     placed = [HeldOutFrame(observation=seen) for seen in novel_observations(capture, person)]
     before = [score_frame(trainer.avatar, frame) for frame in placed]

@@ -5,8 +5,6 @@ import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import torch
-
 from avatar.config import TrainConfig
 from avatar.evaluation.held_out import HeldOutFrame
 from avatar.rig import Rig
@@ -52,11 +50,9 @@ def training_config(recording: Capture, seconds: float, **changes: Any) -> Train
     return dataclasses.replace(config, **changes)
 
 
-def load_trainer(
-    recording: Capture, rig: Rig, config: TrainConfig, device: torch.device
-) -> LoadedTrainer:
+def load_trainer(recording: Capture, rig: Rig, config: TrainConfig) -> LoadedTrainer:
     """A trainer that has taken in every frame before its first step."""
-    trainer, frames, held = Trainer(rig, config, device), [], []
+    trainer, frames, held = Trainer(rig, config), [], []
     began = time.process_time()
     total = recording.source.frame_count
     for item in prepare_stream(

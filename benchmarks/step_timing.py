@@ -7,13 +7,13 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from avatar.backends import TorchBackend
 from avatar.config import TrainConfig
-from avatar.kernels import torch_reference
-from avatar.kernels.backend_protocol import MarchSettings
+from avatar.kernels import operations
+from avatar.kernels.operands import MarchSettings
 from avatar.radiance_field import sample_tv_pairs
 from avatar.training.replay_buffer import ReplayBuffer, TrainingBatch
 from avatar.training.training_step import compute_gradients
+from baselines import torch_reference
 from baselines.instant_avatar.autograd_steps import (
     AutogradField,
     PaperStepInputs,
@@ -27,18 +27,18 @@ from benchmarks.stopwatch import time_interleaved
 POINTS = 65_536
 
 
-def step_marks(seen: LoadedTrainer, device: torch.device) -> list[Measurement]:
+def step_marks(seen: LoadedTrainer) -> list[Measurement]:
     """The step on 1,024 rays of one frame, by all three."""
     trainer, config = seen.trainer, seen.trainer.config
     avatar, field = trainer.avatar, trainer.avatar.field
     frame = seen.frames[len(seen.frames) // 3]
-    replay = ReplayBuffer(1, device)
+    replay = ReplayBuffer(1)
     replay.add(frame)
-    batch = replay.sample_rays(config.rays, _seeded(device))
+    batch = replay.sample_rays(config.rays, _seeded())
     how = MarchSettings(config.sample_step_m, config.opaque_margin_m, config.max_samples)
     grid = avatar.occupancy.density_grid
-    samples = field.backend.march(batch.rays, replay.correspondences, grid, how)
-    chance = _seeded(device)
+    samples = operations.march(batch.rays, replay.correspondences, grid, how)
+    chance = _seeded()
     empty = avatar.occupancy.sample_empty(config.empty_space_points, chance)
     near = sample_tv_pairs(samples.points, config, chance)
     plain, scene = AutogradField(field), PaperStepInputs.of(avatar.rig, frame, seen.frames, grid)
@@ -48,20 +48,20 @@ def step_marks(seen: LoadedTrainer, device: torch.device) -> list[Measurement]:
         field.table_grad.zero_()
         compute_gradients(
             avatar, seen.trainer.sampler, replay.correspondences, batch, config,
-            hard_surface_share=1.0, generator=_seeded(device),
+            hard_surface_share=1.0, generator=_seeded(),
         )  # fmt: skip
 
     alternatives: dict[str, Callable[[], object]] = {
         "ours": ours,
         "torch": lambda: autograd_step(plain, samples, empty, near, batch, config),
-        "march": lambda: TorchBackend().march(batch.rays, replay.correspondences, grid, how),
+        "march": lambda: torch_reference.march(batch.rays, replay.correspondences, grid, how),
         "paper": lambda: counts.append(
             paper_step(scene, plain, batch, empty, config)
         ),
     }  # fmt: skip
     ours(replace(config, faint_gradient_share=0.0))
     strays = _largest_difference(field.parameters(), alternatives["torch"]())
-    times = time_interleaved(alternatives, device, fewer_rounds={"paper": 2})
+    times = time_interleaved(alternatives, fewer_rounds={"paper": 2})
     kept, roots = (count / config.rays for count in counts[-1])
     return _step_marks(times, len(samples.points) / config.rays, strays, kept, roots, batch)
 
@@ -100,22 +100,22 @@ def _largest_difference(parameters: list[torch.nn.Parameter], plain: object) -> 
     return max(float((p.grad - g).abs().max() / g.abs().max()) for p, g in both)
 
 
-def encode_marks(seen: LoadedTrainer, device: torch.device) -> list[Measurement]:
+def encode_marks(seen: LoadedTrainer) -> list[Measurement]:
     """The hash grid forward and backward at training samples."""
     field = seen.trainer.avatar.field
     points = training_points(seen, POINTS)
-    grad = torch.randn(POINTS, field.levels.feature_width, generator=_seeded(device), device=device)
+    grad = torch.randn(POINTS, field.levels.feature_width, generator=_seeded())
     table = field.table.detach().clone().requires_grad_()
 
     def ours() -> None:
         field.table_grad.zero_()
-        field.backend.encode(points, field.table, field.levels)
-        field.backend.encode_backward(points, grad, field.levels, field.table_grad)
+        operations.encode(points, field.table, field.levels)
+        operations.encode_backward(points, grad, field.levels, field.table_grad)
 
     def plain() -> None:
         torch.autograd.grad(torch_reference.encode(points, table, field.levels), table, grad)
 
-    times = time_interleaved({"ours": ours, "torch": plain}, device)
+    times = time_interleaved({"ours": ours, "torch": plain})
     mega = {name: POINTS / time / 1e6 for name, time in times.items()}
     levels = f"{len(field.levels.cells_per_m)} levels, {field.levels.entries:,} entries"
     return [
@@ -132,16 +132,14 @@ def training_points(seen: LoadedTrainer, count: int) -> Float32[Tensor, "count 3
     """Canonical samples as training draws them, ray by ray."""
     trainer, config = seen.trainer, seen.trainer.config
     how = MarchSettings(config.sample_step_m, config.opaque_margin_m, config.max_samples)
-    chance = _seeded(trainer.replay.device)
+    chance = _seeded()
     found: list[Tensor] = []
     while sum(map(len, found)) < count:
         batch = trainer.replay.sample_rays(config.rays, chance)
         grid = trainer.avatar.occupancy.density_grid
-        found.append(
-            trainer.backend.march(batch.rays, trainer.replay.correspondences, grid, how).points
-        )
+        found.append(operations.march(batch.rays, trainer.replay.correspondences, grid, how).points)
     return torch.cat(found)[:count].contiguous()
 
 
-def _seeded(device: torch.device) -> torch.Generator:
-    return torch.Generator(device=device).manual_seed(0)
+def _seeded() -> torch.Generator:
+    return torch.Generator().manual_seed(0)

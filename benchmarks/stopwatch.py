@@ -16,19 +16,17 @@ def limit_threads(count: int) -> None:
 
 def time_interleaved(
     alternatives: Mapping[str, Callable[[], object]],
-    device: torch.device,
     *,
     rounds: int = 5,
     fewer_rounds: Mapping[str, int] | None = None,
 ) -> dict[str, float]:
     """Median seconds of each alternative.
 
-    On the CPU these are seconds of one core (process time, one thread): what else runs on the
-    machine hardly counts. On a GPU they are wall seconds between two synchronisations.
+    These are seconds of one core (process time, one thread): what else runs on the machine hardly
+    counts.
 
     Args:
         alternatives: Each is called once to warm up, then once a round, in turn.
-        device: Where they run.
         rounds: How often each is timed.
         seldom: Those that are too slow for that: how often instead, and without warming up.
     """
@@ -41,14 +39,7 @@ def time_interleaved(
     for turn in range(rounds):
         for name, work in alternatives.items():
             if turn < fewer_rounds.get(name, rounds):
-                began = _now(device)
+                began = time.process_time()
                 work()
-                spent[name].append(_now(device) - began)
+                spent[name].append(time.process_time() - began)
     return {name: statistics.median(times) for name, times in spent.items()}
-
-
-def _now(device: torch.device) -> float:
-    if device.type != "cuda":
-        return time.process_time()
-    torch.cuda.synchronize(device)
-    return time.perf_counter()

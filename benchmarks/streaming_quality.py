@@ -5,7 +5,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
 from avatar.avatar_model import Avatar
@@ -96,19 +95,19 @@ def training_frames_at(
 
 def measure_streaming_quality(capture: Path) -> Iterator[Measurement]:
     """Streaming beside learning with every frame at hand; old frames; the first picture."""
-    recording, device = open_sample(capture), torch.device("cpu")
+    recording = open_sample(capture)
     rig = Rig.from_shaped_body(recording.shaped)
     seconds = recording.source.duration_s
     assert seconds is not None
     config = training_config(recording, seconds)
     limit_threads(Hardware.here().cores)
-    trainer = Trainer(rig, config, device)
+    trainer = Trainer(rig, config)
     warm_up(trainer)
     copies, held = train_with_copies(trainer, recording.in_real_time())
     streamed = mean_psnr(trainer.avatar, held)
     yield _first_usable(trainer.avatar, recording, rig, copies, config.held_out_stride)
     yield _forgetting(trainer.avatar, recording, rig, copies, config.held_out_stride)
-    offline = load_trainer(recording, rig, config, device)
+    offline = load_trainer(recording, rig, config)
     train_for_wall_seconds(offline.trainer, trainer.wall_seconds)
     beside = mean_psnr(offline.trainer.avatar, offline.held_out)
     yield Measurement(

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
 
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
@@ -164,7 +163,7 @@ def held_out_on_exact_masks(run: Path, truth: Path) -> float:
 
     Two runs with masks of their own are then compared with the same pictures.
     """
-    trainer, _ = checkpoint.load(run / "checkpoint", torch.device("cpu"))
+    trainer, _ = checkpoint.load(run / "checkpoint")
     kept = SavedFrames.load(run / "checkpoint" / LAST_RUN_FILE).held_out
     masks = open_masks(truth / "masks")
     frames = []

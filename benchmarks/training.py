@@ -1,6 +1,6 @@
 """The training core against what was asked of it: one table, ratios within one run.
 
-    python -m benchmarks.training [--quick] [--device cpu] [--json FILE]
+    python -m benchmarks.training [--quick] [--json FILE]
 
 Alternatives take turns in one process; times are those of one core unless the row says otherwise.
 There are no thresholds here: whether a mark is reached is for the reader to see.
@@ -13,13 +13,10 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
 
-import torch
 import tyro
 
 from apps.cli.command_line import run_command
-from apps.run.session_start import resolve_device
 from avatar.rig import Rig
 from benchmarks.builds import build_marks
 from benchmarks.correspondence_lookup import warp_marks
@@ -56,8 +53,6 @@ class Training:
 
     quick: bool = False
     """Only single operations: neither quality nor start-up nor memory."""
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Where to train."""
     json: Path | None = None
     """File for the figures."""
     keep: Path | None = None
@@ -75,7 +70,7 @@ def run_benchmark(job: Training) -> int:
     hardware = Hardware.here()
     with tempfile.TemporaryDirectory() as temporary:
         marks = list(all_marks(job, job.keep or Path(temporary)))
-    print("\n".join([*hardware.lines(), f"device {job.device}", "", *markdown_rows(marks)]))
+    print("\n".join([*hardware.lines(), "", *markdown_rows(marks)]))
     if job.json is not None:
         content = {"hardware": asdict(hardware), "marks": [asdict(mark) for mark in marks]}
         job.json.write_text(json.dumps(content, indent=1) + "\n")
@@ -84,50 +79,44 @@ def run_benchmark(job: Training) -> int:
 
 def all_marks(job: Training, folder: Path) -> Iterator[Measurement]:
     """All rows; each is also told on standard error as soon as it is known."""
-    device = resolve_device(job.device)
     small = film_sample(folder / f"sample{SIZE_PX}", SIZE_PX)
-    groups = [operation_marks(small, device)]
+    groups = [operation_marks(small)]
     if not job.quick:
         groups += [
-            measure_by_core_seconds(folder, device),
-            measure_by_wall_time(
-                small, {"held out": ("33", "36"), "novel poses": ("31", "34")}, device
-            ),
-            measure_pose_refinement(folder, device),
-            large_marks(folder, device),
+            measure_by_core_seconds(folder),
+            measure_by_wall_time(small, {"held out": ("33", "36"), "novel poses": ("31", "34")}),
+            measure_pose_refinement(folder),
+            large_marks(folder),
         ]
     for mark in itertools.chain.from_iterable(groups):
         print(f"{mark.name}: {mark.value} ({mark.context})", file=sys.stderr, flush=True)
         yield mark
 
 
-def operation_marks(capture: Path, device: torch.device) -> Iterator[Measurement]:
+def operation_marks(capture: Path) -> Iterator[Measurement]:
     """Single operations, on an avatar that has been learnt for a while."""
     recording = open_sample(capture)
     rig = Rig.from_shaped_body(recording.shaped)
-    seen = load_trainer(
-        recording, rig, training_config(recording, 60.0, refine_poses=False), device
-    )
+    seen = load_trainer(recording, rig, training_config(recording, 60.0, refine_poses=False))
     limit_threads(1)
     train_for_core_seconds(seen.trainer, WARMUP_TRAINING_SECONDS)
-    yield from step_marks(seen, device)
-    yield from encode_marks(seen, device)
-    if device.type == "cpu":  # the other side of the ratio runs there only
-        novel = read_motion(capture / "truth" / "novel" / "poses.npz")
-        yield from warp_marks(seen, novel[len(novel) // 2].joint_rotations)
-        yield from build_marks(capture)
-    yield from skipping_marks(seen, device)
+    yield from step_marks(seen)
+    yield from encode_marks(seen)
+    novel = read_motion(capture / "truth" / "novel" / "poses.npz")
+    yield from warp_marks(seen, novel[len(novel) // 2].joint_rotations)
+    yield from build_marks(capture)
+    yield from skipping_marks(seen)
 
 
-def large_marks(folder: Path, device: torch.device) -> Iterator[Measurement]:
+def large_marks(folder: Path) -> Iterator[Measurement]:
     """What a long video of large pictures takes; its first 120 frames turn as the others do."""
     large = film_sample(folder / "sample540", 540, frames=300, turns=5.0)
     asked = {"held out": ("33", "37"), "novel poses": ("30.5", "34")}
-    yield from measure_by_wall_time(large, asked, device)
+    yield from measure_by_wall_time(large, asked)
     yield from measure_startup(large)
     yield from measure_peak_memory(large, folder / "run540")
     printed = dict.fromkeys(asked, ("", ""))
-    yield from measure_by_wall_time(large, printed, device, seconds=TEN_MINUTES)
+    yield from measure_by_wall_time(large, printed, seconds=TEN_MINUTES)
 
 
 if __name__ == "__main__":

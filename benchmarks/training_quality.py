@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
 from avatar.avatar_model import Avatar
 from avatar.config import TrainConfig
@@ -81,11 +80,11 @@ def with_true_poses(capture: Path, held: Sequence[HeldOutFrame], rig: Rig) -> li
 
 
 def train_online(
-    recording: Capture, rig: Rig, config: TrainConfig, device: torch.device
+    recording: Capture, rig: Rig, config: TrainConfig
 ) -> tuple[Trainer, list[HeldOutFrame]]:
     """Learns while the video is read, on all cores, as ia-ingest does."""
     limit_threads(Hardware.here().cores)
-    trainer, held = Trainer(rig, config, device), list[HeldOutFrame]()
+    trainer, held = Trainer(rig, config), list[HeldOutFrame]()
     warm_up(trainer)
     total = recording.source.frame_count
     inbox = Inbox(
@@ -97,13 +96,13 @@ def train_online(
     return trainer, held
 
 
-def measure_by_core_seconds(folder: Path, device: torch.device) -> Iterator[Measurement]:
+def measure_by_core_seconds(folder: Path) -> Iterator[Measurement]:
     """128 px, one thread: each time is a run of its own."""
     recording = open_sample(film_sample(folder / "sample128", 128))
     rig = Rig.from_shaped_body(recording.shaped)
     for seconds, least, moonshot in ((5.0, "32", "34"), (10.0, "34", "36"), (60.0, "36", "39")):
         limit_threads(1)
-        seen = load_trainer(recording, rig, training_config(recording, seconds), device)
+        seen = load_trainer(recording, rig, training_config(recording, seconds))
         warm_up(seen.trainer)
         train_for_core_seconds(seen.trainer, seconds)
         held, trainer = mean_psnr(seen.trainer.avatar, seen.held_out), seen.trainer
@@ -120,7 +119,6 @@ def measure_by_core_seconds(folder: Path, device: torch.device) -> Iterator[Meas
 def measure_by_wall_time(
     capture: Path,
     targets: dict[str, tuple[str, str]],
-    device: torch.device,
     *,
     seconds: float = WALL_SECONDS,
 ) -> Iterator[Measurement]:
@@ -129,12 +127,11 @@ def measure_by_wall_time(
     Args:
         capture: A filmed sample; its first 120 frames are learnt.
         asked: "At least" and "moonshot" for "held out" and for "novel poses".
-        device: Where to train.
         seconds: How long, by the wall clock.
     """
     recording = open_sample(capture, frames=slice(0, 120))
     rig = Rig.from_shaped_body(recording.shaped)
-    trainer, held = train_online(recording, rig, training_config(recording, seconds), device)
+    trainer, held = train_online(recording, rig, training_config(recording, seconds))
     shown = {"held out": held, "novel poses": novel_pose_frames(capture, rig)}
     for name, pictures in shown.items():
         found, (least, moonshot) = mean_psnr(trainer.avatar, pictures), targets[name]
@@ -149,7 +146,7 @@ def measure_by_wall_time(
         )
 
 
-def measure_pose_refinement(folder: Path, device: torch.device) -> Iterator[Measurement]:
+def measure_pose_refinement(folder: Path) -> Iterator[Measurement]:
     """What pose refinement gains on noisy poses, scored at the true ones, in the mask."""
     capture = film_sample(folder / "noisy256", 256, **NOISE)
     recording = open_sample(capture)
@@ -157,7 +154,7 @@ def measure_pose_refinement(folder: Path, device: torch.device) -> Iterator[Meas
     found: dict[bool, dict[str, MeanPsnr]] = {}
     for refines in (False, True):
         config = training_config(recording, WALL_SECONDS, refine_poses=refines)
-        trainer, held = train_online(recording, rig, config, device)
+        trainer, held = train_online(recording, rig, config)
         pictures = {
             "held out": with_true_poses(capture, held, rig),
             "novel poses": novel_pose_frames(capture, rig),

@@ -12,8 +12,6 @@ from pathlib import Path
 try:
     import apps  # noqa: F401, I001 - sets OpenMP's variables, which torch reads when it is imported
 
-    import torch
-
     from preprocess.open_capture import open_capture
     from preprocess.capture_session import CaptureInputs
     from studio.shoot import ShootConfig, film_capture
@@ -43,7 +41,7 @@ def main(folder: Path) -> None:
     # The rig never changes; the recipe follows from the number of steps and the size of a pixel.
     rig = Rig.from_shaped_body(recording.shaped)
     config = TrainConfig.for_budget(steps=STEPS, footprint_m=recording.pixel_footprint_m())
-    trainer = Trainer(rig, config, torch.device("cpu"))
+    trainer = Trainer(rig, config)
     warm_up(trainer)  # compiles kernels
 
     # One thread makes frames ready, this one learns from them as they come.

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float32, UInt8
 from PIL import Image
 
@@ -132,19 +131,11 @@ def export_avatar(
             what the graph means.
         OSError: If it cannot be written.
     """
-    occupied = avatar.rendering_grid().occupied.cpu().numpy()
-    device = avatar.field.table.device
-
-    def field_at(
-        points: Float32[torch.Tensor, "points 3"],
-    ) -> tuple[Float32[torch.Tensor, "points 3"], Float32[torch.Tensor, "points"]]:
-        rgb, density = avatar.color_and_density_at(points.to(device))
-        return rgb.cpu(), density.cpu()
-
+    occupied = avatar.rendering_grid().occupied.numpy()
     config = config or BakeConfig.for_sample_step(avatar.sample_step_m)
     config = config if fine_tune_bricks else replace(config, fine_tuning_pictures=0)
     return export_field(
-        field_at,
+        avatar.color_and_density_at,
         avatar.rig,
         occupied,
         path,

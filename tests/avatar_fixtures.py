@@ -12,7 +12,7 @@ from avatar.config import TrainConfig
 from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.events import HeldOutScore
-from avatar.kernels.backend_protocol import HashLevels
+from avatar.kernels.operands import HashLevels
 from avatar.rig import Rig
 from avatar.training.frame_stream import prepare_stream
 from avatar.training.trainer import Trainer, cosine_decay
@@ -168,7 +168,7 @@ def learnt(rig, clip) -> Learnt:
         table_size=1 << 14,
         refine_poses=False,
     )
-    trainer = Trainer(rig, config, torch.device("cpu"))
+    trainer = Trainer(rig, config)
     held = []
     for item in prepare_stream(iter(clip.observations), rig, stride=6, total=None):
         if isinstance(item, HeldOutFrame):

@@ -31,7 +31,7 @@ BATCH_OPTIONS = frozenset(
     ("video", "out", "resume", "overwrite", "json", "view", "live", "realtime", "idle_seconds")
 )
 """Options of ia-ingest that a batch sets itself, or that need a person or a camera."""
-COST_OPTIONS = frozenset({"threads", "device"})
+COST_OPTIONS = frozenset({"threads"})
 """Options that change the cost of an avatar; changing them does not train it again."""
 TRUTH_WORDS = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
 """Values of flags in a manifest."""

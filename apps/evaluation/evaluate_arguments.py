@@ -84,8 +84,6 @@ class EvaluateArguments:
     out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Folder for the runs of a dataset, and for its frames under captures/ (default: runs/NAME,
     named after the dataset)."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Device for training and rendering."""
     json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Write the scores of every frame to this file."""
     markdown: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None

@@ -23,7 +23,6 @@ from apps.evaluation.score_table import AvatarEvaluation, ScoreRow
 from apps.report.report_page import data_uri
 from apps.report.report_writer import motion_animation
 from apps.run.run_folder import RunFolder
-from apps.run.session_start import resolve_device
 from avatar.evaluation.held_out import HeldOutFrame
 from avatar.evaluation.perceptual import Lpips
 from avatar.render import render
@@ -306,5 +305,4 @@ class EvaluationSession:
 
     def _load_trainer(self, run: RunFolder) -> Trainer:
         with self.console.status(f"loading {run.checkpoint}"):
-            device = resolve_device(self.arguments.device)
-            return checkpoint.load(run.checkpoint, device)[0]
+            return checkpoint.load(run.checkpoint)[0]

@@ -161,14 +161,13 @@ def report_page(
 def _summary(report: Report) -> str:
     training, machine = report.training, report.machine
     threads = "one thread" if machine.threads == 1 else f"{machine.threads} threads"
-    where = f"a CPU, {threads}" if machine.device == "cpu" else "a GPU"
     earlier, duration = report.earlier_videos, f"{training.wall_seconds:.0f} seconds"
     frames = f"{report.frames.used} frames"
     if earlier is not None:
         frames += f" of this video, and {earlier.frames_trained} of {_join_names(earlier.videos)}"
         now_s = training.wall_seconds - earlier.wall_seconds
         duration += f" ({now_s:.0f} on this video)"
-    return f"An avatar from {frames}, trained for {duration} on {where}."
+    return f"An avatar from {frames}, trained for {duration} on a CPU, {threads}."
 
 
 def _join_names(names: Sequence[str]) -> str:

@@ -26,11 +26,11 @@ REPORT_FORMAT = 1
 
 @dataclass(frozen=True, kw_only=True)
 class MachineInfo:
-    """Device ("cpu", "cuda"), backend of the kernels, and number of threads."""
+    """Number of threads, device and compiler of the kernels."""
 
-    device: str
-    backend: str
     threads: int
+    device: str = "cpu"
+    backend: str = "numba"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -276,11 +276,7 @@ def _build_report(
     return Report(
         command=command,
         recipe=recipe,
-        machine=MachineInfo(
-            device=trainer.avatar.field.table.device.type,
-            backend=trainer.backend.name,
-            threads=threads,
-        ),
+        machine=MachineInfo(threads=threads),
         frames=_frame_stats(result),
         training=_training_stats(result, startup_seconds),
         held_out=held_out,

@@ -5,7 +5,7 @@ import os
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
@@ -112,9 +112,6 @@ class IngestArguments(CaptureArguments):
     """Open a live viewer at http://127.0.0.1:PORT (default 8008): orbit the avatar, see body
     coverage, pause training, save a package. Requires viser: pip install
     'instant-avatar-stream[viewer]'. Ctrl-C closes it at the end."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Device for training; auto is the CPU. There are no CUDA kernels yet: cuda runs the
-    plain-torch reference, which is slower."""
     threads: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Threads of the trainer (default: one per core)."""
     seed: int = 0

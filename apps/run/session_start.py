@@ -1,4 +1,4 @@
-"""Start of a training session: device, kernels, a new, resumed or extended trainer, the viewer."""
+"""Start of a training session: threads, kernels, a new, resumed or extended trainer, the viewer."""
 
 import math
 from collections.abc import Iterator
@@ -19,7 +19,6 @@ from apps.run.missing_inputs import remove_unused_tracking
 from apps.run.run_folder import RunFolder
 from apps.run.run_timing import expected_held_out, post_training_seconds
 from apps.run.training_session import TrainingSession
-from avatar.backends import backend_for
 from avatar.config import HELD_OUT_STRIDE, TrainConfig
 from avatar.evaluation.all_round_verdict import SEEN
 from avatar.evaluation.coverage import coverage_advice, expected_coverage
@@ -30,30 +29,6 @@ from avatar.training.trainer import Trainer
 from capture.input_error import InputError
 from export.bake import proxy_surface
 from preprocess.capture_session import Capture
-
-CUDA_SLOW_WARNING = (
-    "--device cuda runs the plain-torch reference, which is slower than the CPU: there are no CUDA "
-    "kernels yet. Omit --device to train on the CPU."
-)
-"""Warning for --device cuda."""
-
-
-def resolve_device(name: str) -> torch.device:
-    """Return the device for --device.
-
-    Args:
-        name: "cpu", "cuda", or "auto". Auto is the CPU, which is faster until there are CUDA
-            kernels.
-
-    Raises:
-        InputError: If CUDA is requested, but torch finds no GPU.
-    """
-    if name == "cuda" and not torch.cuda.is_available():
-        raise InputError(
-            "--device cuda requires a GPU, but torch finds none. Omit --device, or install torch "
-            "with CUDA and check nvidia-smi."
-        )
-    return torch.device("cuda" if name == "cuda" else "cpu")
 
 
 def set_threads(requested: int | None) -> int:
@@ -92,17 +67,6 @@ class PreparedTrainer:
     notes: dict[str, Any]
 
 
-def load_kernels(arguments: IngestArguments, console: Console) -> int:
-    """Compile or load the kernels of the device; return the number of threads."""
-    threads = set_threads(arguments.threads)
-    with console.status("compiling kernels (slow on the first run only)"):
-        device = resolve_device(arguments.device)
-        backend_for(device)
-    if device.type == "cuda":
-        console.warning(CUDA_SLOW_WARNING)
-    return threads
-
-
 def prepare_trainer(
     arguments: IngestArguments, capture: Capture, run: RunFolder, console: Console
 ) -> PreparedTrainer:
@@ -117,7 +81,7 @@ def prepare_trainer(
         if arguments.resume:
             console.info(f"No checkpoint in {run.path}; starting a new run.")
         prepared = _new_run(arguments, capture)
-    with console.status("warming up"):
+    with console.status("compiling kernels (slow on the first run only)"):
         train.warm_up(prepared.trainer)
         proxy_surface.warm_up()
     _announce_coverage(capture, console)
@@ -178,7 +142,6 @@ def new_trainer(
     seed: int,
     refine_poses: bool,
     hold_every: int = HELD_OUT_STRIDE,
-    device: torch.device,
 ) -> Trainer:
     """Build an untrained trainer for the person, the training budget and the image size."""
     config = TrainConfig.for_budget(
@@ -191,7 +154,7 @@ def new_trainer(
         seed=seed,
     )
     config = replace(config, refine_poses=refine_poses)
-    return Trainer(Rig.from_shaped_body(recording.shaped), config, device)
+    return Trainer(Rig.from_shaped_body(recording.shaped), config)
 
 
 def _new_run(arguments: IngestArguments, capture: Capture) -> PreparedTrainer:
@@ -202,7 +165,6 @@ def _new_run(arguments: IngestArguments, capture: Capture) -> PreparedTrainer:
         seed=arguments.seed,
         refine_poses=arguments.refine_poses,
         hold_every=arguments.hold_out,
-        device=resolve_device(arguments.device),
     )
     notes = {"video": capture.identity, "name": capture.paths.video.name}
     return PreparedTrainer(trainer=trainer, restore_count=0, notes=notes)
@@ -212,7 +174,7 @@ def _load_trainer(
     arguments: IngestArguments, capture: Capture, run: RunFolder, console: Console
 ) -> PreparedTrainer:
     """Load the checkpoint: the same video continues, another one is added."""
-    trainer, notes = checkpoint.load(run.checkpoint, resolve_device(arguments.device))
+    trainer, notes = checkpoint.load(run.checkpoint)
     _check_same_body(trainer, capture, run)
     earlier = EarlierVideos(run, notes)
     if notes.get("video") == capture.identity:

@@ -1,1 +1,1 @@
-"""Kernels: the protocol of a backend, and the torch reference."""
+"""Kernels: the operations of a training step, compiled for the CPU."""

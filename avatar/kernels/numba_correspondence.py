@@ -9,7 +9,7 @@ culls cells, and leaves out spurious correspondences.
 import math
 
 import numpy as np
-from jaxtyping import Float32, Int32
+from jaxtyping import Float32
 
 from avatar.kernels.kernel_compiler import FAST_MATH, NO_ALLOCATION, compile_kernel
 from avatar.kernels.numba_rendering import canonical_point
@@ -24,28 +24,28 @@ from avatar.kernels.numba_skinning import (
     solve_root,
     transform_point,
 )
-from avatar.kernels.torch_correspondence import (
-    MAX_ROOTS,
-    MIN_SECOND_ORDER_M,
-    PROBE_DISTANCE_CELLS,
-    SAME_ROOT_M,
-)
 from avatar.rig import Rig
 
 F32, I32, U32 = np.float32, np.int32, np.uint32
 FACE_DIRECTIONS = np.array(
     [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)], dtype=np.int32
 )
+MAX_ROOTS = 3
+"""Largest number of roots of a cell; two bits hold it."""
+SAME_ROOT_M = 0.02
+"""Distance below which two roots of a cell are the same, metres."""
+PROBE_DISTANCE_CELLS = 0.375
+"""Distance of the probes from a cell's center, in cells: three quarters of the way to a face."""
+MIN_SECOND_ORDER_M = 5e-4
+"""Deviation from an affine warp, at a cell's faces, from which the cell is bent, metres."""
 SEARCH_MARGIN_M = 0.03
 """Margin about the band within which roots are searched, metres."""
 MAX_PREDICTED_OVERSHOOT_M = 0.015
 """Distance beyond the band from which a predicted root is not searched, metres."""
 
 
-def solve_correspondences(
-    rig: Rig, bones: Float32[np.ndarray, "24 12"], band_m: float, cell_m: float
-) -> tuple[Float32[np.ndarray, "3"], Int32[np.ndarray, "gx gy gz"], Float32[np.ndarray, "rows 12"]]:
-    """Corner, packed cells and roots of one pose's `CorrespondenceGrid`."""
+def solve_correspondences(rig, bones, band_m, cell_m):
+    """As `avatar.kernels.operations.solve_correspondences`."""
     volume = blended_transform_volume(rig, bones, band_m + SEARCH_MARGIN_M)
     posed, inverses = np.empty_like(rig.seeds), np.empty((len(rig.seeds), 9), np.float32)
     room = np.empty(MATRIX_LANES + 15, dtype=np.float32)

@@ -9,7 +9,6 @@ write to one place: no atomics, and the same sums for any number of threads.
 import numpy as np
 from numba import get_num_threads, prange
 
-from avatar.kernels.backend_protocol import FEATURES_PER_LEVEL, PRIMES
 from avatar.kernels.kernel_compiler import (
     FAST_MATH,
     add4,
@@ -19,6 +18,7 @@ from avatar.kernels.kernel_compiler import (
     scale4,
     store4,
 )
+from avatar.kernels.operands import FEATURES_PER_LEVEL, PRIMES
 
 POINTS_PER_BLOCK = 256
 ENTRIES_PER_BLOCK = 4096

@@ -24,9 +24,10 @@ from avatar.kernels.kernel_compiler import (
     store4,
 )
 from avatar.kernels.numba_skinning import transform_point
-from avatar.kernels.torch_correspondence import MAX_ROOT_STEP_M
 
 F32, I32 = np.float32, np.int32
+MAX_ROOT_STEP_M = 0.05
+"""A root never moves farther than this at once: where the chord is longer the warp has a fold."""
 ROOTS_AHEAD = 8
 """Cells between one whose root moves and the one whose weights are fetched meanwhile."""
 MIN_PULL_SHARE = 1e-3

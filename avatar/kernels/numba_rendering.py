@@ -1,19 +1,22 @@
 """Ray marching, volume rendering, its losses and their gradient, compiled for the CPU."""
 
+import math
+
 import numpy as np
 from numba import prange
 
 from avatar.kernels.kernel_compiler import FAST_MATH, NO_ALLOCATION, compile_kernel, prefetch
-from avatar.kernels.torch_reference import (
-    ALPHA_DEAD_ZONE,
-    BRIGHT_GRAY,
-    COLOR_HUBER_DELTA,
-    DARK_GRAY,
-    MAX_LOG_DENSITY,
-    OPAQUE_DEPTH,
-)
+from avatar.kernels.operands import MAX_LOG_DENSITY
 
 F32, I32, U32 = np.float32, np.int32, np.uint32
+COLOR_HUBER_DELTA = 0.1
+"""Color error at which the Huber loss turns from quadratic to linear."""
+DARK_GRAY, BRIGHT_GRAY = 0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0)
+"""Backgrounds: the mean loss over both is that over all grays in [0, 1] (Gauss), if quadratic."""
+ALPHA_DEAD_ZONE = 1e-3
+"""Error of alpha up to which the L1 loss on alpha is zero."""
+OPAQUE_DEPTH = 12.0
+"""Optical depth, by cached densities, at which a training ray counts as opaque."""
 UNLIMITED_STEPS = 10**9
 """Opaque margin, in samples, from which a ray does not end at a surface (exact rendering)."""
 RAYS_PER_BLOCK = 16

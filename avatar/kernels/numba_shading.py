@@ -7,9 +7,11 @@ from numba import prange
 
 from avatar.kernels.kernel_compiler import FAST_MATH, NO_ALLOCATION, compile_kernel
 from avatar.kernels.numba_rendering import cell_index_at
-from avatar.kernels.torch_reference import MAX_LOG_DENSITY, MIN_NORMAL_WEIGHT
+from avatar.kernels.operands import MAX_LOG_DENSITY
 
 F32, I32, U32 = np.float32, np.int32, np.uint32
+MIN_NORMAL_WEIGHT = 1e-3
+"""Weight of a sample in its ray up to which its normal does not count."""
 
 
 @compile_kernel(parallel=True, **NO_ALLOCATION)

@@ -5,12 +5,13 @@ import math
 import numpy as np
 
 from avatar.kernels.kernel_compiler import FAST_MATH, NO_ALLOCATION, compile_kernel
-from avatar.kernels.torch_correspondence import MAX_PROBE_CORRECTION_M
 
 F32, U32 = np.float32, np.uint32
 MATRIX_LANES = 16
 """Floats that a 3×4 matrix takes in a volume of transforms: as many as a register and a cache line
 hold. The last four are nothing."""
+MAX_PROBE_CORRECTION_M = 0.03
+"""Largest motion of a probe, metres; one that would move farther lies beyond a fold and stays."""
 
 
 @compile_kernel(inline="always", **FAST_MATH)

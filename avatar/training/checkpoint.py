@@ -104,7 +104,7 @@ def write_state(state: dict[str, Any], folder: Path) -> Path:
     return path
 
 
-def load(folder: Path, device: torch.device) -> tuple[Trainer, dict[str, Any]]:
+def load(folder: Path) -> tuple[Trainer, dict[str, Any]]:
     """The trainer that `save` left, without frames, and the caller's notes.
 
     Raises:
@@ -121,7 +121,7 @@ def load(folder: Path, device: torch.device) -> tuple[Trainer, dict[str, Any]]:
                 f"The checkpoint {path} has format {state['format']}; this version reads "
                 f"{CHECKPOINT_FORMAT}. Train again with --overwrite."
             )
-        return _restored(state, device), state["notes"]
+        return _restored(state), state["notes"]
     except InputError:
         raise
     except pickle.UnpicklingError as error:
@@ -136,9 +136,9 @@ def load(folder: Path, device: torch.device) -> tuple[Trainer, dict[str, Any]]:
         ) from error
 
 
-def _restored(state: dict[str, Any], device: torch.device) -> Trainer:
+def _restored(state: dict[str, Any]) -> Trainer:
     rig = Rig(**{item.name: state["rig"][item.name].numpy() for item in dataclasses.fields(Rig)})
-    trainer = Trainer(rig, TrainConfig(**state["config"]), device)
+    trainer = Trainer(rig, TrainConfig(**state["config"]))
     with torch.no_grad():
         for field, name in ((trainer.field, "field"), (trainer.avatar.field, "mean")):
             for parameter, values in zip(field.parameters(), state[name], strict=True):

@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Float32
 from torch import Tensor
 
-from avatar.kernels.backend_protocol import PremultipliedPixels
 from avatar.kernels.kernel_compiler import FAST_MATH, compile_kernel
+from avatar.kernels.operands import PremultipliedPixels
 from avatar.training.replay_buffer import TrainingBatch
 
 ChannelGains = Float32[np.ndarray, "3"]
@@ -44,16 +44,15 @@ class FrameExposures:
         gains: Factor of each slot's color channels against the neutral avatar.
     """
 
-    def __init__(self, capacity: int, device: torch.device, *, avatar_frozen: bool = False) -> None:
+    def __init__(self, capacity: int, *, avatar_frozen: bool = False) -> None:
         """Starts without frames.
 
         Args:
             capacity: Number of slots.
-            device: Where the gains lie.
             avatar_frozen: Whether the avatar no longer changes. Its brightness is then known, and
                 gains are neither centered nor shrunk.
         """
-        self.gains: Float32[Tensor, "slots 3"] = torch.ones(capacity, 3, device=device)
+        self.gains: Float32[Tensor, "slots 3"] = torch.ones(capacity, 3)
         self._avatar_frozen = avatar_frozen
         self._frames: list[int] = []
         self._restored: dict[int, ChannelGains] = {}
@@ -62,7 +61,7 @@ class FrameExposures:
     @property
     def by_frame(self) -> dict[int, ChannelGains]:
         """Known gains, by the frames' indices in their source."""
-        gains = self.gains[: len(self._frames)].cpu().numpy().copy()
+        gains = self.gains[: len(self._frames)].numpy().copy()
         return {**self._restored, **dict(zip(self._frames, gains, strict=True))}
 
     def restore(self, gains: Mapping[int, ChannelGains]) -> None:
@@ -87,7 +86,7 @@ class FrameExposures:
         """
         gain = self.expected_gain(frame) if gain is None else gain
         self._frames[slot : slot + 1] = [frame]
-        self.gains[slot] = torch.from_numpy(gain).to(self.gains)
+        self.gains[slot] = torch.from_numpy(gain)
         self._rendered[slot] = INITIAL_RAYS * INITIAL_COLOR
         self._pixels[slot] = self._rendered[slot] * gain
 
@@ -107,10 +106,10 @@ class FrameExposures:
         held = len(self._frames)
         gains = np.zeros((held, 3), dtype=np.float32)
         _update_gains(
-            batch.rays.slots.cpu().numpy(), batch.target.cpu().numpy(), rendered.cpu().numpy(),
+            batch.rays.slots.numpy(), batch.target.numpy(), rendered.numpy(),
             self._avatar_frozen, self._pixels, self._rendered, gains,
         )  # fmt: skip
-        self.gains[:held] = torch.from_numpy(gains).to(self.gains)
+        self.gains[:held] = torch.from_numpy(gains)
 
 
 @compile_kernel(**FAST_MATH)

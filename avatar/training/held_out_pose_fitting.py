@@ -52,15 +52,15 @@ def fit_test_poses(
     """
     if not frames:
         return
-    avatar, device = trainer.avatar, trainer.replay.device
+    avatar = trainer.avatar
     replay, poses = _with_neighboring_corrections(trainer, frames)
-    exposures = FrameExposures(len(frames), device, avatar_frozen=True)
+    exposures = FrameExposures(len(frames), avatar_frozen=True)
     for slot, index in enumerate(replay.frame_indices):
         exposures.set_frame(slot, index, trainer.exposures.expected_gain(index))
     _fit_frames(trainer, replay, poses, exposures, progress)
     for slot, frame in enumerate(frames):
-        pose, gain = poses.pose(slot), exposures.gains[slot].cpu().numpy()
-        cells = CorrespondenceGrid.solve(avatar.rig, pose.joint_rotations, device=device)
+        pose, gain = poses.pose(slot), exposures.gains[slot].numpy()
+        cells = CorrespondenceGrid.solve(avatar.rig, pose.joint_rotations)
         moved = HeldOutFrame(
             observation=replace(frame.observation, pose=pose), correspondences=cells, gain=gain
         )
@@ -89,8 +89,8 @@ def _fit_frames(
         off_skin_weight=0.0,
         rays=at_once * RAYS_PER_CORRECTION,
     )
-    sampler = OccupancySampler(field.backend, avatar.occupancy, config)
-    generator = torch.Generator(device=replay.device).manual_seed(config.seed)
+    sampler = OccupancySampler(avatar.occupancy, config)
+    generator = torch.Generator().manual_seed(config.seed)
     steps = math.ceil(CORRECTIONS_PER_FRAME * len(replay) / at_once)
     for step in range(steps):
         if step >= COARSE_SHARE * steps:
@@ -105,7 +105,7 @@ def _fit_frames(
             exposures.observe(batch, result.rendered)
         for _ in range(at_once):
             rate = cosine_decay(step / steps)
-            correct_one_pose(avatar.rig, trainer.backend, replay, poses, rate=rate)
+            correct_one_pose(avatar.rig, replay, poses, rate=rate)
         progress(FITTING_SHARE * (step + 1) / steps)
 
 
@@ -113,12 +113,10 @@ def _with_neighboring_corrections(
     trainer: Trainer, frames: list[HeldOutFrame]
 ) -> tuple[ReplayBuffer, PoseOptimizer]:
     """The frames and their poses, slot by slot, corrected like the frames about them."""
-    rig, device = trainer.avatar.rig, trainer.avatar.field.table.device
-    replay = ReplayBuffer(len(frames), device)
+    rig, replay = trainer.avatar.rig, ReplayBuffer(len(frames))
     poses = PoseOptimizer(
         rig,
         len(frames),
-        device,
         poses_may_be_exact=False,
         rays_per_frame=RAYS_PER_CORRECTION,
         prior_precision=PRIOR_PRECISION,

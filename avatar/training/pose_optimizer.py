@@ -18,8 +18,8 @@ from jaxtyping import Float, Float32, Int64
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from avatar.kernels.backend_protocol import SkinningVolume
 from avatar.kernels.numba_pose import pose_joints
+from avatar.kernels.operands import SkinningVolume
 from avatar.rig import Rig
 from avatar.training.pose_correction import (
     MIN_EVIDENCE,
@@ -109,7 +109,6 @@ class PoseOptimizer:
         self,
         rig: Rig,
         capacity: int,
-        device: torch.device,
         *,
         poses_may_be_exact: bool = True,
         rays_per_frame: int = MAX_RAYS_PER_FRAME,
@@ -121,7 +120,6 @@ class PoseOptimizer:
         Args:
             rig: Rig of the person.
             capacity: Number of slots.
-            device: Device that accumulates the gradients.
             poses_may_be_exact: Whether a pose moves only where its rays agree that it is wrong, and
                 then by half steps. Otherwise, with estimated poses or a fixed avatar, every pose
                 makes whole steps.
@@ -138,11 +136,11 @@ class PoseOptimizer:
         self.poses_may_be_exact = poses_may_be_exact
         self.min_gradient_cell_m = MIN_POSE_GRADIENT_CELL_M
         self.corrections: Float[np.ndarray, "slots 25 3"] = np.zeros((capacity, 25, 3))
-        self.bones: Float32[Tensor, "slots 24 12"] = torch.zeros(capacity, 24, 12, device=device)
+        self.bones: Float32[Tensor, "slots 24 12"] = torch.zeros(capacity, 24, 12)
         self.skinning = SkinningVolume(
-            torch.from_numpy(rig.weights).to(device),
-            torch.from_numpy(rig.box_low).to(device),
-            torch.from_numpy(rig.nodes_per_m).to(device),
+            torch.from_numpy(rig.weights),
+            torch.from_numpy(rig.box_low),
+            torch.from_numpy(rig.nodes_per_m),
         )
         self._tracker_poses: list[BodyPose | None] = [None] * capacity
         self._given_turns = np.zeros((capacity, 23, 3, 3))
@@ -259,7 +257,7 @@ class PoseOptimizer:
     ) -> None:
         """Accumulates the wrenches of a step's rays on their frames' bones."""
         self._rays.add(
-            slots.cpu().numpy(), wrenches.cpu().numpy(), loss.cpu().numpy(),
+            slots.numpy(), wrenches.numpy(), loss.numpy(),
             self._rays_per_frame * self._is_correctable, self._joints,
         )  # fmt: skip
 
@@ -350,4 +348,4 @@ class PoseOptimizer:
             self._given_turns[slot], self.corrections[slot], self.rig.rest_joints, self._parents,
             self._rest_from_canonical, turns[slot], places[slot], bones, root_turns[slot],
         )  # fmt: skip
-        self.bones[slot] = torch.from_numpy(bones).to(self.bones.device)
+        self.bones[slot] = torch.from_numpy(bones)

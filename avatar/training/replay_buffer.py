@@ -14,8 +14,8 @@ from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
 from avatar.correspondence_grid import CORRESPONDENCE_CELL_M, CorrespondenceGrid
-from avatar.kernels.backend_protocol import CorrespondenceTables, RayBatch
 from avatar.kernels.numba_drawing import SIGHT_SPACING_PX, draw_rays
+from avatar.kernels.operands import CorrespondenceTables, RayBatch
 from avatar.rig import Rig
 from avatar.training.frame_stream import TrainingFrame, camera_in_body, view_descriptor
 from avatar.training.pose_optimizer import RootCorrection
@@ -78,10 +78,9 @@ class ReplayBuffer:
         frame_indices: Index in its source of the frame that each slot holds.
     """
 
-    def __init__(self, capacity: int, device: torch.device) -> None:
+    def __init__(self, capacity: int) -> None:
         """Starts empty, for at most `capacity` frames."""
         self.capacity = capacity
-        self.device = device
         self.frame_indices: list[int] = []
         self._poses_and_views: list[tuple[BodyPose, RayView, RayView | None]] = []
         self._descriptors = np.zeros((capacity, 3 + 69))
@@ -145,16 +144,16 @@ class ReplayBuffer:
 
         Rays of the frames then miss the person: to be called after the last step.
         """
-        self._low = torch.zeros(self.capacity, 3, device=self.device)
-        self._shape = torch.ones(self.capacity, 3, dtype=torch.int32, device=self.device)
-        self._index = torch.zeros(self.capacity, 1, dtype=torch.int32, device=self.device)
-        self._roots = torch.zeros(self.capacity, 1, 12, device=self.device)
+        self._low = torch.zeros(self.capacity, 3)
+        self._shape = torch.ones(self.capacity, 3, dtype=torch.int32)
+        self._index = torch.zeros(self.capacity, 1, dtype=torch.int32)
+        self._roots = torch.zeros(self.capacity, 1, 12)
 
     def set_correspondences(self, slot: int, correspondences: CorrespondenceGrid) -> None:
         """Gives a slot the warp of its frame's pose."""
         self._index = self._store_rows(self._index, slot, correspondences.packed_cells.reshape(-1))
         self._roots = self._store_rows(self._roots, slot, correspondences.roots)
-        self._low[slot] = torch.from_numpy(correspondences.low).to(self.device)
+        self._low[slot] = torch.from_numpy(correspondences.low)
         self._shape[slot] = torch.tensor(correspondences.packed_cells.shape, dtype=torch.int32)
 
     def set_pose(self, slot: int, pose: BodyPose, rig: Rig) -> None:
@@ -179,26 +178,27 @@ class ReplayBuffer:
 
         Args:
             count: How many.
-            generator: On the store's device.
+            generator: Source of random numbers.
         """
-        chances = torch.rand(DRAWS_PER_RAY, count, generator=generator, device=generator.device)
+        chances = torch.rand(DRAWS_PER_RAY, count, generator=generator)
         slots = np.empty(count, dtype=np.int32)
         origins, directions = np.empty((2, count, 3), dtype=np.float32)
         targets = np.empty((count, 4), dtype=np.float32)
         world_from_body = np.empty((count, 3, 3), dtype=np.float32)
         draw_rays(
-            chances.cpu().numpy(), len(self),
+            chances.numpy(), len(self),
             (NEAR_PERSON_RAY_SHARE, HEAD_SIDE_RAY_SHARE, MAX_HEAD_RAY_SHARE),
             self._pixels, self._runs.numpy(), self._sights.numpy(), self._colors.numpy(),
             self._origins, self._turns, self._world_from_camera,
             slots, origins, directions, targets, world_from_body,
         )  # fmt: skip
-
-        def here(values: np.ndarray) -> Tensor:
-            return torch.from_numpy(values).to(self.device)
-
-        rays = RayBatch(here(origins), here(directions), here(slots), chances[-1].to(self.device))
-        return TrainingBatch(rays, here(targets), here(world_from_body))
+        rays = RayBatch(
+            origins=torch.from_numpy(origins),
+            directions=torch.from_numpy(directions),
+            slots=torch.from_numpy(slots),
+            jitter=chances[-1],
+        )
+        return TrainingBatch(rays, torch.from_numpy(targets), torch.from_numpy(world_from_body))
 
     def _store_frame(self, slot: int, frame: TrainingFrame) -> None:
         self.set_correspondences(slot, frame.correspondences)
@@ -224,10 +224,10 @@ class ReplayBuffer:
             width = needed + needed // 4
             # untouched pages cost nothing; numpy, not torch, asks for those of 2 MiB
             room = np.empty((len(store), width, *store.shape[2:]), dtype=values.dtype)
-            wider, held = torch.from_numpy(room).to(store), len(store) // self.capacity * len(self)
+            wider, held = torch.from_numpy(room), len(store) // self.capacity * len(self)
             wider[:held, : store.shape[1]] = store[:held]
             store = wider
-        store[row, :needed] = torch.from_numpy(values).to(store)
+        store[row, :needed] = torch.from_numpy(values)
         return store
 
     def _update_distances(self, slot: int, descriptor: Float[np.ndarray, " 72"]) -> None:

@@ -26,6 +26,7 @@ from avatar.events import (
     WaitingForFrame,
     Warned,
 )
+from avatar.kernels import operations
 from avatar.render import render
 from avatar.rig import Rig
 from avatar.training.frame_stream import (
@@ -325,18 +326,16 @@ def warm_up(trainer: Trainer) -> float:
         How many seconds it took: tens on a machine's first run, about one later.
     """
     began = time.perf_counter()
-    rig, device = trainer.avatar.rig, trainer.avatar.field.table.device
+    rig = trainer.avatar.rig
     config = dataclasses.replace(trainer.config, rays=64, empty_space_points=16, density_tv_pairs=8)
-    stand_in = Trainer(rig, config, device)
+    stand_in = Trainer(rig, config)
     camera = _front_camera(rig)
     stand_in.add_frame(_dummy_frame(rig, camera))
     stand_in.steps = FIRST_CORRECTION_STEPS
     for _ in range(config.occupancy_interval):
         stand_in.step(rate=1.0, hard_surface_share=1.0)
     poses = stand_in.poses  # an exact pose does not move, and nothing would have followed it
-    stand_in.backend.update_roots(
-        stand_in.replay.correspondences, 0, poses.skinning, poses.bones[0]
-    )
+    operations.update_roots(stand_in.replay.correspondences, 0, poses.skinning, poses.bones[0])
     render(stand_in.avatar, BodyPose.rest(), camera)
     return time.perf_counter() - began
 

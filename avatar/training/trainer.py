@@ -18,10 +18,10 @@ import torch
 from jaxtyping import Float
 
 from avatar.avatar_model import Avatar, OrientationShading
-from avatar.backends import backend_for
 from avatar.config import COARSEST_M, NOMINAL_STEPS_PER_S, TrainConfig
 from avatar.correspondence_grid import CorrespondenceGrid
-from avatar.kernels.backend_protocol import AdamSettings, Backend, HashLevels
+from avatar.kernels import operations
+from avatar.kernels.operands import AdamSettings, HashLevels
 from avatar.occupancy_grid import INITIAL_OCCUPANCY_DECAY, OCCUPANCY_DECAY, OccupancyGrid
 from avatar.radiance_field import RadianceField
 from avatar.rig import Rig
@@ -81,8 +81,8 @@ class UncompiledAdam(torch.optim.Adam):
     step = torch.no_grad()(inspect.unwrap(torch.optim.Adam.step))
 
 
-def step_optimizer(optimizer: UncompiledAdam, backend: Backend) -> None:
-    """Takes the optimizer's step by the backend's kernel, and zeroes the gradients.
+def step_optimizer(optimizer: UncompiledAdam) -> None:
+    """Takes the optimizer's step by our kernel, and zeroes the gradients.
 
     The state is that of `torch.optim.Adam`, whose own kernel takes 1.5 times as long.
     """
@@ -95,7 +95,9 @@ def step_optimizer(optimizer: UncompiledAdam, backend: Backend) -> None:
                 state["exp_avg_sq"] = torch.zeros_like(parameter)
             state["step"] += 1
             how = AdamSettings(group["lr"], group["betas"], group["eps"], int(state["step"]))
-            backend.adam_step(how, parameter.grad, state["exp_avg"], state["exp_avg_sq"], parameter)
+            operations.adam_step(
+                how, parameter.grad, state["exp_avg"], state["exp_avg_sq"], parameter
+            )
 
 
 NETWORK_RATE_FACTOR = 0.3
@@ -122,7 +124,7 @@ class Trainer:
         poses: Poses of these frames, corrected if the configuration says so.
         unseen: What frames have shown of the skin, and what the other skin is drawn to.
         exposures: Exposures of these frames, estimated if the configuration says so.
-        generator: Source of random numbers, on the field's device.
+        generator: Source of random numbers.
         pose_corrections: Correction of each frame's pose, by the frame's index in its source; a
             frame that is read again starts from it. To be cleared before another source is read;
             keeps at most twice the replay capacity.
@@ -133,39 +135,36 @@ class Trainer:
         paused_wall_seconds, paused_cpu_seconds: Time inside `paused`.
     """
 
-    def __init__(self, rig: Rig, config: TrainConfig, device: torch.device) -> None:
+    def __init__(self, rig: Rig, config: TrainConfig) -> None:
         """Starts without frames, from random parameters."""
         self.config = config
-        self.backend: Backend = backend_for(device)
         levels = HashLevels.spanning(
             rig.box_low, rig.box_high, coarsest_m=COARSEST_M, finest_m=config.finest_m,
             levels=config.levels, table_size=config.table_size,
         )  # fmt: skip
         start = torch.Generator().manual_seed(config.seed)
-        self.field = RadianceField(levels, self.backend, device, start)
+        self.field = RadianceField(levels, start)
         self.learner = Avatar(
             rig=rig,
             field=self.field,
-            occupancy=OccupancyGrid(rig, device),
+            occupancy=OccupancyGrid(rig),
             sample_step_m=config.sample_step_m,
-            shading=OrientationShading(rig, device),
+            shading=OrientationShading(rig),
         )
         self.unseen = UnseenSkin(rig)
-        self.sampler: RaySampler = OccupancySampler(
-            self.backend, self.learner.occupancy, config, self.unseen
-        )
+        self.sampler: RaySampler = OccupancySampler(self.learner.occupancy, config, self.unseen)
         self.avatar = replace(self.learner, field=self.field.clone())
-        self.replay = ReplayBuffer(config.replay_capacity, device)
+        self.replay = ReplayBuffer(config.replay_capacity)
         self.poses = PoseOptimizer(
-            rig, config.replay_capacity, device, poses_may_be_exact=config.poses_may_be_exact
+            rig, config.replay_capacity, poses_may_be_exact=config.poses_may_be_exact
         )
-        self.exposures = FrameExposures(config.replay_capacity, device)
+        self.exposures = FrameExposures(config.replay_capacity)
         self.pose_corrections: dict[int, Float[np.ndarray, "25 3"]] = {}
         self.steps = self.rays = self.samples = self.frames_seen = 0
         self.wall_seconds = self.cpu_seconds = 0.0
         self.step_wall_seconds = self.step_cpu_seconds = 0.0
         self.paused_wall_seconds = self.paused_cpu_seconds = 0.0
-        self.generator = torch.Generator(device=device).manual_seed(config.seed)
+        self.generator = torch.Generator().manual_seed(config.seed)
         rate = config.learning_rate
         self.optimizer = UncompiledAdam(
             [
@@ -218,7 +217,7 @@ class Trainer:
         slot, rig = self.replay.frame_indices.index(frame), self.avatar.rig
         self.replay.set_pose(slot, pose, rig)
         far = self.poses.replace_pose(slot, pose, frame=frame, step=self.steps)
-        move_correspondences(rig, self.backend, self.replay, self.poses, slot, far=far)
+        move_correspondences(rig, self.replay, self.poses, slot, far=far)
 
     @contextmanager
     def paused(self) -> Iterator[None]:
@@ -267,7 +266,7 @@ class Trainer:
             self.optimizer.param_groups, (1.0, NETWORK_RATE_FACTOR), strict=True
         ):
             group["lr"] = config.learning_rate * base * rate
-        step_optimizer(self.optimizer, self.backend)
+        step_optimizer(self.optimizer)
         if refines:
             self._correct_poses(falling)
         if config.estimate_exposures:
@@ -297,9 +296,7 @@ class Trainer:
 
     def _correct_poses(self, rate: float) -> None:
         for _ in range(CORRECTIONS_PER_STEP):
-            slot = correct_one_pose(
-                self.avatar.rig, self.backend, self.replay, self.poses, rate=rate
-            )
+            slot = correct_one_pose(self.avatar.rig, self.replay, self.poses, rate=rate)
             if slot is not None:
                 correction = self.poses.corrections[slot].copy()
                 self.pose_corrections[self.replay.frame_indices[slot]] = correction
@@ -322,18 +319,17 @@ def resolve_correspondences(
 ) -> None:
     """Solves a frame's correspondence grid again and moves its rays to its corrected pose."""
     joints = poses.pose(slot).joint_rotations
-    replay.set_correspondences(slot, CorrespondenceGrid.solve(rig, joints, device=replay.device))
+    replay.set_correspondences(slot, CorrespondenceGrid.solve(rig, joints))
     replay.correct_root(slot, poses.root_correction(slot))
 
 
 def correct_one_pose(
-    rig: Rig, backend: Backend, replay: ReplayBuffer, poses: PoseOptimizer, *, rate: float
+    rig: Rig, replay: ReplayBuffer, poses: PoseOptimizer, *, rate: float
 ) -> int | None:
     """Corrects one pose; its frame's correspondences and rays follow.
 
     Args:
         rig: Rig of the person.
-        backend: Updates the roots of the correspondences.
         replay: The frames.
         poses: Their poses, slot by slot.
         rate: Factor of the step, in (0, 1].
@@ -344,13 +340,12 @@ def correct_one_pose(
     slot = poses.correct_next(rate=rate)
     if slot is not None:
         far = poses.needs_resolve(slot)
-        move_correspondences(rig, backend, replay, poses, slot, far=far)
+        move_correspondences(rig, replay, poses, slot, far=far)
     return slot
 
 
 def move_correspondences(
     rig: Rig,
-    backend: Backend,
     replay: ReplayBuffer,
     poses: PoseOptimizer,
     slot: int,
@@ -360,12 +355,12 @@ def move_correspondences(
     """Lets a frame's correspondences and rays follow its pose.
 
     Args:
-        rig, backend, replay, poses: See `correct_one_pose`.
+        rig, replay, poses: See `correct_one_pose`.
         slot: Slot of the frame.
         far: Whether the correspondences must be solved again.
     """
     if far:
         resolve_correspondences(rig, replay, poses, slot)
         return
-    backend.update_roots(replay.correspondences, slot, poses.skinning, poses.bones[slot])
+    operations.update_roots(replay.correspondences, slot, poses.skinning, poses.bones[slot])
     replay.correct_root(slot, poses.root_correction(slot))

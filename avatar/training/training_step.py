@@ -10,15 +10,15 @@ from torch import Tensor
 from avatar import radiance_field
 from avatar.avatar_model import Avatar
 from avatar.config import TrainConfig
-from avatar.kernels.backend_protocol import (
-    Backend,
+from avatar.kernels import operations
+from avatar.kernels.numba_drawing import draw_strong_gradients
+from avatar.kernels.operands import (
     CorrespondenceTables,
     MarchSettings,
     PremultipliedPixels,
     RayBatch,
     RaySamples,
 )
-from avatar.kernels.numba_drawing import draw_strong_gradients
 from avatar.occupancy_grid import OccupancyGrid
 from avatar.radiance_field import RadianceField
 from avatar.training.pose_optimizer import PoseOptimizer
@@ -56,13 +56,11 @@ class OccupancySampler:
 
     def __init__(
         self,
-        backend: Backend,
         occupancy: OccupancyGrid,
         config: TrainConfig,
         unseen: UnseenSkin | None = None,
     ) -> None:
         """Reads `occupancy` and `unseen` at every call; their owner keeps them up to date."""
-        self._backend = backend
         self._unseen = unseen if config.unseen_weight else None
         self._occupancy = occupancy
         self._config = config
@@ -70,7 +68,7 @@ class OccupancySampler:
 
     def sample_rays(self, rays: RayBatch, correspondences: CorrespondenceTables) -> RaySamples:
         """Canonical samples in occupied cells, until the cached optical depth ends the ray."""
-        return self._backend.march(
+        return operations.march(
             rays,
             correspondences,
             self._occupancy.density_grid,
@@ -133,28 +131,28 @@ def compute_gradients(
         surface_share: Progress from smooth densities to firm surfaces, in [0, 1].
         caches_density: Whether the samples raise the occupancy's cached densities.
         poses: Accumulates the samples' wrenches, if poses are refined.
-        generator: Draws regularization points and samples, on the field's device.
+        generator: Draws regularization points and samples.
     """
     field = learner.field
     samples = sampler.sample_rays(batch.rays, correspondences)
     asked = _regularization_points(sampler, learner.occupancy, samples.points, config, generator)
     pairs = sampler.sample_source_pairs(config.unseen_points, generator)
-    asked.append(pairs.points.to(samples.points))
+    asked.append(pairs.points)
     seen = field.forward(torch.cat([samples.points, *asked]))
     raw, *raw_asked = seen.raw.split([len(points) for points in (samples.points, *asked)])
     count = len(raw)
     normals = learner.shading.body_normals(
-        field.backend, batch.rays, samples, raw, correspondences, config.sample_step_m
+        batch.rays, samples, raw, correspondences, config.sample_step_m
     )
     normals = (batch.world_from_body @ normals[..., None])[..., 0]
     lit = learner.shading.factors(normals)
-    rendered, loss, grad = field.backend.composite_loss(
+    rendered, loss, grad = operations.composite_loss(
         raw, samples, config.sample_step_m, batch.target / lit,
         config.alpha_weight, config.hard_surface_weight * hard_surface_share,
     )  # fmt: skip
     grads = [grad, *_regularization_gradients(raw_asked, asked, config, surface_share)]
     weight = config.unseen_weight / config.unseen_points
-    grads += [radiance_field.source_gradient(raw_asked[-1], pairs.weights.to(raw), weight)]
+    grads += [radiance_field.source_gradient(raw_asked[-1], pairs.weights, weight)]
     drawn, drawn_grads = draw_by_strength(torch.cat(grads), config.faint_gradient_share, generator)
     grad_features = field.backward(seen.rows(drawn), drawn_grads)
     if poses is not None and count:
@@ -165,7 +163,7 @@ def compute_gradients(
     if caches_density:
         log_density = raw[:, 3].contiguous()
         grid = learner.occupancy.density_grid
-        field.backend.scatter_max_density(seen.points[:count], log_density, grid)
+        operations.scatter_max_density(seen.points[:count], log_density, grid)
     return StepResult(loss, rendered * lit, normals, count)
 
 
@@ -179,18 +177,18 @@ def _regularization_points(
     """Points of the regularizers: empty, TV pairs, interior, smoothness pairs, off skin, head."""
     none = points[:0]
     return [
-        sampler.sample_empty(config.empty_space_points, generator).to(points)
+        sampler.sample_empty(config.empty_space_points, generator)
         if config.empty_space_weight
         else none,
         radiance_field.sample_tv_pairs(points, config, generator),
-        occupancy.sample_interior(config.interior_points, generator).to(points)
+        occupancy.sample_interior(config.interior_points, generator)
         if config.interior_weight
         else none,
         radiance_field.sample_smoothness_pairs(points, config, generator),
-        occupancy.sample_off_skin(config.off_skin_points, generator).to(points)
+        occupancy.sample_off_skin(config.off_skin_points, generator)
         if config.off_skin_weight
         else none,
-        occupancy.sample_interior(config.head_interior_points, generator, of_head=True).to(points)
+        occupancy.sample_interior(config.head_interior_points, generator, of_head=True)
         if config.head_interior_weight
         else none,
     ]
@@ -245,20 +243,17 @@ def draw_by_strength(
     Args:
         grads: Gradients of all points.
         faint_share: Strength, as a share of the mean, below which a gradient is faint.
-        generator: Decides, on the gradients' device.
+        generator: Decides.
 
     Returns:
         The points that were drawn, and their gradients, divided by the chance of each.
     """
     if not faint_share:
-        return torch.arange(len(grads), device=grads.device), grads
-    chances = torch.rand(len(grads), generator=generator, device=generator.device)
+        return torch.arange(len(grads)), grads
+    chances = torch.rand(len(grads), generator=generator)
     points, drawn = np.empty(len(grads), dtype=np.int64), np.empty(grads.shape, dtype=np.float32)
-    count = draw_strong_gradients(
-        grads.cpu().numpy(), faint_share, chances.cpu().numpy(), points, drawn
-    )
-    device = grads.device
-    return torch.from_numpy(points[:count]).to(device), torch.from_numpy(drawn[:count]).to(device)
+    count = draw_strong_gradients(grads.numpy(), faint_share, chances.numpy(), points, drawn)
+    return torch.from_numpy(points[:count]), torch.from_numpy(drawn[:count])
 
 
 def _accumulate_pose_gradients(
@@ -272,14 +267,14 @@ def _accumulate_pose_gradients(
     loss: Float32[Tensor, "rays"],
 ) -> None:
     """Adds the wrenches that the samples exert on the bones of their frames' poses."""
-    backend, levels = field.backend, field.levels.coarser_than(poses.min_gradient_cell_m)
+    levels = field.levels.coarser_than(poses.min_gradient_cell_m)
     # undo the mean over rays: a pose is judged by the loss of each of its rays
     each = grad_features[: len(drawn), : levels.feature_width] * len(loss)
     grad_points = torch.zeros_like(samples.points)
-    grad_points[drawn] = backend.encode_points_backward(
+    grad_points[drawn] = operations.encode_points_backward(
         samples.points[drawn], each, field.table, levels
     )
-    wrenches = backend.bone_wrenches(
+    wrenches = operations.bone_wrenches(
         samples, grad_points, slots, cells, poses.skinning, poses.bones
     )
     poses.accumulate(slots.long(), wrenches, loss)

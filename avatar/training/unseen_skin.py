@@ -190,10 +190,9 @@ class UnseenSkin:
         count = round(count * self._unseen_share)
         if self._sources is None or not count:
             return SourcePairs.none()
-        device = generator.device
-        drawn = torch.randint(len(self._drawn_from), (count,), generator=generator, device=device)
-        within = torch.rand(count, 3, generator=generator, device=device).cpu().numpy()
-        cells = self._drawn_from[drawn.cpu().numpy()]
+        drawn = torch.randint(len(self._drawn_from), (count,), generator=generator)
+        within = torch.rand(count, 3, generator=generator).numpy()
+        cells = self._drawn_from[drawn.numpy()]
         corner = np.stack(np.unravel_index(cells, self._shape), axis=1)
         points = (self._rig.box_low + (corner + within) / self._rig.cells_per_m).astype(np.float32)
         there, found = self._source_points(points, self._seed_of_cell[cells])

@@ -23,12 +23,12 @@ from jaxtyping import Bool, Float32
 from torch import Tensor
 
 from avatar.config import TrainConfig
-from avatar.kernels import torch_reference
-from avatar.kernels.backend_protocol import DensityGrid, HashLevels, RaySamples
+from avatar.kernels.operands import DensityGrid, HashLevels, RaySamples
 from avatar.radiance_field import OPACITY_LENGTH_M, RadianceField
 from avatar.rig import Rig
 from avatar.training.frame_stream import TrainingFrame
 from avatar.training.replay_buffer import TrainingBatch
+from baselines import torch_reference
 from baselines.instant_avatar.broyden_kernels import START_BONES
 
 
@@ -110,18 +110,17 @@ class PaperStepInputs:
         cls, rig: Rig, frame: TrainingFrame, frames: Sequence[TrainingFrame], grid: DensityGrid
     ) -> "PaperStepInputs":
         """The scene of one frame out of a sequence."""
-        device = grid.low.device
         transforms = rig.body_from_canonical(frame.pose.joint_rotations)
-        weights = torch.from_numpy(rig.weights).to(device)
+        weights = torch.from_numpy(rig.weights)
         blended = weights @ torch.from_numpy(transforms[:, :3].reshape(24, 12)).to(weights)
         inverses = np.linalg.inv(transforms[list(START_BONES)])[:, :3]
         union, union_box = union_occupancy(rig, frames, grid)
         return cls(
             volume=blended.permute(3, 2, 1, 0)[None].contiguous(),
-            low=torch.from_numpy(rig.box_low).to(device),
-            high=torch.from_numpy(rig.box_high).to(device),
+            low=torch.from_numpy(rig.box_low),
+            high=torch.from_numpy(rig.box_high),
             bones=torch.from_numpy(inverses).to(weights),
-            person_box=torch.from_numpy(person_box(frame)).to(device),
+            person_box=torch.from_numpy(person_box(frame)),
             union=union,
             union_box=union_box,
         )
@@ -140,8 +139,8 @@ def union_occupancy(
     """The cells of root-normalised space that hold something in any frame, and their box."""
     boxes = np.stack([person_box(frame) for frame in frames])
     low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
-    cells = grid.occupied.cpu().nonzero().numpy()
-    points = (cells + 0.5) / grid.cells_per_m.cpu().numpy() + grid.low.cpu().numpy()
+    cells = grid.occupied.nonzero().numpy()
+    points = (cells + 0.5) / grid.cells_per_m.numpy() + grid.low.numpy()
     weights = rig.weights_at(points)
     union = torch.zeros((UNION_CELLS,) * 3)
     for frame in frames:
@@ -151,8 +150,7 @@ def union_occupancy(
         place = ((posed - low) / (high - low) * UNION_CELLS).astype(int)
         union[tuple(place.clip(0, UNION_CELLS - 1).T)] = 1.0
     dilated = torch.nn.functional.max_pool3d(union[None, None], 3, stride=1, padding=1)[0, 0]
-    device = grid.low.device
-    return (dilated > 0).to(device), torch.from_numpy(np.stack([low, high])).to(device)
+    return (dilated > 0), torch.from_numpy(np.stack([low, high]))
 
 
 def stratified_samples(
@@ -164,9 +162,7 @@ def stratified_samples(
     walls = (scene.person_box[:, None] - origins) / towards
     enter = walls.amin(dim=0).amax(dim=1).clamp(min=0.0)
     step = (walls.amax(dim=0).amin(dim=1) - enter).clamp(min=0.0) / SAMPLES_PER_RAY
-    place = torch.arange(SAMPLES_PER_RAY, device=step.device) + torch.rand(
-        len(step), SAMPLES_PER_RAY, device=step.device
-    )
+    place = torch.arange(SAMPLES_PER_RAY) + torch.rand(len(step), SAMPLES_PER_RAY)
     points = (
         origins[:, None] + (enter[:, None] + place * step[:, None])[..., None] * directions[:, None]
     )
@@ -232,7 +228,7 @@ def paper_step(
     candidates = raw.new_full((*valid.shape, 4), -30.0)
     candidates[valid] = raw[:asked]
     best = candidates[..., 3].argmax(dim=0)
-    chosen = candidates[best, torch.arange(len(points), device=raw.device)]
+    chosen = candidates[best, torch.arange(len(points))]
     mean_step = float(step[step > 0].mean())
     scale = torch.log(step / mean_step).repeat_interleave(count)
     chosen = torch.cat([chosen[:, :3], chosen[:, 3:] + scale[:, None]], dim=1)

@@ -1,17 +1,15 @@
-"""All canonical roots of posed samples by Broyden's method (Fast-SNARF): in torch, and compiled."""
+"""All canonical roots of posed samples by Broyden's method (Fast-SNARF), compiled."""
 
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int32
+from jaxtyping import Bool, Float32, Int32
 from numba import prange
 from torch import Tensor
 
-from avatar.kernels.backend_protocol import Backend
 from avatar.kernels.kernel_compiler import FAST_MATH, compile_kernel
 from avatar.kernels.numba_skinning import MATRIX_LANES, solve_root, transform_point
-from avatar.kernels.torch_correspondence import broyden_roots
 
 F32 = np.float32
 START_BONES = (0, 1, 2, 4, 5, 16, 17, 18, 19)
@@ -39,61 +37,17 @@ class BlendedTransforms(NamedTuple):
 
 
 def find_all_roots(
-    backend: Backend,
     points: Float32[Tensor, "points 3"],
     slots: Int32[Tensor, "points"],
     poses: BlendedTransforms,
 ) -> tuple[Float32[Tensor, "points starts 3"], Bool[Tensor, "points starts"]]:
     """The point at which each of Fast-SNARF's searches ends, and whether it is a new root."""
-    if backend.name == "torch":
-        return find_roots_in_torch(points, slots, *poses)
     roots = torch.empty(len(points), poses.inverses.shape[1], 3)
     valid = torch.empty(roots.shape[:2], dtype=torch.bool)
     find_all_roots_numba(
         points.numpy(), slots.numpy(), *(part.numpy() for part in poses),
         roots.numpy(), valid.numpy(),
     )  # fmt: skip
-    return roots, valid
-
-
-def find_roots_in_torch(
-    points: Float[Tensor, "points 3"],
-    slots: Int32[Tensor, "points"],
-    blended: Float[Tensor, "slots x y z 12"],
-    low: Float[Tensor, "3"],
-    nodes_per_m: Float[Tensor, "3"],
-    inverses: Float[Tensor, "slots starts 12"],
-) -> tuple[Float[Tensor, "points starts 3"], Bool[Tensor, "points starts"]]:
-    """Every canonical point that skinning carries to a sample, by Broyden's method (§3.2).
-
-    Args:
-        points: Samples, each in the body frame of its slot, metres.
-        slots: Pose of each sample.
-        blended: Σ w_j B_j at the nodes of the canonical box, for each slot.
-        low, nodes_per_m: Corner of that box, metres, and density of its nodes.
-        inverses: Transforms from the body to the canonical frame of the start bones.
-
-    Returns:
-        The point at which each search ends, and whether no earlier search found the same root.
-    """
-    starts = inverses.shape[1]
-    roots = points.new_zeros(len(points), starts, 3)
-    valid = torch.zeros(len(points), starts, dtype=torch.bool, device=points.device)
-    # blended transforms are a volume of twelve "weights" whose "bones" are unit vectors
-    unit = torch.eye(12).to(points)
-    for slot in slots.unique().tolist():
-        here = (slots == slot).nonzero()[:, 0]
-        matrix = inverses[slot].unflatten(1, (3, 4))
-        target = points[here, None].expand(len(here), starts, 3)
-        start = (matrix[:, :, :3] @ target[..., None])[..., 0] + matrix[:, :, 3]
-        found, rests = broyden_roots(
-            target.flatten(0, 1), start.flatten(0, 1), blended[slot], low, nodes_per_m, unit
-        )
-        roots[here] = found.unflatten(0, (len(here), starts))
-        valid[here] = rests.unflatten(0, (len(here), starts))
-    for search in range(1, starts):
-        near = (roots[:, :search] - roots[:, search, None]).norm(dim=-1) < SAME_ROOT_M
-        valid[:, search] &= ~(near & valid[:, :search]).any(dim=1)
     return roots, valid
 
 

@@ -1,17 +1,16 @@
-"""Lattice samples along rays in the occupied cells of a body-frame grid: in torch, and compiled."""
+"""Lattice samples along rays in the occupied cells of a body-frame grid, compiled."""
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Int32, Integer
+from jaxtyping import Float32, Int32, Integer
 from numba import prange
 from torch import Tensor
 
-from avatar.kernels.backend_protocol import Backend, RayBatch
 from avatar.kernels.kernel_compiler import FAST_MATH, compile_kernel
 from avatar.kernels.numba_rendering import nonzero
+from avatar.kernels.operands import RayBatch
 
 F32, I32 = np.float32, np.int32
 
@@ -36,15 +35,13 @@ class PosedOccupancy(NamedTuple):
 
 
 def sample_occupied_cells(
-    backend: Backend, rays: RayBatch, grid: PosedOccupancy, step_m: float
+    rays: RayBatch, grid: PosedOccupancy, step_m: float
 ) -> tuple[Float32[Tensor, "samples 3"], Int32[Tensor, "rays"]]:
     """Body-frame samples of rays in a grid's occupied cells, and their number for each ray.
 
     The compiled kernels walk the lattice twice, to count and to write, since the number of samples
     of a ray is unknown before.
     """
-    if backend.name == "torch":
-        return sample_in_torch(*rays, step_m, *grid)
     counts = torch.empty(len(rays.slots), dtype=torch.int32)
     given = (
         *(part.numpy() for part in rays), np.float32(step_m), *(part.numpy() for part in grid)
@@ -53,44 +50,6 @@ def sample_occupied_cells(
     points = torch.empty(int(counts.sum()), 3)
     write_samples_numba(*given, points.numpy(), (torch.cumsum(counts, 0) - counts).numpy())
     return points, counts
-
-
-def sample_in_torch(
-    origins: Float32[Tensor, "rays 3"],
-    directions: Float32[Tensor, "rays 3"],
-    slots: Int32[Tensor, "rays"],
-    jitter: Float32[Tensor, "rays"],
-    step_m: float,
-    occupied: Integer[Tensor, "slots cells"] | Bool[Tensor, "slots cells"],
-    low: Float32[Tensor, "slots 3"],
-    cells_per_m: Float32[Tensor, "slots 3"],
-    shape: Int32[Tensor, "slots 3"],
-    near: Float32[Tensor, "slots 3"],
-    far: Float32[Tensor, "slots 3"],
-) -> tuple[Float32[Tensor, "samples 3"], Int32[Tensor, "rays"]]:
-    """Samples `t = entry + (k + jitter) step_m` of rays, in the occupied cells of their grid.
-
-    A ray is sampled inside the box between `near` and `far`. Outside the grid the nearest cell of
-    its border counts.
-
-    Returns:
-        Points in the body frame, ray by ray, and the number of samples of each ray.
-    """
-    slot = slots.long()
-    towards = torch.where(directions.abs() > 1e-7, directions, 1e-7)
-    walls = (near[slot] - origins) / towards, (far[slot] - origins) / towards
-    enter = torch.minimum(*walls).amax(dim=1).clamp(min=0.0)
-    leave = torch.maximum(*walls).amin(dim=1)
-    longest = float((leave - enter).max()) if len(slot) else 0.0
-    steps = math.ceil(max(longest, 0.0) / step_m) + 1
-    t = enter[:, None] + (torch.arange(steps, device=slot.device) + jitter[:, None]) * step_m
-    points = origins[:, None] + t[..., None] * directions[:, None]
-    cell = ((points - low[slot][:, None]) * cells_per_m[slot][:, None]).long().clamp(min=0)
-    cell = torch.minimum(cell, shape[slot][:, None].long() - 1)
-    sides = shape[slot].long()
-    flat = (cell[..., 0] * sides[:, None, 1] + cell[..., 1]) * sides[:, None, 2] + cell[..., 2]
-    kept = (t < leave[:, None]) & (occupied[slot[:, None], flat] > 0)
-    return points[kept], kept.sum(dim=1).int()
 
 
 @compile_kernel(**FAST_MATH)

@@ -8,13 +8,14 @@ import torch
 from jaxtyping import Bool, Float32, Int32
 from torch import Tensor
 
-from avatar.kernels.backend_protocol import (
+from avatar.kernels import operations
+from avatar.kernels.operands import (
+    MAX_LOG_DENSITY,
     CorrespondenceTables,
     DensityGrid,
     MarchSettings,
     RayBatch,
 )
-from avatar.kernels.torch_reference import MAX_LOG_DENSITY
 from avatar.occupancy_grid import OccupancyGrid, in_occupied_cells
 from avatar.radiance_field import RadianceField
 from avatar.rig import Rig
@@ -64,9 +65,8 @@ class CanonicalWarp(Protocol):
 class CorrespondenceWarp:
     """Warp cells; of several roots the one of highest cached density counts."""
 
-    def __init__(self, field: RadianceField, occupancy: OccupancyGrid) -> None:
+    def __init__(self, occupancy: OccupancyGrid) -> None:
         """Chooses between roots by what `occupancy` has cached, whether or not it is occupied."""
-        self._backend = field.backend
         everywhere = torch.ones_like(occupancy.density_grid.occupied)
         self._grid = occupancy.density_grid._replace(occupied=everywhere)
 
@@ -79,7 +79,7 @@ class CorrespondenceWarp:
         """Each sample is a ray of its own, and marching asks for its first point."""
         along = points.new_tensor([0.6, 0.64, 0.48]).expand(len(points), 3).contiguous()
         rays = RayBatch(points, along, slots, points.new_zeros(len(points)))
-        samples = self._backend.march(
+        samples = operations.march(
             rays, cells, self._grid, MarchSettings(ONE_SAMPLE_STEP_M, math.inf, 1)
         )
         return CanonicalPoints(samples.points, samples.root_rows, samples.counts > 0)
@@ -106,26 +106,25 @@ class BroydenWarp:
             slots: Number of poses that it holds.
             kept_in: Only roots in its occupied cells count; None for those in the rig's box.
         """
-        device = field.table.device
         self._field = field
-        self._weights = torch.from_numpy(rig.weights).to(device)
-        self._low = torch.from_numpy(rig.box_low).to(device)
-        self._high = torch.from_numpy(rig.box_high).to(device)
+        self._weights = torch.from_numpy(rig.weights)
+        self._low = torch.from_numpy(rig.box_low)
+        self._high = torch.from_numpy(rig.box_high)
         self._kept_in = kept_in
-        nodes = torch.tensor(self._weights.shape[:3], device=device) - 1
+        nodes = torch.tensor(self._weights.shape[:3]) - 1
         self.poses = BlendedTransforms(
             # untouched memory costs nothing: pages are committed when they are written
-            blended=torch.empty(slots, *self._weights.shape[:3], 12, device=device),
+            blended=torch.empty(slots, *self._weights.shape[:3], 12),
             low=self._low,
             nodes_per_m=nodes / (self._high - self._low),
-            inverses=torch.zeros(slots, len(START_BONES), 12, device=device),
+            inverses=torch.zeros(slots, len(START_BONES), 12),
         )
 
     def set_pose(self, slot: int, bones: Float32[Tensor, "24 12"]) -> None:
         """Blends the pose's transforms, and inverts those of the bones that searches start with."""
         torch.matmul(self._weights, bones, out=self.poses.blended[slot])
         square = np.tile(np.eye(4), (len(START_BONES), 1, 1))
-        square[:, :3] = bones[list(START_BONES)].cpu().numpy().reshape(-1, 3, 4)
+        square[:, :3] = bones[list(START_BONES)].numpy().reshape(-1, 3, 4)
         inverses = np.linalg.inv(square)[:, :3].reshape(-1, 12)
         self.poses.inverses[slot] = torch.from_numpy(inverses).to(bones)
 
@@ -136,13 +135,13 @@ class BroydenWarp:
         cells: CorrespondenceTables,
     ) -> CanonicalPoints:
         """The densest root of each sample; the field is queried only where there are several."""
-        roots, valid = find_all_roots(self._field.backend, points, slots, self.poses)
+        roots, valid = find_all_roots(points, slots, self.poses)
         valid &= self._is_accepted(roots)
         several = (valid.sum(dim=1) > 1).nonzero()[:, 0]
         best = valid.int().argmax(dim=1)
         if len(several):
             held = valid[several]
-            score = torch.full(held.shape, -math.inf, device=held.device)
+            score = torch.full(held.shape, -math.inf)
             score[held] = self._field.raw_outputs_at(roots[several][held].contiguous())[:, 3]
             best[several] = score.argmax(dim=1)
         found = valid.any(dim=1)
@@ -185,7 +184,7 @@ class PosedField:
         self, points: Float32[Tensor, "points 3"], slot: int, cells: CorrespondenceTables
     ) -> PosedDensities:
         """The density at points of one slot's body frame."""
-        slots = torch.full((len(points),), slot, dtype=torch.int32, device=points.device)
+        slots = torch.full((len(points),), slot, dtype=torch.int32)
         warped = self._warp(points, slots, cells)
         log_density = self._field.raw_outputs_at(warped.points)[:, 3].clamp(max=MAX_LOG_DENSITY)
         density = points.new_zeros(len(points))

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float32, Int64, UInt8
 from torch import Tensor
 
-from avatar.kernels.backend_protocol import CorrespondenceTables
+from avatar.kernels.operands import CorrespondenceTables
 from avatar.occupancy_grid import OccupancyGrid
 from avatar.rig import Rig
 from baselines.instant_avatar.occupied_samples import PosedOccupancy
@@ -59,7 +59,7 @@ class NoSkipping:
 
     def sample_empty(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
         """No points, as no cell is known to be empty."""
-        return torch.zeros(0, 3, device=generator.device)
+        return torch.zeros(0, 3)
 
     def add_frame(self, slot: int, cells: CorrespondenceTables) -> None:
         """Ignored."""
@@ -119,15 +119,15 @@ def jittered_points(
     generator: torch.Generator,
 ) -> Float32[Tensor, "cells 3"]:
     """A random point in each of some cells of a grid, metres."""
-    within = torch.rand(len(cells), 3, generator=generator, device=generator.device)
-    return low + (cells + within.to(low.device)) * cell_m
+    within = torch.rand(len(cells), 3, generator=generator)
+    return low + (cells + within) * cell_m
 
 
 def cells_in_block(
-    first: tuple[int, int, int], last: tuple[int, int, int], device: torch.device
+    first: tuple[int, int, int], last: tuple[int, int, int]
 ) -> Int64[Tensor, "cells 3"]:
     """The cells of a block, its last ones not included."""
-    axes = [torch.arange(*ends, device=device) for ends in zip(first, last, strict=True)]
+    axes = [torch.arange(*ends) for ends in zip(first, last, strict=True)]
     return torch.cartesian_prod(*axes)
 
 
@@ -135,9 +135,9 @@ def cells_in_block(
 class EmptyPointPool:
     """Canonical points that the latest probes found in empty cells."""
 
-    def __init__(self, device: torch.device) -> None:
+    def __init__(self) -> None:
         """Starts empty."""
-        self._points = torch.zeros(0, 3, device=device)
+        self._points = torch.zeros(0, 3)
 
     def fill(self, points: Float32[Tensor, "points 3"]) -> None:
         """Puts other points in the place of those that were there."""
@@ -146,10 +146,8 @@ class EmptyPointPool:
     def draw(self, count: int, generator: torch.Generator) -> Float32[Tensor, "drawn 3"]:
         """At most `count` of them, at random."""
         held = len(self._points)
-        drawn = torch.randint(
-            max(held, 1), (count if held else 0,), generator=generator, device=generator.device
-        )
-        return self._points[drawn.to(self._points.device)]
+        drawn = torch.randint(max(held, 1), (count if held else 0,), generator=generator)
+        return self._points[drawn]
 
 
 @final
@@ -163,25 +161,22 @@ class SequenceGrid:
         occupied: Everything, until the first update.
     """
 
-    def __init__(self, rig: Rig, field: PosedField, *, interval: int, device: torch.device) -> None:
+    def __init__(self, rig: Rig, field: PosedField, *, interval: int) -> None:
         """A grid that knows nothing.
 
         Args:
             rig: Rig of the person; the grid is a cube about the pelvis that no pose leaves.
             field: Field that is probed.
             interval: Steps between updates.
-            device: Device of the grid.
         """
         reach = _reach(rig) + GRID_MARGIN_M
-        pelvis = torch.from_numpy(rig.rest_joints[0]).float().to(device)
+        pelvis = torch.from_numpy(rig.rest_joints[0]).float()
         self._field, self._every = field, interval
         self._low, self._cell_m = pelvis - reach, 2.0 * reach / GRID_CELLS
         self._slots: list[int] = []
-        self._pool = EmptyPointPool(device)
-        self.density: Float32[Tensor, "64 64 64"] = torch.zeros((GRID_CELLS,) * 3, device=device)
-        self.occupied: UInt8[Tensor, "64 64 64"] = torch.ones(
-            (GRID_CELLS,) * 3, dtype=torch.uint8, device=device
-        )
+        self._pool = EmptyPointPool()
+        self.density: Float32[Tensor, "64 64 64"] = torch.zeros((GRID_CELLS,) * 3)
+        self.occupied: UInt8[Tensor, "64 64 64"] = torch.ones((GRID_CELLS,) * 3, dtype=torch.uint8)
 
     def posed_occupancy(self, cells: CorrespondenceTables) -> PosedOccupancy:
         """The union grid, for every slot."""
@@ -206,9 +201,7 @@ class SequenceGrid:
     def update(self, steps: int, cells: CorrespondenceTables, generator: torch.Generator) -> None:
         """Probes a random frame, at the grid's interval."""
         if steps % self._every == 0 and self._slots:
-            drawn = torch.randint(
-                len(self._slots), (1,), generator=generator, device=generator.device
-            )
+            drawn = torch.randint(len(self._slots), (1,), generator=generator)
             self.probe(self._slots[int(drawn)], cells, generator)
 
     def probe(self, slot: int, cells: CorrespondenceTables, generator: torch.Generator) -> None:
@@ -216,7 +209,7 @@ class SequenceGrid:
         low, high = (corner[slot] - self._low for corner in person_boxes(cells))
         first = (low / self._cell_m).floor().long().clamp(0, GRID_CELLS).tolist()
         last = (high / self._cell_m).ceil().long().clamp(0, GRID_CELLS).tolist()
-        block = cells_in_block(tuple(first), tuple(last), low.device)
+        block = cells_in_block(tuple(first), tuple(last))
         cell_m = torch.full_like(low, self._cell_m)
         probed = self._field.density_at(
             jittered_points(block, self._low, cell_m, generator), slot, cells
@@ -241,18 +234,16 @@ class PerFrameGrids:
         occupied: Everything, until a slot's first probe.
     """
 
-    def __init__(self, field: PosedField, slots: int, device: torch.device) -> None:
+    def __init__(self, field: PosedField, slots: int) -> None:
         """Grids without frames."""
         self._field = field
         self._turn: list[int] = []
-        self._pool = EmptyPointPool(device)
+        self._pool = EmptyPointPool()
         cube = (slots, GRID_CELLS, GRID_CELLS, GRID_CELLS)
-        self.density: Float32[Tensor, "slots 64 64 64"] = torch.zeros(cube, device=device)
-        self.occupied: UInt8[Tensor, "slots 64 64 64"] = torch.zeros(
-            cube, dtype=torch.uint8, device=device
-        )
-        self._low = torch.zeros(slots, 3, device=device)
-        self._cell_m = torch.ones(slots, 3, device=device)
+        self.density: Float32[Tensor, "slots 64 64 64"] = torch.zeros(cube)
+        self.occupied: UInt8[Tensor, "slots 64 64 64"] = torch.zeros(cube, dtype=torch.uint8)
+        self._low = torch.zeros(slots, 3)
+        self._cell_m = torch.ones(slots, 3)
 
     def posed_occupancy(self, cells: CorrespondenceTables) -> PosedOccupancy:
         """Each slot's own, in the box that it had when it was probed."""
@@ -285,7 +276,7 @@ class PerFrameGrids:
 
     def probe(self, slot: int, cells: CorrespondenceTables, generator: torch.Generator) -> None:
         """Raises one slot's densities to what a random point of each cell holds."""
-        block = cells_in_block((0, 0, 0), (GRID_CELLS, GRID_CELLS, GRID_CELLS), self._low.device)
+        block = cells_in_block((0, 0, 0), (GRID_CELLS, GRID_CELLS, GRID_CELLS))
         points = jittered_points(block, self._low[slot], self._cell_m[slot], generator)
         probed = self._field.density_at(points, slot, cells)
         flat = self.density[slot].view(-1)

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from avatar.avatar_model import Avatar
 from avatar.config import TrainConfig
-from avatar.kernels.backend_protocol import (
-    Backend,
+from avatar.kernels.operands import (
     CorrespondenceTables,
     DensityGrid,
     RayBatch,
@@ -48,24 +47,21 @@ class PosedSampler:
     A ray does not end at a surface: its samples reach to the far wall of the person's box.
     """
 
-    def __init__(
-        self, backend: Backend, emptiness: PosedEmptySpace, warp: CanonicalWarp, step_m: float
-    ) -> None:
+    def __init__(self, emptiness: PosedEmptySpace, warp: CanonicalWarp, step_m: float) -> None:
         """Combines a body-frame occupancy with a warp.
 
         Args:
-            backend: Selects torch or the compiled kernels.
             emptiness: Occupancy in the body frame.
             warp: Carries samples to canonical space.
             step_m: Distance between samples along a ray, metres.
         """
-        self._backend, self._emptiness = backend, emptiness
+        self._emptiness = emptiness
         self._warp, self._step_m = warp, step_m
 
     def sample_rays(self, rays: RayBatch, correspondences: CorrespondenceTables) -> RaySamples:
         """Canonical samples along rays; a sample without a canonical point is left out."""
         points, placed = sample_occupied_cells(
-            self._backend, rays, self._emptiness.posed_occupancy(correspondences), self._step_m
+            rays, self._emptiness.posed_occupancy(correspondences), self._step_m
         )
         slots = rays.slots.repeat_interleave(placed)
         warped = self._warp(points, slots, correspondences)
@@ -104,7 +100,7 @@ class PosedSampler:
         Args:
             steps: Steps before the one that has just been made.
             correspondences: Correspondence grids of all slots.
-            generator: Source of random numbers, on the field's device.
+            generator: Source of random numbers.
         """
         self._emptiness.update(steps, correspondences, generator)
 
@@ -129,8 +125,8 @@ class GlobalSparsitySampler:
 
     def sample_empty(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
         """Random points of the whole box."""
-        place = torch.rand(count, 3, generator=generator, device=generator.device)
-        return self._low + place.to(self._low.device) * (self._high - self._low)
+        place = torch.rand(count, 3, generator=generator)
+        return self._low + place * (self._high - self._low)
 
     def sample_source_pairs(self, count: int, generator: torch.Generator) -> SourcePairs:
         """Pairs of the other sampler."""
@@ -170,23 +166,20 @@ class BaselineScheme:
         """The scheme's body-frame sampler; None where it samples canonical occupancy, as ours."""
         if self.skipping == "canonical" and self.roots == "cells":
             return None
-        device = avatar.field.table.device
         grid = avatar.occupancy.density_grid if self.skipping == "canonical" else None
         warp = self.warp(avatar, config.replay_capacity, kept_in=grid)
         field = PosedField(avatar.field, warp)
         emptiness: PosedEmptySpace
         match self.skipping:
             case "union":
-                emptiness = SequenceGrid(
-                    avatar.rig, field, interval=config.occupancy_interval, device=device
-                )
+                emptiness = SequenceGrid(avatar.rig, field, interval=config.occupancy_interval)
             case "frame":
-                emptiness = PerFrameGrids(field, config.replay_capacity, device)
+                emptiness = PerFrameGrids(field, config.replay_capacity)
             case "none":
                 emptiness = NoSkipping()
             case "canonical":
                 emptiness = CorrespondenceBand(avatar.occupancy)
-        return PosedSampler(avatar.field.backend, emptiness, warp, config.sample_step_m)
+        return PosedSampler(emptiness, warp, config.sample_step_m)
 
     def warp(self, avatar: Avatar, slots: int, *, kept_in: DensityGrid | None) -> CanonicalWarp:
         """The scheme's warp for a number of slots.
@@ -198,7 +191,7 @@ class BaselineScheme:
         """
         if self.roots == "broyden":
             return BroydenWarp(avatar.field, avatar.rig, slots, kept_in=kept_in)
-        return CorrespondenceWarp(avatar.field, avatar.occupancy)
+        return CorrespondenceWarp(avatar.occupancy)
 
 
 @final
@@ -209,22 +202,18 @@ class BaselineTrainer:
         trainer: The trainer, whose sampler is the scheme's.
     """
 
-    def __init__(
-        self, rig: Rig, config: TrainConfig, device: torch.device, scheme: BaselineScheme
-    ) -> None:
+    def __init__(self, rig: Rig, config: TrainConfig, scheme: BaselineScheme) -> None:
         """Starts without frames.
 
         Raises:
             ValueError: If the scheme and the configuration contradict each other.
         """
         scheme.check(config)
-        self.trainer = trainer = Trainer(rig, config, device)
+        self.trainer = trainer = Trainer(rig, config)
         self._posed_sampler = scheme.posed_sampler(trainer.learner, config)
-        trainer.sampler = self._posed_sampler or OccupancySampler(
-            trainer.backend, trainer.learner.occupancy, config
-        )
+        trainer.sampler = self._posed_sampler or OccupancySampler(trainer.learner.occupancy, config)
         if scheme.empty_term == "global":
-            low, high = (torch.from_numpy(part).to(device) for part in (rig.box_low, rig.box_high))
+            low, high = map(torch.from_numpy, (rig.box_low, rig.box_high))
             trainer.sampler = GlobalSparsitySampler(trainer.sampler, low, high)
 
     def add_frame(self, frame: TrainingFrame) -> None:

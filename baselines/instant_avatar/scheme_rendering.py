@@ -10,8 +10,13 @@ from torch import Tensor
 
 from avatar.avatar_model import Avatar
 from avatar.correspondence_grid import CorrespondenceGrid
-from avatar.kernels.backend_protocol import CorrespondenceTables, RayBatch, RaySamples
-from avatar.kernels.torch_reference import MAX_LOG_DENSITY
+from avatar.kernels import operations
+from avatar.kernels.operands import (
+    MAX_LOG_DENSITY,
+    CorrespondenceTables,
+    RayBatch,
+    RaySamples,
+)
 from avatar.radiance_field import RadianceField
 from avatar.render import (
     EMPTY_LOG_DENSITY,
@@ -61,22 +66,21 @@ def render_sampler(
         )
     if scheme.skipping == "canonical" and scheme.roots == "cells":
         raise ValueError("skipping='canonical' with roots='cells' is what avatar.render does.")
-    device = avatar.field.table.device
     grid = avatar.rendering_grid() if scheme.skipping == "canonical" else None
     warp = scheme.warp(avatar, 1, kept_in=grid)
     bones = avatar.rig.body_from_canonical(pose.joint_rotations)[:, :3].reshape(24, 12)
-    warp.set_pose(0, torch.from_numpy(bones).float().to(device))
+    warp.set_pose(0, torch.from_numpy(bones).float())
     emptiness: PosedEmptySpace = NoSkipping()
     if scheme.skipping == "frame":
-        emptiness = PerFrameGrids(PosedField(avatar.field, warp), 1, device)
-        _fill_grid(emptiness, correspondence_tables(cells, device))
+        emptiness = PerFrameGrids(PosedField(avatar.field, warp), 1)
+        _fill_grid(emptiness, correspondence_tables(cells))
     elif scheme.skipping == "canonical":
         emptiness = CorrespondenceBand(avatar.occupancy)
-    return PosedSampler(avatar.field.backend, emptiness, warp, avatar.sample_step_m).sample_rays
+    return PosedSampler(emptiness, warp, avatar.sample_step_m).sample_rays
 
 
 def _fill_grid(grids: PerFrameGrids, tables: CorrespondenceTables) -> None:
-    generator = torch.Generator(device=tables.low.device).manual_seed(0)
+    generator = torch.Generator().manual_seed(0)
     grids.add_frame(0, tables)
     for _ in range(PROBES_PER_RENDERED_POSE):
         grids.probe(0, tables, generator)
@@ -100,16 +104,15 @@ def render_samples(
         cells: Correspondence grid of the pose.
         sample_rays: Chooses the samples along rays.
     """
-    device = avatar.field.table.device
-    tables = correspondence_tables(cells, device)
+    tables = correspondence_tables(cells)
     world_from_body = avatar.rig.world_from_body(pose)
     width, height = camera.size_px
     picture = np.zeros((height, width, 4), dtype=np.float32)
     for part, pixels in pixel_chunks(picture, 0, 0):
-        rays = ray_batch(BodyFrameRays.through(pixels, camera, world_from_body), device)
+        rays = ray_batch(BodyFrameRays.through(pixels, camera, world_from_body))
         samples = sample_rays(rays, tables)
         colors = _composite_samples(avatar.field, samples, sample_step_m=avatar.sample_step_m)
-        part[:] = colors.cpu().numpy().reshape(part.shape)
+        part[:] = colors.numpy().reshape(part.shape)
     return picture
 
 
@@ -121,8 +124,8 @@ def _composite_samples(
     The field is queried front to back, and not behind the depth that `MIN_TRANSMITTANCE` hides.
     """
     points, first, count, _ = samples
-    ray = torch.repeat_interleave(torch.arange(len(count), device=points.device), count)
-    rank = torch.arange(len(points), device=points.device) - first[ray]
+    ray = torch.repeat_interleave(torch.arange(len(count)), count)
+    rank = torch.arange(len(points)) - first[ray]
     raw = points.new_zeros(len(points), 4)
     raw[:, 3] = EMPTY_LOG_DENSITY
     optical = points.new_zeros(len(count))
@@ -137,4 +140,4 @@ def _composite_samples(
         raw[seen] = values
         density = torch.exp(values[:, 3].clamp(max=MAX_LOG_DENSITY))
         optical.index_add_(0, ray[seen], density * sample_step_m)
-    return field.backend.composite(raw, samples, sample_step_m)
+    return operations.composite(raw, samples, sample_step_m)

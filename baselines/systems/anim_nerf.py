@@ -12,7 +12,7 @@ from jaxtyping import Float32, Int64
 from scipy.spatial import KDTree
 from torch import Tensor, nn
 
-from avatar.kernels.torch_reference import MAX_LOG_DENSITY
+from avatar.kernels.operands import MAX_LOG_DENSITY
 from avatar.rig import Rig
 from baselines.systems.method_settings import MethodSettings, NerfNetwork
 from baselines.systems.posed_person import (

@@ -4,8 +4,6 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import torch
-
 from avatar.config import HELD_OUT_STRIDE, TrainConfig
 from avatar.evaluation.held_out import HeldOutFrame
 from avatar.rig import Rig
@@ -59,7 +57,7 @@ class ComparedCapture:
         if capture.motion.proportions is None and (fit := fit_capture(capture)) is not None:
             capture = apply_fit(capture, fit)
         rig = Rig.from_shaped_body(capture.shaped)
-        warm_up(Trainer(rig, TrainConfig(), torch.device("cpu")))
+        warm_up(Trainer(rig, TrainConfig()))
         began, learnt, held_out = time.process_time(), [], []
         for item in prepare_stream(
             capture.observations(), rig, stride=HELD_OUT_STRIDE, total=capture.source.frame_count

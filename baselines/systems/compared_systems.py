@@ -49,7 +49,7 @@ class ProductSystem:
     def __init__(self, data: ComparedCapture, config: TrainConfig) -> None:
         """Takes in all frames."""
         self.steps = 0
-        self._trainer = Trainer(data.rig, config, torch.device("cpu"))
+        self._trainer = Trainer(data.rig, config)
         for frame in data.frames:
             self._trainer.add_frame(frame)
 

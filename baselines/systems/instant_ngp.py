@@ -10,10 +10,8 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor, nn
 
-from avatar.backends import backend_for
 from avatar.config import COARSEST_M, TrainConfig
-from avatar.kernels.backend_protocol import HashLevels
-from avatar.kernels.torch_reference import MAX_LOG_DENSITY
+from avatar.kernels.operands import MAX_LOG_DENSITY, HashLevels
 from avatar.radiance_field import RadianceField
 from avatar.training.trainer import NETWORK_RATE_FACTOR
 from baselines.systems.method_settings import MethodSettings
@@ -67,9 +65,8 @@ class InstantNgp(nn.Module):
             low.numpy(), high.numpy(), coarsest_m=COARSEST_M, finest_m=config.finest_m,
             levels=config.levels, table_size=config.table_size,
         )  # fmt: skip
-        device = torch.device("cpu")
         start = torch.Generator().manual_seed(config.seed)
-        self.field = RadianceField(levels, backend_for(device), device, start)
+        self.field = RadianceField(levels, start)
         self._anchor = torch.zeros((), requires_grad=True)
         self._low, self._shape = low, ((high - low) / CELL_M).ceil().long()
         self._density = torch.full((int(self._shape.prod()),), MIN_DENSITY)

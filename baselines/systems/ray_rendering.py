@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
-from avatar.kernels.torch_reference import MAX_LOG_DENSITY
+from avatar.kernels.operands import MAX_LOG_DENSITY
 from baselines.systems.posed_person import OccupiedCells, PosedBodies
 
 PROBES_PER_RAY = 64

@@ -252,18 +252,6 @@ def test_frames_that_are_not_there(refused, capture):
     refused(capture, "--frames", "100:", words=["24 frames", "100"])
 
 
-def test_a_gpu_that_is_not_there(refused, capture, monkeypatch):
-    import torch
-
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    refused(capture, "--device", "cuda", words=["--device", "GPU"])
-
-
-def test_a_backend_that_is_not_there(refused, capture, monkeypatch):
-    monkeypatch.setenv("IA_BACKEND", "abacus")
-    refused(capture, words=["IA_BACKEND", "abacus", "numba"])
-
-
 def test_a_user_sees_no_traceback(capture, tmp_path):
     command = [sys.executable, "-m", "apps.ingest", str(capture), "--out", str(tmp_path / "run")]
     (capture / "poses.npz").write_bytes(b"PK nothing")

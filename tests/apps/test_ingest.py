@@ -26,7 +26,7 @@ from export.player import Player
 KEYS = {
     "": "format verdict command recipe machine frames training held_out held_out_refined all_round "
     "curve stream package coverage earlier_videos cameras tracking",
-    "machine": "device backend threads",
+    "machine": "threads device backend",
     "frames": "read used held_out dropped near_duplicates not_replayed",
     "training": "wall_seconds cpu_seconds step_cpu_seconds cpu_contention_seconds startup_seconds "
     "steps rays rays_per_second samples_per_ray peak_memory_mb",
@@ -242,7 +242,7 @@ def test_a_full_disk_keeps_the_checkpoint_before(
     assert "--resume" in outcome.complaint()
     left = {file.name for file in (tmp_path / "run").rglob("*") if file.is_file()}
     assert left == {"person.npz", "state.pt", "fit.npz", LIST}
-    trainer, _ = checkpoint.load(tmp_path / "run" / "checkpoint", torch.device("cpu"))
+    trainer, _ = checkpoint.load(tmp_path / "run" / "checkpoint")
     assert trainer.steps == 1
 
 

@@ -6,19 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.backends import backend_for
 from avatar.correspondence_grid import (
     MAX_RAY_DISTANCE_M,
     CorrespondenceCheck,
     CorrespondenceGrid,
     cull_cells,
 )
-from avatar.kernels.backend_protocol import MarchSettings, RayBatch
-from avatar.kernels.torch_correspondence import skin_points
+from avatar.kernels import operations
+from avatar.kernels.operands import MarchSettings, RayBatch
 from avatar.occupancy_grid import OccupancyGrid
 from avatar.render import correspondence_tables
-
-CPU = torch.device("cpu")
+from baselines.torch_correspondence import skin_points
 
 
 def folded() -> np.ndarray:
@@ -34,7 +32,7 @@ def folded() -> np.ndarray:
 def seen(rig):
     """Samples along 4,000 parallel rays through a folded body, and how far off each is carried."""
     rotations, generator = folded(), torch.Generator().manual_seed(0)
-    grid = OccupancyGrid(rig, CPU).density_grid
+    grid = OccupancyGrid(rig).density_grid
     cells = cull_cells(CorrespondenceGrid.solve(rig, rotations), grid)
     low = torch.from_numpy(cells.low)
     size = torch.tensor(cells.packed_cells.shape) * cells.cell_m
@@ -47,8 +45,8 @@ def seen(rig):
         torch.zeros(count, dtype=torch.int32),
         torch.full((count,), 0.5),
     )
-    samples, _ = backend_for(CPU).march_resumable(
-        rays, correspondence_tables(cells, CPU), grid, MarchSettings(0.01, math.inf, 400)
+    samples, _ = operations.march_resumable(
+        rays, correspondence_tables(cells), grid, MarchSettings(0.01, math.inf, 400)
     )
     bones = rig.body_from_canonical(rotations)[:, :3].reshape(24, 12)
     nodes = (np.array(rig.weights.shape[:3]) - 1) / (rig.box_high - rig.box_low)
@@ -56,7 +54,7 @@ def seen(rig):
     carried = skin_points(samples.points, *(torch.from_numpy(part) for part in parts))
     ray = torch.repeat_interleave(torch.arange(count), samples.counts)
     off = (carried - origins[ray])[:, :2].norm(dim=1)
-    strays = CorrespondenceCheck.for_pose(rig, rotations, cells, CPU)
+    strays = CorrespondenceCheck.for_pose(rig, rotations, cells)
     return strays, samples, rays, off
 
 
@@ -81,4 +79,4 @@ def test_few_cells_are_doubtful_and_none_in_the_canonical_pose(rig, seen):
     assert 0 < strays.unreliable_rows.sum() < 0.2 * len(strays.unreliable_rows)
     canonical = rig.canonical_rotations
     cells = CorrespondenceGrid.solve(rig, canonical)
-    assert not CorrespondenceCheck.for_pose(rig, canonical, cells, CPU).unreliable_rows.any()
+    assert not CorrespondenceCheck.for_pose(rig, canonical, cells).unreliable_rows.any()

@@ -15,13 +15,11 @@ from avatar.correspondence_grid import (
     cull_cells,
     screen_bounds,
 )
-from avatar.kernels import torch_reference
-from avatar.kernels.backend_protocol import MarchSettings, RayBatch
-from avatar.kernels.torch_reference import MAX_LOG_DENSITY
+from avatar.kernels import operations
+from avatar.kernels.operands import MAX_LOG_DENSITY, MarchSettings, RayBatch
 from avatar.render import EMPTY_LOG_DENSITY, BodyFrameRays, correspondence_tables, render
+from baselines import torch_reference
 from capture.camera import Camera
-
-CPU = torch.device("cpu")
 
 
 def rays_of(camera: Camera, world_from_body: np.ndarray) -> RayBatch:
@@ -40,10 +38,10 @@ def lattice_samples(avatar: Avatar, pose, camera, cells: CorrespondenceGrid):
     rays = rays_of(camera, avatar.rig.world_from_body(pose))
     how = MarchSettings(avatar.sample_step_m, math.inf, 1024)
     grid = avatar.rendering_grid()
-    samples = avatar.field.backend.march(rays, correspondence_tables(cells, CPU), grid, how)
+    samples = operations.march(rays, correspondence_tables(cells), grid, how)
     assert int(samples.counts.max()) < how.max_samples
     return samples, CorrespondenceCheck.for_pose(
-        avatar.rig, pose.joint_rotations, cells, CPU
+        avatar.rig, pose.joint_rotations, cells
     ).find_spurious(samples, rays)
 
 
@@ -169,10 +167,9 @@ def test_pruning_loses_no_sample(avatar, shot, share):
     pose, camera, cells = shot
     grid, how = scattered(avatar, share), MarchSettings(0.007, math.inf, 1024)
     rays = rays_of(camera, avatar.rig.world_from_body(pose))
-    march = avatar.field.backend.march
-    full = march(rays, correspondence_tables(cells, CPU), grid, how)
+    full = operations.march(rays, correspondence_tables(cells), grid, how)
     held = cull_cells(cells, grid)
-    some = march(rays, correspondence_tables(held, CPU), grid, how)
+    some = operations.march(rays, correspondence_tables(held), grid, how)
     assert torch.equal(some.points, full.points)
     assert torch.equal(some.counts, full.counts)
     assert ((held.packed_cells > 0) <= (cells.packed_cells > 0)).all()
@@ -198,8 +195,8 @@ def test_no_ray_beside_the_window_meets_anything(avatar, shot):
     grid = avatar.rendering_grid()
     held = cull_cells(cells, grid)
     for seen in views(avatar, pose, camera).values():
-        samples = avatar.field.backend.march(
-            rays_of(seen, world_from_body), correspondence_tables(cells, CPU), grid,
+        samples = operations.march(
+            rays_of(seen, world_from_body), correspondence_tables(cells), grid,
             MarchSettings(avatar.sample_step_m, math.inf, 1024),
         )  # fmt: skip
         count = samples.counts.numpy().reshape(seen.size_px[::-1]).copy()

@@ -16,13 +16,12 @@ from avatar.occupancy_grid import (
 )
 from avatar.rig import CLOTHING_BAND_M, HEAD_JOINT
 
-CPU = torch.device("cpu")
 STEP_M = 0.01
 
 
 @pytest.fixture
 def occupancy(rig):
-    return OccupancyGrid(rig, CPU)
+    return OccupancyGrid(rig)
 
 
 def shell_at(rig, *, thickness_m):
@@ -151,7 +150,7 @@ def test_solid_points_lie_deep_under_the_skin(rig, occupancy, generator):
 
 
 def test_points_off_the_skin_are_where_no_clothes_are(rig, generator):
-    occupancy = OccupancyGrid(rig, torch.device("cpu"))
+    occupancy = OccupancyGrid(rig)
     points = occupancy.sample_off_skin(500, generator)
     cell = ((points - occupancy.density_grid.low) * occupancy.density_grid.cells_per_m).long()
     distance = rig.skin_distance[tuple(cell.T.numpy())]
@@ -161,7 +160,7 @@ def test_points_off_the_skin_are_where_no_clothes_are(rig, generator):
 
 
 def test_the_heads_interior_lies_in_the_head(rig, generator):
-    points = OccupancyGrid(rig, CPU).sample_interior(200, generator, of_head=True).numpy()
+    points = OccupancyGrid(rig).sample_interior(200, generator, of_head=True).numpy()
     assert len(points) == 200
     assert (rig.weights_at(points).argmax(axis=1) == HEAD_JOINT).mean() > 0.95
     assert points[:, 1].min() > rig.rest_joints[HEAD_JOINT, 1] - 0.1

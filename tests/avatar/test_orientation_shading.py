@@ -11,13 +11,12 @@ from avatar.training import checkpoint
 from avatar.training.frame_stream import prepare_frame
 from avatar.training.trainer import Trainer
 
-CPU = torch.device("cpu")
 CONFIG = TrainConfig(rays=256, sample_step_m=0.03, finest_m=0.03, levels=4, table_size=1 << 13)
 
 
 @pytest.fixture
 def shading(rig):
-    return OrientationShading(rig, CPU)
+    return OrientationShading(rig)
 
 
 def observe(shading, generator, light, *, steps=160):
@@ -49,7 +48,7 @@ def test_even_light_leaves_every_factor_at_one(shading, generator):
 
 @pytest.fixture(scope="module")
 def trainer(rig, clip):
-    trainer = Trainer(rig, CONFIG, CPU)
+    trainer = Trainer(rig, CONFIG)
     trainer.add_frame(prepare_frame(clip.observations[0], rig))
     for _ in range(30):
         trainer.step(rate=1.0, hard_surface_share=0.5)
@@ -63,7 +62,7 @@ def test_normals_face_the_camera(trainer):
     samples = trainer.sampler.sample_rays(batch.rays, cells)
     raw = field.raw_outputs_at(samples.points)
     normals = trainer.learner.shading.body_normals(
-        field.backend, batch.rays, samples, raw, cells, CONFIG.sample_step_m
+        batch.rays, samples, raw, cells, CONFIG.sample_step_m
     )
     seen = normals.norm(dim=1) > 0.7
     assert seen.sum() > 50
@@ -81,7 +80,7 @@ def test_light_falls_on_a_rendering_that_asks_for_it(trainer, clip, tmp_path):
     ratio = lit[towards, 1].sum() / neutral[towards, 1].sum()
     assert 1.05 < ratio < 1.2
     checkpoint.save(trainer, tmp_path)
-    restored, _ = checkpoint.load(tmp_path, CPU)
+    restored, _ = checkpoint.load(tmp_path)
     assert np.array_equal(
         render(restored.avatar, seen.pose, seen.camera, shaded=True)[..., :3], lit[..., :3]
     )

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from avatar import render as render_module
 from avatar.config import TrainConfig
 from avatar.correspondence_grid import CorrespondenceCheck
-from avatar.kernels.backend_protocol import MarchSettings, RayBatch
+from avatar.kernels import operations
+from avatar.kernels.operands import MarchSettings, RayBatch
 from avatar.render import MIN_TRANSMITTANCE, BodyFrameRays, correspondence_tables, render
 from avatar.training.trainer import Trainer
 from capture.camera import Camera
@@ -64,7 +65,7 @@ def test_a_fog_is_as_opaque_as_its_length_says(rig, shot):
     Of samples that skinning carries to the ray: the others hold nothing.
     """
     config = TrainConfig(levels=2, table_size=1 << 10, sample_step_m=0.03)
-    avatar = Trainer(rig, config, torch.device("cpu")).avatar
+    avatar = Trainer(rig, config).avatar
     weights, bias = avatar.field.layers[2:]
     pose, camera = shot
     with torch.no_grad():
@@ -81,9 +82,9 @@ def test_a_fog_is_as_opaque_as_its_length_says(rig, shot):
         torch.full((len(pixels),), 0.5),
     )
     how = MarchSettings(config.sample_step_m, np.inf, 512)
-    tables = correspondence_tables(cells, torch.device("cpu"))
-    samples = avatar.field.backend.march(batch, tables, avatar.rendering_grid(), how)
-    strays = CorrespondenceCheck.for_pose(rig, pose.joint_rotations, cells, torch.device("cpu"))
+    tables = correspondence_tables(cells)
+    samples = operations.march(batch, tables, avatar.rendering_grid(), how)
+    strays = CorrespondenceCheck.for_pose(rig, pose.joint_rotations, cells)
     rays_of_strays = (
         torch.searchsorted(samples.offsets, strays.find_spurious(samples, batch), right=True) - 1
     )

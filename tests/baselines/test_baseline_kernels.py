@@ -1,25 +1,16 @@
-"""Samples placed through a posed grid, and roots by Broyden's method: both twins of both."""
+"""Samples placed through a posed grid, and roots by Broyden's method."""
 
 import numpy as np
 import pytest
 import torch
 
-from avatar.backends import TorchBackend
 from avatar.config import TrainConfig
-from avatar.kernels.backend_protocol import RayBatch
-from avatar.kernels.numba_backend import NumbaBackend
+from avatar.kernels.operands import RayBatch
 from avatar.training.trainer import Trainer
 from baselines.instant_avatar.broyden_kernels import SAME_ROOT_M, find_all_roots
 from baselines.instant_avatar.occupied_samples import PosedOccupancy, sample_occupied_cells
 from baselines.instant_avatar.posed_field import BroydenWarp
 
-TORCH, NUMBA = TorchBackend(), NumbaBackend()
-BACKENDS = pytest.mark.parametrize("backend", [TORCH, NUMBA], ids=["torch", "numba"])
-COMPILED_SLOWLY = pytest.mark.parametrize(
-    "backend",
-    [pytest.param(TORCH, id="torch"), pytest.param(NUMBA, id="numba", marks=pytest.mark.slow)],
-)
-"""Broyden's kernel takes seven seconds to compile."""
 STEP_M = 0.05
 
 
@@ -52,27 +43,10 @@ def boxes(generator):
     )
 
 
-def test_both_twins_place_the_same_samples(boxes, generator):
-    rays = rays_at(boxes, 400, generator)
-    (points, counts), (expected, expected_counts) = (
-        sample_occupied_cells(backend, rays, boxes, STEP_M) for backend in (NUMBA, TORCH)
-    )
-    # a sample on a cell's wall may fall to either side
-    same = counts == expected_counts
-    assert same.float().mean() > 0.98
-    assert int(expected_counts.sum()) > 1000
-    kept = [
-        part[same.repeat_interleave(count)]
-        for part, count in ((points, counts), (expected, expected_counts))
-    ]
-    torch.testing.assert_close(*kept, atol=2e-6, rtol=0)
-
-
-@BACKENDS
-def test_samples_lie_a_step_apart_and_fill_a_box_that_is_full(backend, boxes, generator):
+def test_samples_lie_a_step_apart_and_fill_a_box_that_is_full(boxes, generator):
     full = boxes._replace(occupied=torch.ones_like(boxes.occupied))
     rays = rays_at(full, 100, generator)
-    points, counts = sample_occupied_cells(backend, rays, full, STEP_M)
+    points, counts = sample_occupied_cells(rays, full, STEP_M)
     size = (full.shape / full.cells_per_m)[rays.slots.long()]
     low = full.low[rays.slots.long()]
     near = (low - rays.origins) / rays.directions
@@ -85,8 +59,7 @@ def test_samples_lie_a_step_apart_and_fill_a_box_that_is_full(backend, boxes, ge
     torch.testing.assert_close(apart, torch.full_like(apart, STEP_M), atol=1e-5, rtol=0)
 
 
-@BACKENDS
-def test_no_sample_lies_beyond_the_walls(backend, boxes, generator):
+def test_no_sample_lies_beyond_the_walls(boxes, generator):
     """A box that is smaller than the grid on one side and larger on the other."""
     full = boxes._replace(
         occupied=torch.ones_like(boxes.occupied),
@@ -94,7 +67,7 @@ def test_no_sample_lies_beyond_the_walls(backend, boxes, generator):
         ray_box_high=boxes.ray_box_high + 0.1,
     )
     rays = rays_at(full, 200, generator)
-    points, counts = sample_occupied_cells(backend, rays, full, STEP_M)
+    points, counts = sample_occupied_cells(rays, full, STEP_M)
     slot = rays.slots.long().repeat_interleave(counts)
     assert len(points) > 500
     assert (points > full.ray_box_low[slot] - 1e-5).all()
@@ -102,10 +75,9 @@ def test_no_sample_lies_beyond_the_walls(backend, boxes, generator):
     assert (points > boxes.ray_box_high[slot]).any()
 
 
-@BACKENDS
-def test_an_empty_cell_has_no_samples(backend, boxes, generator):
+def test_an_empty_cell_has_no_samples(boxes, generator):
     rays = rays_at(boxes, 300, generator)
-    points, counts = sample_occupied_cells(backend, rays, boxes, STEP_M)
+    points, counts = sample_occupied_cells(rays, boxes, STEP_M)
     slot = rays.slots.long().repeat_interleave(counts)
     cell = ((points - boxes.low[slot]) * boxes.cells_per_m[slot]).long()
     cell = torch.minimum(cell.clamp(min=0), boxes.shape[slot] - 1)
@@ -113,12 +85,11 @@ def test_an_empty_cell_has_no_samples(backend, boxes, generator):
     assert (boxes.occupied[slot, flat] > 0).float().mean() > 0.999
 
 
-@BACKENDS
-def test_no_rays_have_no_samples(backend, boxes):
+def test_no_rays_have_no_samples(boxes):
     none = RayBatch(
         torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, dtype=torch.int32), torch.zeros(0)
     )
-    points, counts = sample_occupied_cells(backend, none, boxes, STEP_M)
+    points, counts = sample_occupied_cells(none, boxes, STEP_M)
     assert points.shape == (0, 3)
     assert counts.shape == (0,)
 
@@ -130,7 +101,7 @@ def test_no_rays_have_no_samples(backend, boxes):
 def posed(rig):
     """Canonical points near the skin, carried to two poses; and the poses, as a warp keeps them."""
     config = TrainConfig(levels=2, table_size=1 << 10)
-    avatar = Trainer(rig, config, torch.device("cpu")).avatar
+    avatar = Trainer(rig, config).avatar
     warp = BroydenWarp(avatar.field, rig, 2)
     chance = np.random.default_rng(0)
     cells = np.argwhere(rig.skin_distance < 0.05)
@@ -150,43 +121,26 @@ def posed(rig):
     return *map(torch.from_numpy, (canonical, carried, slots)), warp.poses
 
 
-@COMPILED_SLOWLY
-def test_broyden_finds_the_point_that_was_carried_there(backend, posed):
+@pytest.mark.slow
+def test_broyden_finds_the_point_that_was_carried_there(posed):
     canonical, carried, slots, poses = posed
-    roots, valid = find_all_roots(backend, carried, slots, poses)
+    roots, valid = find_all_roots(carried, slots, poses)
     off = torch.where(valid, (roots - canonical[:, None]).norm(dim=-1), torch.inf).amin(dim=1)
     assert (off < 1e-3).float().mean() >= 0.99
 
 
-@COMPILED_SLOWLY
-def test_no_root_is_found_twice(backend, posed):
+@pytest.mark.slow
+def test_no_root_is_found_twice(posed):
     _, carried, slots, poses = posed
-    roots, valid = find_all_roots(backend, carried, slots, poses)
+    roots, valid = find_all_roots(carried, slots, poses)
     gap = (roots[:, :, None] - roots[:, None]).norm(dim=-1)
     both = valid[:, :, None] & valid[:, None] & ~torch.eye(roots.shape[1], dtype=torch.bool)
     assert gap[both].min() >= SAME_ROOT_M
 
 
 @pytest.mark.slow
-def test_both_twins_find_the_same_roots(posed):
-    _, carried, slots, poses = posed
-    (roots, valid), (expected, rests) = (
-        find_all_roots(b, carried, slots, poses) for b in (NUMBA, TORCH)
-    )
-    gap = (roots[:, :, None] - expected[:, None]).norm(dim=-1)
-    gap = torch.where(valid[:, :, None] & rests[:, None], gap, torch.inf)
-    here, there = gap.amin(dim=2)[valid], gap.amin(dim=1)[rests]
-    # a search that leaves the volume is given up by the compiled twin and runs on in the other
-    assert (here < 1e-3).float().mean() > 0.99
-    assert (there < 1e-3).float().mean() > 0.97
-
-
-@pytest.mark.slow
 def test_nothing_is_found_of_nothing(posed):
     poses = posed[-1]
-    for backend in (NUMBA, TORCH):
-        roots, valid = find_all_roots(
-            backend, torch.zeros(0, 3), torch.zeros(0, dtype=torch.int32), poses
-        )
-        assert roots.shape == (0, 9, 3)
-        assert valid.shape == (0, 9)
+    roots, valid = find_all_roots(torch.zeros(0, 3), torch.zeros(0, dtype=torch.int32), poses)
+    assert roots.shape == (0, 9, 3)
+    assert valid.shape == (0, 9)

@@ -2,14 +2,13 @@
 
 import torch
 
-from avatar.kernels.backend_protocol import MarchSettings
+from avatar.kernels import operations
+from avatar.kernels.operands import MarchSettings
 from avatar.render import correspondence_tables
 from baselines.instant_avatar.broyden_kernels import find_all_roots
 from baselines.instant_avatar.posed_field import BroydenWarp, CorrespondenceWarp
 from baselines.instant_avatar.posed_occupancy import NoSkipping
 from baselines.instant_avatar.samplers import PosedSampler
-
-CPU = torch.device("cpu")
 
 
 def test_of_several_roots_the_densest_counts(rig, avatar, novel, generator, bones_of):
@@ -21,8 +20,8 @@ def test_of_several_roots_the_densest_counts(rig, avatar, novel, generator, bone
     size = torch.tensor(cells.packed_cells.shape) * cells.cell_m
     points = low + torch.rand(4000, 3, generator=generator) * size
     slots = torch.zeros(4000, dtype=torch.int32)
-    warped = warp(points, slots, correspondence_tables(cells, CPU))
-    roots, valid = find_all_roots(avatar.field.backend, points, slots, warp.poses)
+    warped = warp(points, slots, correspondence_tables(cells))
+    roots, valid = find_all_roots(points, slots, warp.poses)
     box = [torch.from_numpy(corner) for corner in (rig.box_low, rig.box_high)]
     valid &= ((roots >= box[0]) & (roots <= box[1])).all(dim=-1)
     score = torch.full(valid.shape, -torch.inf)
@@ -39,8 +38,8 @@ def test_both_warps_agree_on_the_person(rig, avatar, novel, bones_of, solid_in):
     slots = torch.zeros(len(points), dtype=torch.int32)
     broyden = BroydenWarp(avatar.field, rig, 1, kept_in=avatar.occupancy.density_grid)
     broyden.set_pose(0, bones_of(rig, seen.pose))
-    tables = correspondence_tables(cells, CPU)
-    cells_warp = CorrespondenceWarp(avatar.field, avatar.occupancy)
+    tables = correspondence_tables(cells)
+    cells_warp = CorrespondenceWarp(avatar.occupancy)
     exact, ours = (warp(points, slots, tables) for warp in (broyden, cells_warp))
     both = exact.has_root & ours.has_root
     assert float(both.float().mean()) > 0.99
@@ -52,12 +51,11 @@ def test_both_warps_agree_on_the_person(rig, avatar, novel, bones_of, solid_in):
 
 def test_samples_know_which_root_warped_them(avatar, learnt, generator):
     """Through its row each sample leads back into its cell: x = x* + J⁻¹ (p - center)."""
-    replay, backend = learnt.trainer.replay, avatar.field.backend
+    replay = learnt.trainer.replay
     rays = replay.sample_rays(200, generator).rays
     sampler = PosedSampler(
-        backend,
         NoSkipping(),
-        CorrespondenceWarp(avatar.field, avatar.occupancy),
+        CorrespondenceWarp(avatar.occupancy),
         avatar.sample_step_m,
     )
     samples = sampler.sample_rays(rays, replay.correspondences)
@@ -74,16 +72,15 @@ def test_samples_know_which_root_warped_them(avatar, learnt, generator):
 
 
 def test_ours_asks_no_point_that_no_skipping_leaves_out(avatar, learnt, generator):
-    replay, backend = learnt.trainer.replay, avatar.field.backend
+    replay = learnt.trainer.replay
     rays = replay.sample_rays(300, generator).rays
     everything = PosedSampler(
-        backend,
         NoSkipping(),
-        CorrespondenceWarp(avatar.field, avatar.occupancy),
+        CorrespondenceWarp(avatar.occupancy),
         avatar.sample_step_m,
     ).sample_rays(rays, replay.correspondences)
     how = MarchSettings(avatar.sample_step_m, torch.inf, 512)
-    ours = backend.march(rays, replay.correspondences, avatar.occupancy.density_grid, how)
+    ours = operations.march(rays, replay.correspondences, avatar.occupancy.density_grid, how)
     assert (everything.counts >= ours.counts).all()
     assert int(everything.counts.sum()) > 1.5 * int(ours.counts.sum())
     for ray in range(0, 300, 10):

@@ -16,8 +16,6 @@ from baselines.instant_avatar.posed_occupancy import (
     threshold_and_dilate,
 )
 
-CPU = torch.device("cpu")
-
 
 def holds(grid, slot, points):
     """Share of a slot's points that lie in occupied cells of a posed grid."""
@@ -53,16 +51,16 @@ def test_a_cell_counts_from_a_hundredth_of_opacity_in_a_centimetre_or_the_mean()
 def test_the_union_holds_what_every_frame_holds(learnt, avatar, generator, solid_in):
     replay = learnt.trainer.replay
     field = PosedField(avatar.field, CorrespondenceWarp(avatar.field, avatar.occupancy))
-    union = SequenceGrid(avatar.rig, field, interval=16, device=CPU)
+    union = SequenceGrid(avatar.rig, field, interval=16)
     for slot in range(len(replay)):
         union.probe(slot, replay.correspondences, generator)
-    frames = PerFrameGrids(field, 1, CPU)
+    frames = PerFrameGrids(field, 1)
     assert 0.01 < float(union.occupied.float().mean()) < 0.2
     for slot in range(0, len(replay), 5):
         solid = solid_in(avatar, learnt.trainer.poses.pose(slot))
         assert holds(union.posed_occupancy(replay.correspondences), slot, solid) > 0.999
         rotations = learnt.trainer.poses.pose(slot).joint_rotations
-        tables = correspondence_tables(CorrespondenceGrid.solve(avatar.rig, rotations), CPU)
+        tables = correspondence_tables(CorrespondenceGrid.solve(avatar.rig, rotations))
         frames.add_frame(0, tables)
         for _ in range(5):
             frames.probe(0, tables, generator)
@@ -88,7 +86,7 @@ class Nowhere:
 def fog(rig):
     """A posed field of one density, and the function that sets it."""
     config = TrainConfig(levels=2, table_size=1 << 10)
-    field = Trainer(rig, config, CPU).avatar.field
+    field = Trainer(rig, config).avatar.field
 
     def thicken(density):
         with torch.no_grad():
@@ -106,7 +104,7 @@ def of_slot(frames, slot):
 
 def test_a_grid_forgets_at_the_paper_s_rate_and_keeps_the_highest(fog, learnt, generator):
     cells, (field, thicken) = learnt.trainer.replay.correspondences, fog
-    frames = PerFrameGrids(field, 1, CPU)
+    frames = PerFrameGrids(field, 1)
     frames.add_frame(0, cells)
     assert frames.occupied.all()  # until it has been probed
     kept = 0.0
@@ -122,7 +120,7 @@ def test_a_grid_forgets_at_the_paper_s_rate_and_keeps_the_highest(fog, learnt, g
 
 def test_the_frame_whose_grid_is_oldest_is_renewed_first(fog, learnt, generator):
     cells, (field, thicken) = learnt.trainer.replay.correspondences, fog
-    frames = PerFrameGrids(field, 3, CPU)
+    frames = PerFrameGrids(field, 3)
     for slot in (0, 1, 2):
         frames.add_frame(slot, cells)
     thicken(1.0)
@@ -139,7 +137,7 @@ def test_the_frame_whose_grid_is_oldest_is_renewed_first(fog, learnt, generator)
 def test_empty_points_are_empty_in_the_pose_that_was_probed(learnt, avatar, generator):
     """What a grid calls empty has hardly any density, and is drawn from all over the band."""
     warp = CorrespondenceWarp(avatar.field, avatar.occupancy)
-    union = SequenceGrid(avatar.rig, PosedField(avatar.field, warp), interval=16, device=CPU)
+    union = SequenceGrid(avatar.rig, PosedField(avatar.field, warp), interval=16)
     assert len(union.sample_empty(10, generator)) == 0
     for slot in range(4):
         union.probe(slot, learnt.trainer.replay.correspondences, generator)

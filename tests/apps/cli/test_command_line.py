@@ -62,12 +62,3 @@ def test_masks_cannot_be_dark_and_bright(program, capsys):
     words = ["capture", "--mask-invert", "--no-mask-invert"]
     assert getattr(importlib.import_module(module), function)(words) == 2
     assert "mutually exclusive" in capsys.readouterr().err
-
-
-def test_auto_trains_on_the_cpu_even_if_torch_sees_a_gpu(monkeypatch):
-    import torch
-
-    from apps.run.session_start import resolve_device
-
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    assert [resolve_device(name).type for name in ("auto", "cpu", "cuda")] == ["cpu", "cpu", "cuda"]

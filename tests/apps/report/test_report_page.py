@@ -47,7 +47,7 @@ def report(**changes):
     content = {
         "command": {"video": "a <b> & c.mp4"},
         "recipe": {"rays": 1024, "finest_m": 0.0081234567},
-        "machine": MachineInfo(device="cpu", backend="numba", threads=2),
+        "machine": MachineInfo(threads=2),
         "frames": FrameStats(
             read=20,
             used=17,

@@ -5,7 +5,6 @@ import shutil
 
 import numpy as np
 import pytest
-import torch
 
 from avatar.training import checkpoint
 from preprocess.alignment.mask_alignment import body_height_m
@@ -76,7 +75,7 @@ def test_an_added_video_keeps_the_avatars_body_and_says_how_its_own_differs(
     assert f"state a body of {100 * body_height_m(stated):.0f} cm" in " ".join(outcome.err.split())
     kept = read_shaped_body(out / "checkpoint" / "person.npz", body)
     np.testing.assert_array_equal(kept.vertices, person.vertices)
-    trainer, _ = checkpoint.load(out / "checkpoint", torch.device("cpu"))
+    trainer, _ = checkpoint.load(out / "checkpoint")
     np.testing.assert_allclose(trainer.avatar.rig.rest_joints, rig.rest_joints, atol=1e-6)
 
 

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
 from apps.run.live_viewer import render_preview
 from apps.run.training_session import notify_observers
@@ -99,7 +98,7 @@ def test_motions_go_on_and_begin_again(recording, observations):
 
 def test_the_avatar_stands_on_paper(recording, rig):
     config = TrainConfig(rays=64, sample_step_m=0.03, finest_m=0.05, levels=2, table_size=1 << 10)
-    avatar = Trainer(rig, config, torch.device("cpu")).avatar  # nothing learnt: fog all around
+    avatar = Trainer(rig, config).avatar  # nothing learnt: fog all around
     pose = PreviewPoses(recording).pose_at(STANDING, 0.0, None)
     cells = CorrespondenceGrid.solve(rig, pose.joint_rotations)
     camera = look(aspect=1.2).to_camera(60)

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -106,7 +105,7 @@ def test_a_perfect_rendering_on_white_is_the_truth(rng):
 
 
 def test_an_avatar_that_shows_nothing_scores_like_a_white_sheet(rig, held):
-    trainer = Trainer(rig, TrainConfig(levels=2, table_size=1 << 10), torch.device("cpu"))
+    trainer = Trainer(rig, TrainConfig(levels=2, table_size=1 << 10))
     trainer.avatar.occupancy.density_grid.occupied.zero_()
     truth, mask = ground_truth_on_white(held.observation), held.observation.alpha > 0.5
     white = np.ones_like(truth)

@@ -4,10 +4,9 @@ import numba
 import pytest
 import torch
 
-from avatar.kernels.backend_protocol import AdamSettings, MarchSettings
-from avatar.kernels.numba_backend import NumbaBackend
+from avatar.kernels import operations
+from avatar.kernels.operands import AdamSettings, MarchSettings
 
-NUMBA = NumbaBackend()
 OPERATIONS = (
     "encode", "encode_backward", "encode_points_backward", "march", "composite", "composite_loss",
     "scatter_max_density", "bone_wrenches", "update_roots", "mean_normals", "adam_step",
@@ -21,32 +20,34 @@ def results_of(learnt) -> dict[str, list[torch.Tensor]]:
     batch, cells = trainer.replay.sample_rays(700, generator), trainer.replay.correspondences
     grid = trainer.avatar.occupancy.density_grid
     grid = grid._replace(density=grid.density.clone())
-    samples = NUMBA.march(batch.rays, cells, grid, MarchSettings(0.01, 0.06, 128))
+    samples = operations.march(batch.rays, cells, grid, MarchSettings(0.01, 0.06, 128))
     points, count = samples.points, len(samples.points)
     raw = torch.randn(count, 4, generator=generator)
     slope = torch.randn(count, field.levels.feature_width, generator=generator)
     grad_table = torch.zeros_like(field.table)
-    NUMBA.encode_backward(points, slope, field.levels, grad_table)
-    grad_points = NUMBA.encode_points_backward(points, slope, field.table, field.levels)
-    NUMBA.scatter_max_density(points, raw[:, 3].contiguous(), grid)
-    wrenches = NUMBA.bone_wrenches(
+    operations.encode_backward(points, slope, field.levels, grad_table)
+    grad_points = operations.encode_points_backward(points, slope, field.table, field.levels)
+    operations.scatter_max_density(points, raw[:, 3].contiguous(), grid)
+    wrenches = operations.bone_wrenches(
         samples, grad_points, batch.rays.slots, cells, poses.skinning, poses.bones
     )
     moved = cells._replace(roots=cells.roots.clone())
-    NUMBA.update_roots(moved, 0, poses.skinning, poses.bones[0])
+    operations.update_roots(moved, 0, poses.skinning, poses.bones[0])
     volume = trainer.learner.shading._normals
-    normals = NUMBA.mean_normals(raw, samples, 0.01, batch.rays.slots, cells, volume)
+    normals = operations.mean_normals(raw, samples, 0.01, batch.rays.slots, cells, volume)
     stepped = [grad_table.clone(), *(torch.ones_like(grad_table) for _ in range(3))]
-    NUMBA.adam_step(AdamSettings(0.01, (0.9, 0.99), 1e-15, 1), *stepped)
+    operations.adam_step(AdamSettings(0.01, (0.9, 0.99), 1e-15, 1), *stepped)
     return {
         "mean_normals": [normals],
         "adam_step": stepped[1:],
-        "encode": [NUMBA.encode(points, field.table, field.levels)],
+        "encode": [operations.encode(points, field.table, field.levels)],
         "encode_backward": [grad_table],
         "encode_points_backward": [grad_points],
         "march": list(samples),
-        "composite": [NUMBA.composite(raw, samples, 0.01)],
-        "composite_loss": list(NUMBA.composite_loss(raw, samples, 0.01, batch.target, 0.1, 0.1)),
+        "composite": [operations.composite(raw, samples, 0.01)],
+        "composite_loss": list(
+            operations.composite_loss(raw, samples, 0.01, batch.target, 0.1, 0.1)
+        ),
         "scatter_max_density": [grid.density],
         "bone_wrenches": [wrenches],
         "update_roots": [moved.roots[0, : int((cells.packed_cells[0] >> 3).max())]],

@@ -18,7 +18,6 @@ from avatar.training.frame_stream import prepare_frame
 from avatar.training.trainer import Trainer
 from capture.input_error import InputError
 
-CPU = torch.device("cpu")
 CONFIG = TrainConfig(
     rays=128,
     sample_step_m=0.03,
@@ -36,7 +35,7 @@ def frames(rig, clip):
 
 
 def taught(rig, frames) -> Trainer:
-    trainer = Trainer(rig, CONFIG, CPU)
+    trainer = Trainer(rig, CONFIG)
     for frame in frames:
         trainer.add_frame(frame)
     for _ in range(20):
@@ -94,7 +93,7 @@ def test_what_is_read_is_what_was_written_to_the_last_bit(trainer, tmp_path):
     notes = {"video": "a.mp4", "curve": [{"psnr": 31.5}, {"psnr": None}], "held": [9, 19]}
     folder = tmp_path / "run" / "checkpoint"
     path = checkpoint.save(trainer, folder, notes=notes)
-    again, read = checkpoint.load(folder, CPU)
+    again, read = checkpoint.load(folder)
     assert list(folder.iterdir()) == [path]
     assert read == notes
     assert again.config == trainer.config
@@ -110,13 +109,13 @@ def test_what_is_read_is_what_was_written_to_the_last_bit(trainer, tmp_path):
 
 def test_the_avatar_looks_the_same_afterwards(trainer, clip, saved):
     seen = clip.novel
-    again, _ = checkpoint.load(saved.parent, CPU)
+    again, _ = checkpoint.load(saved.parent)
     before = render(trainer.avatar, seen.pose, seen.camera)
     np.testing.assert_array_equal(render(again.avatar, seen.pose, seen.camera), before)
 
 
 def test_training_goes_on_where_it_stopped(rig, frames, saved):
-    again, fresh = checkpoint.load(saved.parent, CPU)[0], Trainer(rig, CONFIG, CPU)
+    again, fresh = checkpoint.load(saved.parent)[0], Trainer(rig, CONFIG)
     losses = []
     for learner in (again, fresh):
         for frame in frames:
@@ -133,9 +132,7 @@ def test_a_detached_state_is_that_of_the_step_it_was_taken_at(learner, saved, tm
     detached = checkpoint.detached_state(learner)
     learner.step(rate=1.0, hard_surface_share=0.5)
     checkpoint.write_state(detached, tmp_path / "later")
-    before, after = (
-        checkpoint.load(folder, CPU)[0] for folder in (saved.parent, tmp_path / "later")
-    )
+    before, after = (checkpoint.load(folder)[0] for folder in (saved.parent, tmp_path / "later"))
     assert before.steps == after.steps == learner.steps - 1
     assert torch.equal(before.field.table, after.field.table)
     assert not torch.equal(before.field.table, learner.field.table)
@@ -146,7 +143,7 @@ def test_a_detached_state_is_that_of_the_step_it_was_taken_at(learner, saved, tm
 def test_a_second_checkpoint_replaces_the_first(learner, saved):
     learner.step(rate=1.0, hard_surface_share=0.5)
     checkpoint.save(learner, saved.parent)
-    assert checkpoint.load(saved.parent, CPU)[0].steps == 21
+    assert checkpoint.load(saved.parent)[0].steps == 21
     assert list(saved.parent.iterdir()) == [saved]
 
 
@@ -194,7 +191,7 @@ def test_a_first_checkpoint_that_fails_leaves_nothing(trainer, tmp_path, monkeyp
 
 def test_a_folder_without_a_checkpoint_says_so(tmp_path):
     with pytest.raises(FileNotFoundError, match="checkpoint"):
-        checkpoint.load(tmp_path / "checkpoint", CPU)
+        checkpoint.load(tmp_path / "checkpoint")
 
 
 @pytest.mark.parametrize("share", [0.0, 0.001, 0.3, 0.7, 0.999])
@@ -202,14 +199,14 @@ def test_a_file_that_was_cut_off_is_refused_by_name(saved, share):
     whole = saved.read_bytes()
     saved.write_bytes(whole[: int(share * len(whole))])
     with pytest.raises(InputError, match=str(saved)):
-        checkpoint.load(saved.parent, CPU)
+        checkpoint.load(saved.parent)
 
 
 @pytest.mark.parametrize("content", [b"hello, I am no checkpoint", b"\x80\x02garbage", bytes(999)])
 def test_a_file_of_something_else_is_refused_by_name(saved, content):
     saved.write_bytes(content)
     with pytest.raises(InputError, match=str(saved)):
-        checkpoint.load(saved.parent, CPU)
+        checkpoint.load(saved.parent)
 
 
 class Trap:
@@ -228,7 +225,7 @@ def test_code_in_a_checkpoint_is_refused_and_not_executed(saved, tmp_path, write
     trap = Trap(mark)
     write(trap if write is torch.save else pickle.dumps(trap, protocol=2), saved)
     with pytest.raises(InputError, match=rf"{saved} holds something other than numbers"):
-        checkpoint.load(saved.parent, CPU)
+        checkpoint.load(saved.parent)
     assert not mark.exists()
     pickle.loads(pickle.dumps(trap))  # the trap works
     assert mark.exists()
@@ -239,7 +236,7 @@ def test_a_checkpoint_of_another_format_says_which(saved):
     with pytest.raises(
         InputError, match=rf"format {checkpoint.CHECKPOINT_FORMAT + 1}.*--overwrite"
     ):
-        checkpoint.load(folder, CPU)
+        checkpoint.load(folder)
 
 
 @pytest.mark.parametrize(
@@ -256,4 +253,4 @@ def test_a_checkpoint_that_lacks_something_is_refused_by_name(saved, key, change
             state[key] = {} if isinstance(state[key], dict) else []
 
     with pytest.raises(InputError, match=str(saved)):
-        checkpoint.load(damaged(saved, lose), CPU)
+        checkpoint.load(damaged(saved, lose))

@@ -8,7 +8,7 @@ import torch
 
 from avatar.config import TrainConfig
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
-from avatar.kernels.backend_protocol import RayBatch
+from avatar.kernels.operands import RayBatch
 from avatar.training import checkpoint
 from avatar.training.frame_exposure import MAX_FRAME_GAP, FrameExposures
 from avatar.training.frame_stream import prepare_frame
@@ -16,7 +16,6 @@ from avatar.training.held_out_pose_fitting import fit_test_poses
 from avatar.training.replay_buffer import TrainingBatch
 from avatar.training.trainer import Trainer
 
-CPU = torch.device("cpu")
 CONFIG = TrainConfig(
     rays=256, sample_step_m=0.03, finest_m=0.03, levels=4, table_size=1 << 13,
     empty_space_points=32, refine_poses=False, seed=7,
@@ -38,7 +37,7 @@ def rays_of(gains, generator, *, rays=4000):
 
 
 def exposures_of(*frames: int, **more) -> FrameExposures:
-    exposures = FrameExposures(len(frames), CPU, **more)
+    exposures = FrameExposures(len(frames), **more)
     for slot, frame in enumerate(frames):
         exposures.set_frame(slot, frame)
     return exposures
@@ -86,7 +85,7 @@ def test_rays_without_person_say_nothing(generator):
 
 
 def test_a_new_frame_starts_from_its_nearest_neighbor(generator):
-    exposures = FrameExposures(4, CPU)
+    exposures = FrameExposures(4)
     exposures.set_frame(0, 10, BRIGHT.astype(np.float32))
     exposures.restore({30: DARK.astype(np.float32)})
     for slot, frame in enumerate((12, 28), start=1):
@@ -111,7 +110,7 @@ def trainers(rig, clip):
     """After a video in which every second frame is darker: with and without estimation."""
     trained = []
     for estimates in (True, False):
-        trainer = Trainer(rig, replace(CONFIG, estimate_exposures=estimates), CPU)
+        trainer = Trainer(rig, replace(CONFIG, estimate_exposures=estimates))
         for observation in clip.observations[:6]:
             filmed = exposed(observation, DARK if observation.frame.index % 2 else np.ones(3))
             trainer.add_frame(prepare_frame(filmed, rig))
@@ -142,6 +141,6 @@ def test_the_exposure_of_a_held_out_frame_is_fitted_in_the_fitted_score_only(tra
 def test_gains_survive_a_checkpoint(trainers, tmp_path, rig, clip):
     trainer = trainers[0]
     checkpoint.save(trainer, tmp_path)
-    restored, _ = checkpoint.load(tmp_path, CPU)
+    restored, _ = checkpoint.load(tmp_path)
     restored.add_frame(prepare_frame(clip.observations[3], rig))
     assert np.array_equal(restored.exposures.gains[0], trainer.exposures.by_frame[3])

@@ -12,10 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.backends import TorchBackend, backend_for
 from avatar.config import TrainConfig
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
-from avatar.kernels.numba_backend import NumbaBackend
 from avatar.radiance_field import RadianceField
 from avatar.training import trainer as trainer_module
 from avatar.training.frame_stream import prepare_stream
@@ -28,12 +26,10 @@ from avatar.training.trainer import (
     update_ema,
 )
 
-CPU = torch.device("cpu")
-
 
 @pytest.fixture
 def field(levels) -> RadianceField:
-    return RadianceField(levels, backend_for(CPU), CPU, torch.Generator().manual_seed(3))
+    return RadianceField(levels, torch.Generator().manual_seed(3))
 
 
 def filled(field, value) -> RadianceField:
@@ -78,7 +74,7 @@ def test_while_the_rate_is_high_the_mean_is_closer_to_unseen_frames_than_the_las
         table_size=1 << 14,
         refine_poses=False,
     )
-    trainer, held = Trainer(rig, config, CPU), []
+    trainer, held = Trainer(rig, config), []
     for item in prepare_stream(iter(clip.observations), rig, stride=6, total=None):
         if isinstance(item, HeldOutFrame):
             held.append(item)
@@ -97,14 +93,13 @@ def test_while_the_rate_is_high_the_mean_is_closer_to_unseen_frames_than_the_las
 WITHOUT_COMPILER = """
 import sys, torch
 from avatar.training.trainer import UncompiledAdam
-from avatar.backends import backend_for
 from avatar.training.trainer import step_optimizer
 numbers = torch.nn.Parameter(torch.zeros(3))
 adam = UncompiledAdam([numbers])
 numbers.grad = torch.ones(3)
 adam.step()
 numbers.grad = torch.ones(3)
-step_optimizer(adam, backend_for(numbers.device))
+step_optimizer(adam)
 adam.load_state_dict(adam.state_dict())
 assert numbers.max() < 0
 print("torch._dynamo" in sys.modules)
@@ -128,8 +123,7 @@ def test_its_steps_are_those_of_torch():
     assert not torch.equal(ours, start)
 
 
-@pytest.mark.parametrize("backend", [NumbaBackend(), TorchBackend()], ids=["numba", "torch"])
-def test_a_backends_steps_are_those_of_torch_and_spend_the_gradient(backend):
+def test_compiled_steps_are_those_of_torch_and_spend_the_gradient():
     """Rates and eps of two groups, blocks that are not full, entries without a gradient so far."""
     generator = torch.Generator().manual_seed(0)
     start = [torch.randn(5001, 4, generator=generator), torch.randn(7, generator=generator)]
@@ -143,7 +137,7 @@ def test_a_backends_steps_are_those_of_torch_and_spend_the_gradient(backend):
             grad = torch.randn(mine.shape, generator=generator)
             mine.grad = grad * (torch.rand(grad.shape, generator=generator) < 0.2)
             other.grad = mine.grad.clone()
-        step_optimizer(pair[0], backend)
+        step_optimizer(pair[0])
         pair[1].step()
         assert not any(p.grad.any() for p in ours)
         if step == 3:

@@ -15,18 +15,17 @@ import pytest
 import torch
 
 from avatar.avatar_model import Avatar
-from avatar.backends import TorchBackend
 from avatar.config import TrainConfig
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.evaluation.image_metrics import soft_iou
-from avatar.kernels.backend_protocol import (
+from avatar.kernels import operations
+from avatar.kernels.numba_rendering import OPAQUE_DEPTH
+from avatar.kernels.operands import (
     CorrespondenceTables,
     DensityGrid,
     MarchSettings,
     RayBatch,
 )
-from avatar.kernels.numba_backend import NumbaBackend
-from avatar.kernels.torch_reference import OPAQUE_DEPTH
 from avatar.occupancy_grid import MIN_STEP_OPACITY, OCCUPANCY_DECAY, OccupancyGrid
 from avatar.render import render
 from avatar.rig import Rig
@@ -38,11 +37,6 @@ from preprocess.observation import Observation
 from studio import staging
 from studio.actor import Actor
 from studio.staging import static_camera
-
-CPU = torch.device("cpu")
-BACKENDS = pytest.mark.parametrize(
-    "backend", [TorchBackend(), NumbaBackend()], ids=["torch", "numba"]
-)
 
 # --- a plane that is grazed -------------------------------------------------------------------
 
@@ -85,22 +79,19 @@ def descending(slope: float) -> RayBatch:
     )
 
 
-def lowest(backend, slope: float, step_m: float, grace_m: float) -> float:
+def lowest(slope: float, step_m: float, grace_m: float) -> float:
     """How deep below the dense cells' upper wall the last sample of the ray lies, metres."""
     how = MarchSettings(step_m, grace_m, 4096)
-    points = backend.march(descending(slope), flat_world(), ground(2000.0), how).points
+    points = operations.march(descending(slope), flat_world(), ground(2000.0), how).points
     return 8 * CANONICAL_M - float(points[-1, 2])
 
 
-@BACKENDS
 @pytest.mark.parametrize("step_m", [0.015, 0.01, 0.005, 0.0025])
 @pytest.mark.parametrize("slope", [0.3, 0.6])
-def test_a_grazing_ray_reaches_the_bottom_of_the_surfaces_cell_whatever_the_step(
-    backend, slope, step_m
-):
+def test_a_grazing_ray_reaches_the_bottom_of_the_surfaces_cell_whatever_the_step(slope, step_m):
     """A surface may lie anywhere in the first cell that has shown its density."""
     grace_m = TrainConfig().opaque_margin_m
-    depth = lowest(backend, slope, step_m, grace_m)
+    depth = lowest(slope, step_m, grace_m)
     assert depth >= CANONICAL_M
     # it goes on for the grace, after what makes it opaque, and ends on the lattice
     sine = slope / math.hypot(1.0, slope)
@@ -108,10 +99,9 @@ def test_a_grazing_ray_reaches_the_bottom_of_the_surfaces_cell_whatever_the_step
     assert depth == pytest.approx(expected, abs=2.5 * step_m * sine)
 
 
-@BACKENDS
-def test_a_grace_of_four_samples_would_cut_it_off_before(backend):
+def test_a_grace_of_four_samples_would_cut_it_off_before():
     """At 15 mm a grace of four samples is one of 6 cm; at 2.5 mm it ends above the surface."""
-    depths = [lowest(backend, 0.3, step_m, 4 * step_m) for step_m in (0.015, 0.005, 0.0025)]
+    depths = [lowest(0.3, step_m, 4 * step_m) for step_m in (0.015, 0.005, 0.0025)]
     assert depths[0] > CANONICAL_M
     assert depths[1] < 0.7 * CANONICAL_M
     assert depths[2] < 0.4 * CANONICAL_M
@@ -126,7 +116,7 @@ SHEET = 0.15
 
 def forgotten(rig, *, decay: float, updates: int) -> float:
     """Share of a thin sheet's cells that count as empty after repeated probes."""
-    occupancy, generator = OccupancyGrid(rig, CPU), torch.Generator().manual_seed(0)
+    occupancy, generator = OccupancyGrid(rig), torch.Generator().manual_seed(0)
     grid = occupancy.density_grid
     layer = int((float(rig.rest_joints[6, 2]) + 0.05 - rig.box_low[2]) * grid.cells_per_m[2])
     middle = float(rig.box_low[2] + (layer + 0.5) / grid.cells_per_m[2])
@@ -215,7 +205,7 @@ def taught(clip: Filmed, steps: int, *, grace_steps: int | None = None, marks: i
     config = dataclasses.replace(config, refine_poses=False)
     if grace_steps is not None:
         config = dataclasses.replace(config, opaque_margin_m=grace_steps * config.sample_step_m)
-    trainer, scores = Trainer(clip.rig, config, CPU), []
+    trainer, scores = Trainer(clip.rig, config), []
     for frame in clip.frames:
         trainer.add_frame(frame)
     for step in range(steps):
@@ -267,7 +257,7 @@ def test_a_picture_that_ended_by_cached_densities_would_have_holes(large):
     """A surface that is grazed is cut off; the exact picture has none of it."""
     avatar = large.avatar
     how = MarchSettings(avatar.sample_step_m, 4 * avatar.sample_step_m, 512)
-    cut = partial(avatar.field.backend.march, grid=avatar.occupancy.density_grid, how=how)
+    cut = partial(operations.march, grid=avatar.occupancy.density_grid, how=how)
     ended_early = partial(render_samples, sample_rays=cut)
     assert max(large.overlaps(ended_early)) < 0.98 <= min(large.overlaps())
     held = large.held[0]

@@ -7,18 +7,16 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from avatar.backends import TorchBackend
 from avatar.config import COARSEST_M, TrainConfig
 from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
-from avatar.kernels import torch_correspondence
-from avatar.kernels.backend_protocol import (
+from avatar.kernels import operations
+from avatar.kernels.operands import (
     FEATURES_PER_LEVEL,
     CorrespondenceTables,
     HashLevels,
     RaySamples,
 )
-from avatar.kernels.numba_backend import NumbaBackend
 from avatar.render import correspondence_tables
 from avatar.training import checkpoint
 from avatar.training.frame_stream import prepare_stream
@@ -34,11 +32,9 @@ from avatar.training.pose_optimizer import (
     PoseOptimizer,
 )
 from avatar.training.trainer import Trainer, cosine_decay
+from baselines import torch_correspondence, torch_reference
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import descendant_matrix, joint_transforms, rotation_matrices
-
-TORCH, NUMBA = TorchBackend(), NumbaBackend()
-CPU = torch.device("cpu")
 
 
 def pose_of(rotations, root=(0.1, 0.7, -0.2), place=(0.2, 0.1, -0.3)) -> BodyPose:
@@ -51,7 +47,7 @@ def pose_of(rotations, root=(0.1, 0.7, -0.2), place=(0.2, 0.1, -0.3)) -> BodyPos
 
 @pytest.fixture
 def table(rig, bent_pose) -> PoseOptimizer:
-    table = PoseOptimizer(rig, 2, CPU)
+    table = PoseOptimizer(rig, 2)
     table.set_pose(0, pose_of(np.zeros((23, 3))))
     table.set_pose(1, pose_of(bent_pose))
     return table
@@ -84,11 +80,11 @@ def test_the_features_gradient_for_the_points_is_that_of_autograd(levels, genera
     extent = torch.from_numpy((levels.vertex_counts[0] - 1) / levels.cells_per_m[0]).float()
     points = torch.from_numpy(levels.low) + torch.rand(500, 3, generator=generator) * extent
     slope = torch.randn(500, levels.feature_width, generator=generator)
-    torch.testing.assert_close(
-        NUMBA.encode_points_backward(points, slope, table, levels),
-        TORCH.encode_points_backward(points, slope, table, levels),
-        atol=1e-2, rtol=1e-4,
-    )  # fmt: skip
+    leaf = points.clone().requires_grad_()
+    features = torch_reference.encode(leaf, table, levels)
+    (expected,) = torch.autograd.grad(features, leaf, slope)
+    found = operations.encode_points_backward(points, slope, table, levels)
+    torch.testing.assert_close(found, expected, atol=1e-2, rtol=1e-4)
 
 
 def test_compiled_wrenches_agree_with_their_meaning(rig, table, generator):
@@ -104,20 +100,20 @@ def test_compiled_wrenches_agree_with_their_meaning(rig, table, generator):
     )
     slots = torch.ones(3, dtype=torch.int32)
     results = [
-        backend.bone_wrenches(samples, pull, slots, cells, table.skinning, table.bones)
-        for backend in (NUMBA, TORCH)
+        module.bone_wrenches(samples, pull, slots, cells, table.skinning, table.bones)
+        for module in (operations, torch_correspondence)
     ]
     assert float(results[0][1].abs().max()) == 0.0
     torch.testing.assert_close(*results, atol=2e-2, rtol=1e-3)
 
 
 def test_compiled_following_agrees_with_its_meaning(rig, table, bent_pose):
-    cells = correspondence_tables(CorrespondenceGrid.solve(rig, bent_pose), CPU)
+    cells = correspondence_tables(CorrespondenceGrid.solve(rig, bent_pose))
     moved = rig.body_from_canonical(bent_pose + 0.03)[:, :3].reshape(24, 12)
     bones = torch.from_numpy(moved.astype(np.float32))
     ours, theirs = copied(cells), copied(cells)
-    NUMBA.update_roots(ours, 0, table.skinning, bones)
-    TORCH.update_roots(theirs, 0, table.skinning, bones)
+    operations.update_roots(ours, 0, table.skinning, bones)
+    torch_correspondence.update_roots(theirs, 0, table.skinning, bones)
     off = (ours.roots - theirs.roots)[0, 1:].abs().amax(dim=1)
     assert float((off < 1e-2).float().mean()) > 0.99
     assert not torch.equal(ours.roots, cells.roots)
@@ -128,13 +124,13 @@ def test_cells_that_follow_a_pose_are_those_that_would_have_been_solved(rig, tab
     turned = (
         Rotation.from_rotvec(bent_pose) * Rotation.from_rotvec(np.full((23, 3), 0.006))
     ).as_rotvec()
-    tables = correspondence_tables(cells, CPU)
+    tables = correspondence_tables(cells)
     bones = torch.from_numpy(
         rig.body_from_canonical(turned)[:, :3].reshape(24, 12).astype(np.float32)
     )
     before = residual(rig, table, cells, tables.roots[0], bones)
     for _ in range(2):
-        NUMBA.update_roots(tables, 0, table.skinning, bones)
+        operations.update_roots(tables, 0, table.skinning, bones)
     after = residual(rig, table, cells, tables.roots[0], bones)
     assert np.median(before) > 3e-3
     assert np.quantile(after, 0.95) < 5e-4
@@ -158,7 +154,7 @@ def test_the_poses_gradient_is_what_the_roots_do_when_the_pose_moves(rig, table,
         torch.zeros(2, 1), roots, torch.zeros(2, 3), torch.zeros(2, 3), 0.03
     )
     slots = torch.ones(1, dtype=torch.int32)
-    wrenches = NUMBA.bone_wrenches(samples, pull, slots, cells, table.skinning, table.bones)
+    wrenches = operations.bone_wrenches(samples, pull, slots, cells, table.skinning, table.bones)
     table.accumulate(slots.long(), wrenches, torch.ones(1))
     gradient = table.pose_gradient(1)
     given = (
@@ -224,7 +220,7 @@ def turns_of(pose: BodyPose):
 
 
 def test_bones_follow_the_corrected_pose(rig, bent_pose, rng):
-    table = PoseOptimizer(rig, 1, CPU)
+    table = PoseOptimizer(rig, 1)
     table.set_pose(0, pose_of(bent_pose), correction=rng.normal(size=(25, 3)) * 0.3)
     bones = rig.body_from_canonical(table.pose(0).joint_rotations)[:, :3].reshape(24, 12)
     np.testing.assert_allclose(table.bones[0].numpy(), bones, atol=1e-6)
@@ -261,7 +257,7 @@ def test_refining_poses_makes_up_for_a_trackers_jitter(rig, clip, jittered):
     held = [frame for frame in frames if isinstance(frame, HeldOutFrame)]
     reached = {}
     for refine_poses in (False, True):
-        trainer = Trainer(rig, dataclasses.replace(config, refine_poses=refine_poses), CPU)
+        trainer = Trainer(rig, dataclasses.replace(config, refine_poses=refine_poses))
         for frame in frames:
             if not isinstance(frame, HeldOutFrame):
                 trainer.add_frame(frame)
@@ -319,7 +315,7 @@ def test_no_frame_scores_worse_in_a_fitted_pose(learnt, clip):
 
 def test_a_pose_that_was_refined_for_long_enough_stays(rig, bent_pose, generator):
     """Its rays pull no more; those of a frame that came later do."""
-    table, pose = PoseOptimizer(rig, 2, torch.device("cpu")), pose_of(bent_pose)
+    table, pose = PoseOptimizer(rig, 2), pose_of(bent_pose)
     table.set_pose(0, pose, step=0)
     table.set_pose(1, pose, step=1000)
     slots = torch.arange(2).repeat_interleave(300)
@@ -337,7 +333,7 @@ def test_a_pose_that_was_refined_for_long_enough_stays(rig, bent_pose, generator
 
 def test_a_frame_that_has_just_come_is_not_corrected_yet(rig, bent_pose, generator):
     """The field does not know yet what is seen from there, and all of its rays pull one way."""
-    table = PoseOptimizer(rig, 2, CPU)
+    table = PoseOptimizer(rig, 2)
     table.set_pose(0, pose_of(bent_pose), step=500)
     wrenches, loss = torch.randn(300, 24, 6, generator=generator) + 3.0, torch.full((300,), 0.1)
 
@@ -354,7 +350,7 @@ def test_a_frame_that_has_just_come_is_not_corrected_yet(rig, bent_pose, generat
 
 def test_a_pose_whose_rays_do_not_agree_is_exact_and_stays(rig, bent_pose, generator):
     """Chance is not believed again later; the frame whose rays all pull one way stays open."""
-    table, pose = PoseOptimizer(rig, 2, CPU), pose_of(bent_pose)
+    table, pose = PoseOptimizer(rig, 2), pose_of(bent_pose)
     table.set_pose(0, pose)
     table.set_pose(1, pose)
     loss, later = torch.full((300,), 0.1), MIN_STEPS_BEFORE_FREEZE
@@ -376,7 +372,7 @@ def test_a_pose_whose_rays_do_not_agree_is_exact_and_stays(rig, bent_pose, gener
 def test_estimated_poses_follow_their_rays_even_where_these_hardly_agree(rig, bent_pose, generator):
     """No gate, no damping, and the mean of all corrections stays: poses are known to be wrong."""
     loss = torch.full((300,), 0.1)
-    tables = [PoseOptimizer(rig, 1, CPU, poses_may_be_exact=exact) for exact in (True, False)]
+    tables = [PoseOptimizer(rig, 1, poses_may_be_exact=exact) for exact in (True, False)]
     for table in tables:
         table.set_pose(0, pose_of(bent_pose))
         for step in range(FREEZE_AFTER_STEPS - 20, FREEZE_AFTER_STEPS):
@@ -397,7 +393,7 @@ def test_a_held_out_pose_follows_more_rays_and_its_given_pose_less(rig, bent_pos
 
     def correct(rays, precision):
         table = PoseOptimizer(
-            rig, 1, CPU, poses_may_be_exact=False, rays_per_frame=1000, prior_precision=precision
+            rig, 1, poses_may_be_exact=False, rays_per_frame=1000, prior_precision=precision
         )
         table.set_pose(0, pose_of(bent_pose))
         table.accumulate(torch.zeros(rays, dtype=torch.int64), wrenches[:rays], loss[:rays])
@@ -413,7 +409,7 @@ def test_an_estimated_pose_remembers_its_rays_until_it_is_replaced(rig, bent_pos
     wrenches, loss = torch.randn(2, 300, 24, 6, generator=generator) + 3.0, torch.full((300,), 0.1)
 
     def second_correction(*, exact: bool, replaced: bool):
-        table = PoseOptimizer(rig, 1, CPU, poses_may_be_exact=exact)
+        table = PoseOptimizer(rig, 1, poses_may_be_exact=exact)
         for row in range(2):
             if row == 0 or replaced:
                 table.set_pose(0, pose_of(bent_pose))
@@ -430,12 +426,12 @@ def test_an_estimated_pose_remembers_its_rays_until_it_is_replaced(rig, bent_pos
 
 
 def test_a_correction_outlives_a_checkpoint(rig, clip, tmp_path):
-    trainer = Trainer(rig, TrainConfig(table_size=1 << 12, levels=3, finest_m=0.05), CPU)
+    trainer = Trainer(rig, TrainConfig(table_size=1 << 12, levels=3, finest_m=0.05))
     frame = next(prepare_stream(iter(clip.observations), rig, stride=0, total=None))
     correction = np.full((25, 3), 0.02)
     trainer.pose_corrections[frame.index] = correction
     checkpoint.save(trainer, tmp_path)
-    again, _ = checkpoint.load(tmp_path, CPU)
+    again, _ = checkpoint.load(tmp_path)
     again.add_frame(frame, is_restored=True)
     assert again.frames_seen == 0
     np.testing.assert_allclose(again.poses.corrections[0], correction)

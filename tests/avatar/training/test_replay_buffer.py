@@ -20,8 +20,6 @@ from avatar.training.replay_buffer import (
 from avatar.training.training_pixels import PixelRuns
 from preprocess.body.body_pose import BodyPose
 
-CPU = torch.device("cpu")
-
 
 @pytest.fixture(scope="module")
 def frames(rig, clip):
@@ -30,7 +28,7 @@ def frames(rig, clip):
 
 
 def store(frames, capacity=8) -> ReplayBuffer:
-    replay = ReplayBuffer(capacity, CPU)
+    replay = ReplayBuffer(capacity)
     for frame in frames:
         replay.add(frame)
     return replay
@@ -209,7 +207,7 @@ def test_frames_seen_from_two_sides_are_not_alike(frames):
 @given(capacity=st.integers(1, 6), arriving=st.integers(1, 12))
 @settings(deadline=None, max_examples=30)
 def test_the_capacity_is_kept_and_the_newest_frame_is_in(frames, capacity, arriving):
-    replay = ReplayBuffer(capacity, CPU)
+    replay = ReplayBuffer(capacity)
     for index in range(arriving):
         replay.add(posed(cut(frames[0], 5, 5), index, knee=0.1 * index))
         assert index in replay.frame_indices
@@ -232,7 +230,7 @@ def test_a_slot_that_is_taken_over_shows_the_new_frame(frames, generator):
 
 def test_cached_distances_are_those_computed_afresh(frames, rng):
     """What goes is chosen from distances that are updated one row at a time."""
-    replay = ReplayBuffer(6, CPU)
+    replay = ReplayBuffer(6)
     for index in range(40):
         turned = dataclasses.replace(frames[0].pose, joint_rotations=rng.normal(size=(23, 3)))
         replay.add(dataclasses.replace(frames[index % 4], index=index, pose=turned))

@@ -16,8 +16,6 @@ from avatar.training.frame_stream import prepare_frame, rebuild_frame
 from avatar.training.replay_buffer import ReplayBuffer
 from capture.input_error import InputError
 
-CPU = torch.device("cpu")
-
 
 @pytest.fixture(scope="module")
 def frames(rig, clip):
@@ -26,7 +24,7 @@ def frames(rig, clip):
 
 @pytest.fixture
 def kept(frames, clip):
-    replay = ReplayBuffer(2, CPU)
+    replay = ReplayBuffer(2)
     for frame in frames:
         replay.add(frame)
     return SavedFrames.of(replay, [HeldOutFrame(observation=o) for o in clip.observations[3:5]])
@@ -58,13 +56,13 @@ def test_the_zeros_that_were_once_saved_for_the_background_are_left_out(frames, 
 
 
 def test_replay_returns_the_colors_it_was_given(frames):
-    replay = ReplayBuffer(3, CPU)
+    replay = ReplayBuffer(3)
     for frame in frames:
         replay.add(frame)
     for frame, kept in zip(frames, replay.replay_frames(), strict=True):
         assert kept.index == frame.index
         np.testing.assert_array_equal(kept.colors, frame.colors)
-    replay = ReplayBuffer(1, CPU)
+    replay = ReplayBuffer(1)
     for frame in frames:  # one after the other in the same slot, of different sizes
         replay.add(frame)
         (kept,) = replay.replay_frames()
@@ -106,7 +104,7 @@ def test_frames_of_an_earlier_video_have_numbers_of_their_own(kept):
 
 def test_few_held_out_frames_are_kept_of_many(clip):
     held = [HeldOutFrame(observation=o) for o in clip.observations]
-    kept = SavedFrames.of(ReplayBuffer(1, CPU), held)
+    kept = SavedFrames.of(ReplayBuffer(1), held)
     assert len(kept.held_out) == MAX_HELD_OUT_KEPT < len(held)
     assert kept.held_out[0] is held[0]
     assert kept.held_out[-1] is held[-1]

@@ -21,7 +21,6 @@ from avatar.training.trainer import Trainer
 from capture.inbox import Inbox
 from preprocess.observation import DroppedFrame
 
-CPU = torch.device("cpu")
 QUICK = TrainConfig(
     rays=128, sample_step_m=0.03, finest_m=0.05, levels=3, table_size=1 << 12,
     empty_space_points=32, seconds=60.0,
@@ -38,7 +37,7 @@ def ready(rig, clip):
 
 def taught(rig, ready, config):
     """A trainer that was taught by `train`, its held-out frames and its events."""
-    trainer, held = Trainer(rig, config, CPU), []
+    trainer, held = Trainer(rig, config), []
     return trainer, held, list(train(trainer, Inbox(ready), held))
 
 
@@ -94,7 +93,7 @@ def test_rays_need_few_samples(learnt):
 
 
 def after_three_steps(rig, ready, config):
-    trainer = Trainer(rig, config, CPU)
+    trainer = Trainer(rig, config)
     for item in ready:
         if not isinstance(item, HeldOutFrame | DroppedFrame):
             trainer.add_frame(item)
@@ -150,7 +149,7 @@ def test_events_come_in_order_and_end_with_the_last_step(rig, ready):
 
 
 def test_it_stops_when_the_time_is_up(rig, ready, ticking):
-    trainer, inbox = Trainer(rig, dataclasses.replace(QUICK, seconds=0.4), CPU), Inbox(ready)
+    trainer, inbox = Trainer(rig, dataclasses.replace(QUICK, seconds=0.4)), Inbox(ready)
     inbox._thread.join()  # the last frame comes before the first step
     events = list(train(trainer, inbox, []))
     steps = [event for event in events if isinstance(event, Stepped)]
@@ -173,7 +172,7 @@ def test_held_out_frames_that_have_arrived_are_scored_at_the_marks(rig, ready, m
 def test_scoring_at_a_mark_stops_when_its_time_is_spent(rig, ready, monkeypatch, ticking):
     monkeypatch.setattr(train_module, "EVALUATION_TIMES_S", (0.05, 60.0))
     monkeypatch.setattr(train_module, "EVALUATION_TIME_SHARE", 0.0)
-    trainer, held = Trainer(rig, dataclasses.replace(QUICK, seconds=0.5), CPU), []
+    trainer, held = Trainer(rig, dataclasses.replace(QUICK, seconds=0.5)), []
     inbox = Inbox(ready)
     inbox._thread.join()  # all frames are there before the first mark
     (mark,) = [event for event in train(trainer, inbox, held) if isinstance(event, Evaluated)]
@@ -191,7 +190,7 @@ def test_the_rate_is_constant_until_the_last_frame_and_falls_after(rig, clip, ti
         yield frames[2]
 
     config = dataclasses.replace(QUICK, seconds=1.2)
-    trainer, rates = Trainer(rig, config, CPU), {1: [], 2: [], 3: []}
+    trainer, rates = Trainer(rig, config), {1: [], 2: [], 3: []}
     for event in train(trainer, Inbox(arriving()), []):
         if isinstance(event, Stepped):
             group = trainer.optimizer.param_groups[0]
@@ -220,7 +219,7 @@ def test_an_error_in_the_source_is_raised_in_training(rig, ready):
         raise OSError("the disk was pulled out")
 
     with pytest.raises(OSError, match="pulled out"):
-        list(train(Trainer(rig, QUICK, CPU), Inbox(breaking()), []))
+        list(train(Trainer(rig, QUICK), Inbox(breaking()), []))
 
 
 def test_a_resumed_trainer_goes_on_counting(rig, ready):
@@ -253,7 +252,7 @@ def arriving_at(rig, clip, *, gate):
 def rates_by_frames(rig, clip, *, paced, seconds, opens_after_s):
     """The learning rates of the steps after each number of frames."""
     gate = threading.Event()
-    trainer = Trainer(rig, dataclasses.replace(QUICK, seconds=seconds), CPU)
+    trainer = Trainer(rig, dataclasses.replace(QUICK, seconds=seconds))
     inbox = Inbox(arriving_at(rig, clip, gate=gate), paced=paced)
     rates = {1: [], 2: [], 3: []}
     for event in train(trainer, inbox, []):
@@ -289,7 +288,7 @@ def test_a_live_source_is_left_when_the_time_is_up(rig, clip, ticking):
         yield from frames
         closed.wait(30.0)
 
-    trainer = Trainer(rig, dataclasses.replace(QUICK, seconds=0.4), CPU)
+    trainer = Trainer(rig, dataclasses.replace(QUICK, seconds=0.4))
     inbox = Inbox(never_ending(), paced=True, live=True)
     events = list(train(trainer, inbox, []))
     closed.set()
@@ -308,14 +307,14 @@ def test_while_nothing_has_come_the_listener_is_heard(rig):
         yield from ()
 
     inbox = Inbox(nothing(), paced=True, live=True)
-    assert isinstance(next(train(Trainer(rig, QUICK, CPU), inbox, [])), WaitingForFrame)
+    assert isinstance(next(train(Trainer(rig, QUICK), inbox, [])), WaitingForFrame)
     closed.set()
     inbox.close()
 
 
 def test_corrections_of_frames_that_are_gone_are_forgotten(rig, clip):
     config = dataclasses.replace(QUICK, replay_capacity=3)
-    trainer = Trainer(rig, config, CPU)
+    trainer = Trainer(rig, config)
     frame = prepare_frame(clip.observations[0], rig)
     for index in range(40):
         trainer.add_frame(dataclasses.replace(frame, index=index))
@@ -335,7 +334,7 @@ def taught_at_a_pace(rig, ready, config, *, pause_s):
             time.sleep(pause_s)
             yield item
 
-    trainer = Trainer(rig, config, CPU)
+    trainer = Trainer(rig, config)
     events = train(trainer, Inbox(arriving()), [])
     frames_seen = [event.frames_seen for event in events if isinstance(event, Stepped)]
     return frames_seen, trainer.avatar.field.parameters()
@@ -365,7 +364,7 @@ def test_each_frame_is_learnt_from_even_if_there_are_fewer_steps(rig, ready):
 def test_the_rate_falls_with_the_steps_that_are_left(rig, ready):
     config = dataclasses.replace(QUICK, steps=25)
     assert config.seconds == 25 / NOMINAL_STEPS_PER_S
-    trainer = Trainer(rig, config, CPU)
+    trainer = Trainer(rig, config)
     events = train(trainer, Inbox(ready), [])
     group = trainer.optimizer.param_groups[0]
     rates = [group["lr"] for event in events if isinstance(event, Stepped)]
@@ -377,7 +376,7 @@ def test_the_rate_falls_with_the_steps_that_are_left(rig, ready):
 def test_a_revised_pose_is_that_of_a_frame_that_came_with_it(rig, clip):
     one, other = clip.observations[0], clip.observations[5]
     wrong = dataclasses.replace(one, pose=other.pose)
-    trainers = Trainer(rig, QUICK, CPU), Trainer(rig, QUICK, CPU)
+    trainers = Trainer(rig, QUICK), Trainer(rig, QUICK)
     for trainer, seen in zip(trainers, (wrong, one), strict=True):
         frame = prepare_frame(seen, rig)
         trainer.add_frame(dataclasses.replace(frame, head=None))  # cut out where the pose was

@@ -3,7 +3,6 @@
 import time
 
 import pytest
-import torch
 
 from avatar.config import TrainConfig
 from avatar.training.train import TrainingClock
@@ -13,7 +12,7 @@ from avatar.training.trainer import Trainer
 @pytest.fixture
 def trainer(rig) -> Trainer:
     config = TrainConfig(rays=64, sample_step_m=0.03, finest_m=0.05, levels=2, table_size=1 << 10)
-    return Trainer(rig, config, torch.device("cpu"))
+    return Trainer(rig, config)
 
 
 @pytest.fixture

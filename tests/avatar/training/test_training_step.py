@@ -7,11 +7,9 @@ import pytest
 import torch
 
 from avatar import radiance_field
-from avatar.backends import TorchBackend
 from avatar.config import MAX_SAMPLE_STEP_M, TrainConfig
-from avatar.kernels import torch_reference
-from avatar.kernels.backend_protocol import MarchSettings, RaySamples
-from avatar.kernels.numba_backend import NumbaBackend
+from avatar.kernels import operations
+from avatar.kernels.operands import MarchSettings, RaySamples
 from avatar.training.frame_stream import prepare_frame
 from avatar.training.pose_optimizer import PoseOptimizer
 from avatar.training.trainer import Trainer, cosine_decay
@@ -20,6 +18,7 @@ from avatar.training.training_step import (
     compute_gradients,
     draw_by_strength,
 )
+from baselines import torch_reference
 
 FIRM_SHARE = 0.25
 """Far from 0 and 1, so that no term may be left out."""
@@ -35,7 +34,7 @@ CONFIG = TrainConfig(
 
 @pytest.fixture
 def trainer(rig, clip):
-    trainer = Trainer(rig, CONFIG, torch.device("cpu"))
+    trainer = Trainer(rig, CONFIG)
     for observation in clip.observations[:4]:
         trainer.add_frame(prepare_frame(observation, rig))
     for _ in range(40):
@@ -85,21 +84,21 @@ def of_close_pairs(raw, points):
     return loss + 0.3 * (uneven * (densest > 2.0)).mean()
 
 
-def one_step(trainer, backend):
+def one_step(trainer):
     """Gradients of a step, and everything random that went into it."""
     field, occupancy = trainer.avatar.field, trainer.avatar.occupancy
-    field.backend = backend
     batch = trainer.replay.sample_rays(CONFIG.rays, torch.Generator().manual_seed(3))
     generator = torch.Generator().manual_seed(4)
     field.table_grad.zero_()
     compute_gradients(
-        trainer.avatar, OccupancySampler(backend, occupancy, CONFIG),
+        trainer.avatar, OccupancySampler(occupancy, CONFIG),
         trainer.replay.correspondences, batch, CONFIG,
         hard_surface_share=1.0, surface_share=FIRM_SHARE, generator=generator,
     )  # fmt: skip
     generator = torch.Generator().manual_seed(4)
     how = MarchSettings(CONFIG.sample_step_m, CONFIG.opaque_margin_m, CONFIG.max_samples)
-    samples = backend.march(batch.rays, trainer.replay.correspondences, occupancy.density_grid, how)
+    cells = trainer.replay.correspondences
+    samples = operations.march(batch.rays, cells, occupancy.density_grid, how)
     empty = occupancy.sample_empty(CONFIG.empty_space_points, generator)
     drawn = CONFIG.density_tv_pairs if len(samples.points) else 0
     chosen = torch.randint(max(len(samples.points), 1), (drawn,), generator=generator)
@@ -112,11 +111,10 @@ def one_step(trainer, backend):
     return grads, (samples, empty, pairs, solid, close, gaps, batch)
 
 
-@pytest.mark.parametrize("backend", [NumbaBackend(), TorchBackend()], ids=["numba", "torch"])
 @pytest.mark.parametrize("has_onednn", [radiance_field.HAS_ONEDNN, False])
-def test_the_steps_gradient_is_that_of_autograd(trainer, backend, has_onednn, monkeypatch):
+def test_the_steps_gradient_is_that_of_autograd(trainer, has_onednn, monkeypatch):
     monkeypatch.setattr(radiance_field, "HAS_ONEDNN", has_onednn)
-    grads, drawn = one_step(trainer, backend)
+    grads, drawn = one_step(trainer)
     parameters = [p.detach().clone().requires_grad_() for p in trainer.avatar.field.parameters()]
     expected = torch.autograd.grad(mean_loss(trainer, parameters, *drawn), parameters)
     for ours, theirs in zip(grads, expected, strict=True):
@@ -125,7 +123,7 @@ def test_the_steps_gradient_is_that_of_autograd(trainer, backend, has_onednn, mo
 
 def test_the_whole_loss_changes_as_its_gradient_says(trainer):
     """Central differences in double precision, along random directions in every parameter."""
-    grads, drawn = one_step(trainer, NumbaBackend())
+    grads, drawn = one_step(trainer)
     parameters = [p.detach().double() for p in trainer.avatar.field.parameters()]
     generator = torch.Generator().manual_seed(5)
     for place in range(len(parameters)):
@@ -164,7 +162,7 @@ def test_half_of_the_samples_give_nearly_the_steps_whole_gradient(trainer):
     """The table's gradient, and that of the poses, of one draw against those of all samples."""
     found = []
     for share in (0.0, 0.2):
-        poses = PoseOptimizer(trainer.avatar.rig, trainer.replay.capacity, torch.device("cpu"))
+        poses = PoseOptimizer(trainer.avatar.rig, trainer.replay.capacity)
         for slot in range(4):
             poses.set_pose(slot, trainer.poses.pose(slot))
         trainer.field.table_grad.zero_()
@@ -185,7 +183,7 @@ def test_half_of_the_samples_give_nearly_the_steps_whole_gradient(trainer):
 def test_a_step_without_samples_learns_nothing_from_its_rays(trainer):
     """Rays that miss everything: no crash, and no gradient but those of the priors."""
     trainer.avatar.occupancy.density_grid.occupied.zero_()
-    (_, first, *_), drawn = one_step(trainer, NumbaBackend())
+    (_, first, *_), drawn = one_step(trainer)
     samples, empty, pairs, _, close, _, batch = drawn
     assert isinstance(samples, RaySamples)
     assert len(samples.points) == 0

@@ -12,7 +12,6 @@ from avatar.training.skin_evidence import SkinEvidence
 from avatar.training.trainer import Trainer, cosine_decay
 from avatar.training.unseen_skin import FACE_MIN_NORMAL, HEAD, MIN_WEIGHT, UnseenSkin
 
-CPU = torch.device("cpu")
 TORSO, LEFT_THIGH, LEFT_FOREARM, RIGHT_FOREARM = 0, 1, 10, 11
 
 
@@ -155,7 +154,7 @@ def test_unseen_skin_becomes_like_its_sources(rig, clip, generator):
             rays=256, finest_m=0.02, table_size=1 << 13, sample_step_m=0.015,
             unseen_weight=weight, refine_poses=False,
         )  # fmt: skip
-        trainer = Trainer(rig, config, CPU)
+        trainer = Trainer(rig, config)
         for seen in front:
             trainer.add_frame(prepare_frame(seen, rig))
         for step in range(300):
@@ -175,8 +174,8 @@ def test_unseen_skin_becomes_like_its_sources(rig, clip, generator):
 
 
 def test_a_checkpoint_keeps_what_was_seen(rig, frame, tmp_path):
-    trainer = Trainer(rig, TrainConfig(table_size=1 << 12, levels=4, finest_m=0.03), CPU)
+    trainer = Trainer(rig, TrainConfig(table_size=1 << 12, levels=4, finest_m=0.03))
     trainer.add_frame(frame())
     checkpoint.save(trainer, tmp_path)
-    loaded, _ = checkpoint.load(tmp_path, CPU)
+    loaded, _ = checkpoint.load(tmp_path)
     np.testing.assert_array_equal(loaded.unseen.evidence.cosines, trainer.unseen.evidence.cosines)

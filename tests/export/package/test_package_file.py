@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from onnx import TensorProto, helper, numpy_helper
 
 from avatar.config import TrainConfig
@@ -234,7 +233,7 @@ def test_the_fog_of_an_untrained_avatar_is_written_with_a_warning(
     stand_in, views, coarse, tmp_path
 ):
     config = TrainConfig(table_size=1 << 10, finest_m=0.03)
-    avatar = Trainer(stand_in.rig, config, torch.device("cpu")).avatar
+    avatar = Trainer(stand_in.rig, config).avatar
     pose, camera = views["canonical"]
     report = export_avatar(
         avatar, tmp_path / "a.iavatar", views=[(pose, camera)], metrics={}, config=coarse.quick()

@@ -1,19 +1,18 @@
-"""The operations of a training step and their operands, as every backend implements them."""
+"""The operands of the kernels (`avatar.kernels.operations`): what they read and write."""
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import numpy as np
-import torch
 from jaxtyping import Float32, Int32, Int64, UInt8
 from torch import Tensor
-
-from avatar.rig import Rig
 
 FEATURES_PER_LEVEL = 4
 """Features per entry. Fixed: the kernels are compiled for it (16 bytes are one vector)."""
 PRIMES = (1, 2654435761, 805459861)
 """Müller et al. 2022, eq. 4: h(x) = (⊕ x_i π_i) mod T."""
+MAX_LOG_DENSITY = 9.0
+"""Log density (log 1/m) at which the activation is clamped."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -156,20 +155,6 @@ class CorrespondenceTables(NamedTuple):
     cell_m: float
 
 
-class SolvedCorrespondences(NamedTuple):
-    """The correspondence grid of one frame, before `CorrespondenceGrid` names its cell size.
-
-    Attributes:
-        low: Corner of the grid, body frame, metres.
-        packed_cells: `first_row * 8 + bent * 4 + count` of each cell.
-        roots: Canonical roots and the derivatives of the warp at them.
-    """
-
-    low: Float32[np.ndarray, "3"]
-    packed_cells: Int32[np.ndarray, "gx gy gz"]
-    roots: Float32[np.ndarray, "rows 12"]
-
-
 class DensityGrid(NamedTuple):
     """Canonical occupancy: the occupied cells, and the density cached in each cell.
 
@@ -255,117 +240,3 @@ class AdamSettings(NamedTuple):
         """Factors of the mean and of the squares' root, which correct that both started at 0."""
         first, second = self.betas
         return self.rate / (1.0 - first**self.steps), (1.0 - second**self.steps) ** -0.5
-
-
-@runtime_checkable
-class Backend(Protocol):
-    """The operations of a training step, each defined by its reference in `torch_*`.
-
-    Backends leave out what is stated here: shapes, types and meanings.
-    """
-
-    name: str
-
-    def encode(self, points: Points, table: HashTable, levels: HashLevels) -> Features:
-        """Hash-grid features."""
-        ...
-
-    def encode_backward(
-        self, points: Points, grad_features: Features, levels: HashLevels, grad_table: HashTable
-    ) -> None:
-        """Adds the table's gradient to `grad_table`."""
-        ...
-
-    def encode_points_backward(
-        self, points: Points, grad_features: Features, table: HashTable, levels: HashLevels
-    ) -> Points:
-        """Gradient of the features with respect to the points."""
-        ...
-
-    def adam_step(
-        self, how: AdamSettings, grad: Tensor, mean: Tensor, square: Tensor, parameter: Tensor
-    ) -> None:
-        """Takes Adam's step on contiguous tensors, in place, and zeroes the gradient.
-
-        `mean` and `square` are the running means of the gradient and of its square.
-        """
-        ...
-
-    def solve_correspondences(
-        self,
-        rig: Rig,
-        bones: Float32[np.ndarray, "24 12"],
-        band_m: float,
-        cell_m: float,
-        device: torch.device,
-    ) -> SolvedCorrespondences:
-        """Solves the correspondence grid of a pose, given its canonical-to-body bone transforms."""
-        ...
-
-    def march(
-        self, rays: RayBatch, cells: CorrespondenceTables, grid: DensityGrid, how: MarchSettings
-    ) -> RaySamples:
-        """Canonical samples along rays."""
-        return self.march_resumable(rays, cells, grid, how)[0]
-
-    def march_resumable(
-        self, rays: RayBatch, cells: CorrespondenceTables, grid: DensityGrid, how: MarchSettings
-    ) -> tuple[RaySamples, Float32[Tensor, "rays"]]:
-        """Marches, and returns the jitter at which rays with `max_samples` samples continue."""
-        ...
-
-    def composite(self, raw: RawOutputs, samples: RaySamples, step_m: float) -> PremultipliedPixels:
-        """Premultiplied color and alpha of each ray."""
-        ...
-
-    def composite_loss(
-        self,
-        raw: RawOutputs,
-        samples: RaySamples,
-        step_m: float,
-        target: PremultipliedPixels,
-        alpha_weight: float,
-        hard_weight: float,
-    ) -> tuple[PremultipliedPixels, Float32[Tensor, "rays"], RawOutputs]:
-        """Rendering and loss of each ray, and the mean loss's gradient with respect to `raw`."""
-        ...
-
-    def mean_normals(
-        self,
-        raw: RawOutputs,
-        samples: RaySamples,
-        step_m: float,
-        slots: Int32[Tensor, "rays"],
-        cells: CorrespondenceTables,
-        volume: NormalVolume,
-    ) -> Float32[Tensor, "rays 3"]:
-        """Normals at the samples, in the body frame, composited like colors."""
-        ...
-
-    def scatter_max_density(
-        self, points: Points, log_density: Float32[Tensor, "points"], grid: DensityGrid
-    ) -> None:
-        """Raises the cached density of the samples' cells to the samples' own, in place."""
-        ...
-
-    def bone_wrenches(
-        self,
-        samples: RaySamples,
-        grad_points: Float32[Tensor, "samples 3"],
-        slots: Int32[Tensor, "rays"],
-        cells: CorrespondenceTables,
-        skin: SkinningVolume,
-        bones: Float32[Tensor, "slots 24 12"],
-    ) -> Float32[Tensor, "rays 24 6"]:
-        """Wrench that each ray's samples exert on every bone, given the gradient at the samples."""
-        ...
-
-    def update_roots(
-        self,
-        cells: CorrespondenceTables,
-        slot: int,
-        skin: SkinningVolume,
-        bones: Float32[Tensor, "24 12"],
-    ) -> None:
-        """Moves a slot's roots, in place, to follow its changed pose."""
-        ...

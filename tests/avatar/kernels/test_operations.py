@@ -1,4 +1,4 @@
-"""Compiled kernels against their plain torch meaning, and the meaning against closed forms."""
+"""Compiled kernels against plain torch, and both against closed forms."""
 
 import math
 
@@ -7,11 +7,11 @@ import pytest
 import torch
 from scipy.ndimage import distance_transform_cdt
 
-from avatar.backends import TorchBackend, backend_for
 from avatar.correspondence_grid import CorrespondenceGrid
-from avatar.kernels import torch_reference
-from avatar.kernels.backend_protocol import (
+from avatar.kernels import operations
+from avatar.kernels.operands import (
     FEATURES_PER_LEVEL,
+    MAX_LOG_DENSITY,
     CorrespondenceTables,
     DensityGrid,
     MarchSettings,
@@ -19,13 +19,9 @@ from avatar.kernels.backend_protocol import (
     RayBatch,
     RaySamples,
 )
-from avatar.kernels.numba_backend import NumbaBackend
 from avatar.occupancy_grid import OccupancyGrid
 from avatar.render import correspondence_tables
-from capture.input_error import InputError
-
-TORCH, NUMBA = TorchBackend(), NumbaBackend()
-BACKENDS = pytest.mark.parametrize("backend", [TORCH, NUMBA], ids=["torch", "numba"])
+from baselines import torch_reference
 
 
 def points_in(levels, count, generator, *, beyond=0.0):
@@ -46,12 +42,11 @@ def test_the_levels_hold_dense_and_hashed_ones(levels):
     assert (np.diff(levels.offsets)[2:] == 4096).all()
 
 
-@BACKENDS
-def test_features_at_a_vertex_of_a_dense_level_are_its_entry(backend, levels, generator):
+def test_features_at_a_vertex_of_a_dense_level_are_its_entry(levels, generator):
     table = torch.randn(levels.entries, FEATURES_PER_LEVEL, generator=generator)
     i, j, k = 3, 2, 1
     point = torch.from_numpy(levels.low) + torch.tensor([i, j, k]) / float(levels.cells_per_m[0])
-    features = backend.encode(point[None].float(), table, levels)
+    features = operations.encode(point[None].float(), table, levels)
     nx, ny, _ = levels.vertex_counts[0].tolist()
     torch.testing.assert_close(
         features[0, :FEATURES_PER_LEVEL], table[i + nx * (j + ny * k)], atol=1e-5, rtol=0
@@ -63,7 +58,7 @@ def test_compiled_encoding_agrees_with_its_meaning(levels, generator, count):
     table = torch.randn(levels.entries, FEATURES_PER_LEVEL, generator=generator)
     points = points_in(levels, count, generator, beyond=0.1)
     torch.testing.assert_close(
-        NUMBA.encode(points, table, levels), TORCH.encode(points, table, levels),
+        operations.encode(points, table, levels), torch_reference.encode(points, table, levels),
         atol=1e-4, rtol=1e-5,
     )  # fmt: skip
 
@@ -72,9 +67,10 @@ def test_compiled_encoding_agrees_with_its_meaning(levels, generator, count):
 def test_compiled_table_gradient_agrees_with_autograd(levels, generator, count):
     points = points_in(levels, count, generator)
     slope = torch.randn(count, levels.feature_width, generator=generator)
-    ours, theirs = (torch.zeros(levels.entries, FEATURES_PER_LEVEL) for _ in range(2))
-    NUMBA.encode_backward(points, slope, levels, ours)
-    TORCH.encode_backward(points, slope, levels, theirs)
+    ours = torch.zeros(levels.entries, FEATURES_PER_LEVEL)
+    operations.encode_backward(points, slope, levels, ours)
+    leaf = torch.zeros_like(ours, requires_grad=True)
+    (theirs,) = torch.autograd.grad(torch_reference.encode(points, leaf, levels), leaf, slope)
     torch.testing.assert_close(ours, theirs, atol=1e-4, rtol=1e-4)
 
 
@@ -103,18 +99,16 @@ def test_the_encodings_gradient_for_the_points_passes_gradcheck_in_double(levels
     )
 
 
-@BACKENDS
-def test_a_uniform_fog_absorbs_as_beer_and_lambert_say(backend):
+def test_a_uniform_fog_absorbs_as_beer_and_lambert_say():
     raw = torch.tensor([[50.0, -50.0, 0.0, math.log(3.0)]]).repeat(40, 1)
-    rendered = backend.composite(raw, packed([40]), 0.01)
+    rendered = operations.composite(raw, packed([40]), 0.01)
     alpha = 1.0 - math.exp(-3.0 * 0.4)
     expected = torch.tensor([[alpha, 0.0, 0.5 * alpha, alpha]])
     torch.testing.assert_close(rendered, expected, atol=1e-5, rtol=0)
 
 
-@BACKENDS
-def test_a_ray_without_samples_is_clear(backend):
-    rendered = backend.composite(torch.zeros(2, 4), packed([0, 2, 0]), 0.01)
+def test_a_ray_without_samples_is_clear():
+    rendered = operations.composite(torch.zeros(2, 4), packed([0, 2, 0]), 0.01)
     assert torch.equal(rendered[[0, 2]], torch.zeros(2, 4))
     assert rendered[1, 3] > 0
 
@@ -131,8 +125,14 @@ def loss_case(generator, counts=(5, 0, 1, 30, 17)):
 
 def test_compiled_loss_and_gradient_agree_with_autograd(generator):
     case = loss_case(generator)
-    for ours, theirs in zip(NUMBA.composite_loss(*case), TORCH.composite_loss(*case), strict=True):
-        torch.testing.assert_close(ours, theirs, atol=1e-6, rtol=1e-4)
+    raw, samples, step_m, *rest = case
+    leaf = raw.clone().requires_grad_()
+    rendered = torch_reference.composite(leaf, samples.offsets, samples.counts, step_m)
+    loss = torch_reference.loss_per_ray(rendered, *rest)
+    expected = rendered, loss, *torch.autograd.grad(loss.mean(), leaf)
+    for ours, theirs in zip(operations.composite_loss(*case), expected, strict=True):
+        torch.testing.assert_close(ours, theirs.detach(), atol=1e-6, rtol=1e-4)
+    torch.testing.assert_close(operations.composite(raw, samples, step_m), rendered.detach())
 
 
 def test_compiled_normals_agree_with_their_meaning_and_lie_on_rays_that_see_something(generator):
@@ -150,12 +150,12 @@ def test_compiled_normals_agree_with_their_meaning_and_lie_on_rays_that_see_some
     )
     slots = torch.tensor([0, 0, 1, 1, 1], dtype=torch.int32)
     ours, theirs = (
-        backend.mean_normals(raw, samples, step_m, slots, cells, volume)
-        for backend in (NUMBA, TORCH)
+        module.mean_normals(raw, samples, step_m, slots, cells, volume)
+        for module in (operations, torch_reference)
     )
     torch.testing.assert_close(ours, theirs, atol=1e-5, rtol=1e-4)
     assert not ours[1].any()
-    assert (ours.norm(dim=1) <= TORCH.composite(raw, samples, step_m)[:, 3] + 1e-5).all()
+    assert (ours.norm(dim=1) <= operations.composite(raw, samples, step_m)[:, 3] + 1e-5).all()
     assert ours[0].any()
 
 
@@ -168,15 +168,14 @@ def test_the_gradient_of_the_loss_is_exact_to_a_millionth_however_opaque_a_ray(g
     rendered = torch_reference.composite(leaf, samples.offsets, samples.counts, step_m)
     loss = torch_reference.loss_per_ray(rendered, target.double(), *weights)
     (expected,) = torch.autograd.grad(loss.mean(), leaf)
-    grad = NUMBA.composite_loss(raw, samples, *rest)[2]
+    grad = operations.composite_loss(raw, samples, *rest)[2]
     assert float((grad - expected).abs().max()) <= 2e-6 * float(expected.abs().max())
 
 
 def test_the_density_of_a_saturated_sample_has_no_gradient(generator):
     raw, *rest = loss_case(generator)
-    raw[3, 3] = torch_reference.MAX_LOG_DENSITY + 1.0
-    for backend in (NUMBA, TORCH):
-        assert backend.composite_loss(raw, *rest)[2][3, 3] == 0.0
+    raw[3, 3] = MAX_LOG_DENSITY + 1.0
+    assert operations.composite_loss(raw, *rest)[2][3, 3] == 0.0
 
 
 def test_the_meaning_of_the_loss_passes_gradcheck_in_double(generator):
@@ -195,11 +194,11 @@ def scene(rig):
     rotations = np.zeros((23, 3))
     rotations[15, 2], rotations[16, 2], rotations[17, 1] = -1.0, 0.8, -0.8
     generator = torch.Generator().manual_seed(1)
-    grid = OccupancyGrid(rig, torch.device("cpu")).density_grid
+    grid = OccupancyGrid(rig).density_grid
     distance = torch.from_numpy(rig.skin_distance)
     grid.density.copy_(torch.where(distance < 0.02, 400.0, 0.5) * (distance < 0.05))
     grid.occupied.copy_((distance < 0.05).to(torch.uint8))
-    cells = correspondence_tables(CorrespondenceGrid.solve(rig, rotations), torch.device("cpu"))
+    cells = correspondence_tables(CorrespondenceGrid.solve(rig, rotations))
     origins = torch.randn(300, 3, generator=generator)
     origins = torch.nn.functional.normalize(origins, dim=1) * 3.0
     aim = torch.rand(300, 3, generator=generator) * torch.tensor([0.8, 1.6, 0.3])
@@ -214,7 +213,7 @@ def scene(rig):
 @pytest.mark.parametrize("grace_m", [0.06, math.inf], ids=["training", "exact"])
 def test_compiled_marching_agrees_with_its_meaning(scene, grace_m):
     how = MarchSettings(0.01, grace_m, 96)
-    ours, theirs = NUMBA.march(*scene, how), TORCH.march(*scene, how)
+    ours, (theirs, _) = operations.march(*scene, how), torch_reference.march(*scene, how)
     agree = ours.counts == theirs.counts
     assert agree.float().mean() > 0.97  # a lattice point on a wall may fall on either side
     assert int(ours.counts.sum()) > 2000
@@ -223,15 +222,16 @@ def test_compiled_marching_agrees_with_its_meaning(scene, grace_m):
     assert float((off < 1e-3).float().mean()) > 0.995
 
 
-@BACKENDS
-def test_a_ray_that_stops_goes_on_where_it_was(scene, backend):
+def test_a_ray_that_stops_goes_on_where_it_was(scene):
     """Seven samples at a time are, one after the other, those of the whole ray."""
     rays, cells, grid = scene
-    whole = backend.march(rays, cells, grid, MarchSettings(0.01, math.inf, 512))
+    whole = operations.march(rays, cells, grid, MarchSettings(0.01, math.inf, 512))
     parts = [[] for _ in rays.slots]
     alive = torch.arange(len(rays.slots))
     while len(alive):
-        some, jitter = backend.march_resumable(rays, cells, grid, MarchSettings(0.01, math.inf, 7))
+        some, jitter = operations.march_resumable(
+            rays, cells, grid, MarchSettings(0.01, math.inf, 7)
+        )
         for ray, points in zip(alive, some.points.split(some.counts.tolist()), strict=True):
             parts[ray].append(points)
         on = some.counts == 7
@@ -244,8 +244,7 @@ def test_a_ray_that_stops_goes_on_where_it_was(scene, backend):
     )
 
 
-@BACKENDS
-def test_what_an_empty_cell_says_of_those_about_it_changes_no_sample(scene, backend):
+def test_what_an_empty_cell_says_of_those_about_it_changes_no_sample(scene):
     rays, cells, grid = scene
     shape = tuple(cells.shape[0].tolist())
     index = cells.packed_cells.numpy().reshape(shape)
@@ -257,58 +256,42 @@ def test_what_an_empty_cell_says_of_those_about_it_changes_no_sample(scene, back
     )
     assert int(told.packed_cells.min()) < -3
     how = MarchSettings(0.01, math.inf, 512)
-    ours, plain = backend.march(rays, told, grid, how), backend.march(rays, cells, grid, how)
+    ours, plain = operations.march(rays, told, grid, how), operations.march(rays, cells, grid, how)
     assert torch.equal(ours.points, plain.points)
     assert torch.equal(ours.counts, plain.counts)
 
 
-@BACKENDS
-def test_rays_that_miss_have_no_samples(scene, backend):
+def test_rays_that_miss_have_no_samples(scene):
     rays, cells, grid = scene
     away = rays._replace(directions=-rays.directions)
-    assert int(backend.march(away, cells, grid, MarchSettings(0.01, 0.06, 96)).counts.sum()) == 0
+    assert int(operations.march(away, cells, grid, MarchSettings(0.01, 0.06, 96)).counts.sum()) == 0
 
 
-@BACKENDS
-def test_nothing_is_sampled_where_nothing_is_occupied(scene, backend):
+def test_nothing_is_sampled_where_nothing_is_occupied(scene):
     rays, cells, grid = scene
     empty = DensityGrid(torch.zeros_like(grid.occupied), *grid[1:])
-    assert int(backend.march(rays, cells, empty, MarchSettings(0.01, 0.06, 96)).counts.sum()) == 0
+    assert (
+        int(operations.march(rays, cells, empty, MarchSettings(0.01, 0.06, 96)).counts.sum()) == 0
+    )
 
 
-@BACKENDS
-def test_a_ray_is_followed_for_its_grace_in_metres_whatever_the_step(scene, backend):
+def test_a_ray_is_followed_for_its_grace_in_metres_whatever_the_step(scene):
     """A grace counted in samples shrinks with the step and cuts grazing rays: it cost 6 dB."""
     rays, cells, grid = scene
     solid = grid._replace(density=torch.full_like(grid.density, 1e6))
     for step_m in (0.02, 0.01, 0.005):
-        count = backend.march(rays, cells, solid, MarchSettings(step_m, 0.06, 512)).counts
+        count = operations.march(rays, cells, solid, MarchSettings(step_m, 0.06, 512)).counts
         assert int(count.max()) * step_m == pytest.approx(0.06, abs=2.1 * step_m)
 
 
-@BACKENDS
-def test_densities_only_rise_and_to_the_highest_sample(scene, backend):
+def test_densities_only_rise_and_to_the_highest_sample(scene):
     grid = scene[2]._replace(density=torch.full_like(scene[2].density, 2.0))
     low, scale = grid.low, grid.cells_per_m
     here = low + (torch.tensor([[4.3, 5.2, 6.9], [4.9, 5.9, 6.1], [7.5, 7.5, 7.5]])) / scale
     outside = low - 1.0
     points = torch.cat([here, outside[None]]).float()
     log_density = torch.tensor([3.0, 2.0, -1.0, 5.0])
-    backend.scatter_max_density(points, log_density, grid)
+    operations.scatter_max_density(points, log_density, grid)
     assert float(grid.density[4, 5, 6]) == pytest.approx(math.exp(3.0), rel=1e-5)
     assert float(grid.density[7, 7, 7]) == 2.0
     assert int((grid.density != 2.0).sum()) == 1
-
-
-def test_the_backend_can_be_forced(monkeypatch):
-    cpu = torch.device("cpu")
-    monkeypatch.delenv("IA_BACKEND", raising=False)
-    assert backend_for(cpu).name == "numba"
-    monkeypatch.setenv("IA_BACKEND", "torch")
-    assert backend_for(cpu).name == "torch"
-    monkeypatch.setenv("IA_BACKEND", "abacus")
-    with pytest.raises(InputError, match="abacus"):
-        backend_for(cpu)
-    monkeypatch.setenv("IA_BACKEND", "numba")
-    with pytest.raises(InputError, match="on the CPU only"):
-        backend_for(torch.device("cuda"))

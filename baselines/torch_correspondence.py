@@ -1,18 +1,24 @@
-"""Reference of skinning, its inverse, correspondence grids and pose refinement, in plain torch."""
+"""Skinning, its inverse, correspondence grids and the gradient of poses in plain torch.
+
+The oracle of the compiled kernels (`avatar.kernels.operations`), like `baselines.torch_reference`.
+"""
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Int32
 from torch import Tensor
 
-from avatar.kernels.backend_protocol import (
-    CorrespondenceTables,
-    RaySamples,
-    SkinningVolume,
-    SolvedCorrespondences,
+from avatar.kernels.numba_correspondence import (
+    MAX_ROOTS,
+    MIN_SECOND_ORDER_M,
+    PROBE_DISTANCE_CELLS,
+    SAME_ROOT_M,
 )
-from avatar.kernels.torch_reference import root_row
+from avatar.kernels.numba_pose import MAX_ROOT_STEP_M
+from avatar.kernels.numba_skinning import MAX_PROBE_CORRECTION_M
+from avatar.kernels.operands import CorrespondenceTables, RaySamples, SkinningVolume
 from avatar.rig import Rig
+from baselines.torch_reference import root_row
 
 
 def interpolate_volume(
@@ -22,7 +28,7 @@ def interpolate_volume(
     nodes_per_m: Float[Tensor, "3"],
 ) -> Float[Tensor, "points channels"]:
     """Trilinear skinning weights at canonical points; the border's outside."""
-    last = torch.tensor(weights.shape[:3], device=points.device) - 1
+    last = torch.tensor(weights.shape[:3]) - 1
     place = ((points - low) * nodes_per_m / last * 2.0 - 1.0).flip(-1)[None, :, None, None]
     volume = weights.permute(3, 0, 1, 2)[None]
     read = torch.nn.functional.grid_sample(
@@ -80,10 +86,6 @@ def broyden_roots(
     return x, error.norm(dim=-1) <= 2.0 * tolerance_m
 
 
-MAX_ROOT_STEP_M = 0.05
-"""A root never moves farther than this at once: where the chord is longer the warp has a fold."""
-
-
 def bone_wrenches(
     samples: RaySamples,
     grad_points: Float32[Tensor, "samples 3"],
@@ -97,7 +99,7 @@ def bone_wrenches(
     The loss pulls the canonical point with g_x, so it pulls the posed one with g = J⁻ᵀ g_x; a bone
     of weight w takes the force w g and, about the body frame's origin, the moment w (B x) × g.
     """
-    ray = torch.arange(len(slots), device=slots.device).repeat_interleave(samples.counts)
+    ray = torch.arange(len(slots)).repeat_interleave(samples.counts)
     slot = slots[ray].long()
     roots = cells.roots[slot, samples.root_rows.long()]
     force = (roots[:, 3:].unflatten(1, (3, 3)).mT @ grad_points[..., None])[:, None, :, 0]
@@ -131,18 +133,8 @@ def update_roots(
         roots[row, :3] = torch.where(moves[:, None], x + step, x)
 
 
-MAX_ROOTS = 3
-"""Largest number of roots of a cell; two bits hold it."""
-SAME_ROOT_M = 0.02
-"""Distance below which two roots of a cell are the same, metres."""
 SEARCHES_PER_CELL = 4
 """Body parts, nearest first, from which roots of a cell are searched."""
-PROBE_DISTANCE_CELLS = 0.375
-"""Distance of the probes from a cell's center, in cells: three quarters of the way to a face."""
-MIN_SECOND_ORDER_M = 5e-4
-"""Deviation from an affine warp, at a cell's faces, from which the cell is bent, metres."""
-MAX_PROBE_CORRECTION_M = 0.03
-"""Largest motion of a probe, metres; one that would move farther lies beyond a fold and stays."""
 FINITE_DIFFERENCE_M = 5e-3
 """Step of the finite differences of the skinning transforms, metres."""
 FACES = [(i, 0, 0) for i in (1, -1)] + [(0, i, 0) for i in (1, -1)] + [(0, 0, i) for i in (1, -1)]
@@ -157,16 +149,15 @@ SkinningTensors = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 def solve_correspondences(
-    rig: Rig, bones: Float32[np.ndarray, "24 12"], band_m: float, cell_m: float,
-    device: torch.device,
-) -> SolvedCorrespondences:  # fmt: skip
+    rig: Rig, bones: Float32[np.ndarray, "24 12"], band_m: float, cell_m: float
+) -> tuple[Float32[np.ndarray, "3"], Int32[np.ndarray, "gx gy gz"], Float32[np.ndarray, "rows 12"]]:
     """Correspondence grid of one pose.
 
     A cell's roots are those that Broyden's method finds from the nearest seed of each of the four
     nearest body parts, if they are no farther from the canonical skin than the band.
     """
     weights, box_low, nodes_per_m, matrices, seeds, parts, distance, cells_per_m = (
-        torch.from_numpy(part).to(device)
+        torch.from_numpy(part)
         for part in (
             rig.weights, rig.box_low, rig.nodes_per_m, bones,
             rig.seeds, rig.seed_parts, rig.skin_distance, rig.cells_per_m,
@@ -176,11 +167,11 @@ def solve_correspondences(
     posed = skin_points(seeds, *volume)
     low = posed.amin(dim=0) - band_m
     shape = torch.ceil((posed.amax(dim=0) + band_m - low) / cell_m).long().tolist()
-    axes = [torch.arange(n, device=seeds.device) for n in shape]
+    axes = [torch.arange(n) for n in shape]
     center = low + (torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1) + 0.5) * cell_m
     center = center.reshape(-1, 3)
     start, near = _search_starts(center, posed, parts, band_m + 0.012 + 0.6 * cell_m)
-    root = torch.zeros(*near.shape, 3, device=seeds.device)
+    root = torch.zeros(*near.shape, 3)
     kept = torch.zeros_like(near)
     cell, rank = near.nonzero(as_tuple=True)
     seed = start[cell, rank]
@@ -194,9 +185,7 @@ def solve_correspondences(
     cell, rank = kept.nonzero(as_tuple=True)
     warp, bent = taylor_expansion(root[cell, rank], center[cell], volume, cell_m)
     index, roots = _pack_cells(cell, warp, bent, len(center))
-    return SolvedCorrespondences(
-        *(part.cpu().numpy() for part in (low, index.reshape(shape), roots))
-    )
+    return low.numpy(), index.reshape(shape).numpy(), roots.numpy()
 
 
 def _search_starts(
@@ -225,7 +214,7 @@ def skin_distance_at(
     cells_per_m: Float[Tensor, "3"],
 ) -> Float[Tensor, "points"]:
     """Distance from the canonical skin of the cells that hold canonical points; 1 m outside."""
-    shape = torch.tensor(distance.shape, device=points.device)
+    shape = torch.tensor(distance.shape)
     cell = torch.floor((points - low) * cells_per_m).long()
     inside = ((cell >= 0) & (cell < shape)).all(dim=1)
     x, y, z = torch.minimum(cell.clamp(min=0), shape - 1).unbind(dim=1)
@@ -259,7 +248,7 @@ def taylor_expansion(
     Returns:
         x, A row by row, then c_xx c_yy c_zz c_xy c_xz c_yz, 0 where the warp is straight.
     """
-    axes = torch.eye(3, device=root.device) * FINITE_DIFFERENCE_M
+    axes = torch.eye(3) * FINITE_DIFFERENCE_M
     ahead = torch.stack([skin_points(root + step, *volume) for step in axes], dim=2)
     behind = torch.stack([skin_points(root - step, *volume) for step in axes], dim=2)
     inverse = torch.linalg.inv((ahead - behind) / (2.0 * FINITE_DIFFERENCE_M))
@@ -267,7 +256,7 @@ def taylor_expansion(
     root = root + _limited_step((inverse @ off[..., None])[..., 0])
     slope, square = _face_differences(root, center, inverse, volume, PROBE_DISTANCE_CELLS * cell_m)
     bent = square.flatten(1).norm(dim=1) * 0.25 * cell_m**2 > MIN_SECOND_ORDER_M
-    coefficients = torch.zeros(len(root), 6, 3, device=root.device)
+    coefficients = torch.zeros(len(root), 6, 3)
     slope[bent], coefficients[bent] = _second_order_expansion(
         root[bent], center[bent], slope[bent], volume, PROBE_DISTANCE_CELLS * cell_m
     )
@@ -283,7 +272,7 @@ def _second_order_expansion(
 ) -> tuple[Float[Tensor, "roots 3 3"], Float[Tensor, "roots 6 3"]]:
     """A and c_ij, from the faces with the inverse Jacobian found there, and from the corners."""
     slope, square = _face_differences(root, center, inverse, volume, t)
-    sign = torch.tensor(CORNERS, dtype=root.dtype, device=root.device)
+    sign = torch.tensor(CORNERS, dtype=root.dtype)
     u = torch.stack([_probe_root(root, center, inverse, t * way, volume) for way in sign], dim=1)
     slope = 0.5 * (slope + torch.einsum("rkc,ka->rca", u, sign) / (8.0 * t))
     mean = u.mean(dim=1) / t**2
@@ -301,7 +290,7 @@ def _face_differences(
     t: float,
 ) -> tuple[Float[Tensor, "roots 3 3"], Float[Tensor, "roots 3 3"]]:
     """A, and c_xx, c_yy, c_zz one below the other."""
-    sign = torch.tensor(FACES, dtype=root.dtype, device=root.device)
+    sign = torch.tensor(FACES, dtype=root.dtype)
     u = torch.stack([_probe_root(root, center, inverse, t * way, volume) for way in sign], dim=1)
     ahead, behind = u[:, 0::2], u[:, 1::2]
     return ((ahead - behind) / (2.0 * t)).mT, (ahead + behind) / (2.0 * t**2)
@@ -329,14 +318,14 @@ def _pack_cells(
 ) -> tuple[Int32[Tensor, "cells"], Float[Tensor, "rows 12"]]:
     """Flat `CorrespondenceGrid.packed_cells`, and `.roots`, of roots in the cells' order."""
     count = torch.bincount(cell, minlength=cells)
-    bends = torch.zeros(cells, dtype=torch.bool, device=cell.device)
+    bends = torch.zeros(cells, dtype=torch.bool)
     bends[cell[bent]] = True
     rows = torch.where(bends, 3 * count, count)
     first = rows.cumsum(0) - rows + 1  # row 0 stays unused, so that no packed index is 0
     index = torch.where(count > 0, first * 8 + 4 * bends + count, 0)
-    rank = torch.arange(len(cell), device=cell.device) - (count.cumsum(0) - count)[cell]
+    rank = torch.arange(len(cell)) - (count.cumsum(0) - count)[cell]
     row = first[cell] + rank * torch.where(bends[cell], 3, 1)
-    roots = torch.zeros(int(rows.sum()) + 1, 12, device=warp.device)
+    roots = torch.zeros(int(rows.sum()) + 1, 12)
     roots[row] = warp[:, :12]
     long = bends[cell]
     roots[row[long] + 1], roots[row[long] + 2, :6] = warp[long, 12:24], warp[long, 24:]

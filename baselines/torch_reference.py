@@ -1,6 +1,7 @@
-"""Reference of every operation of a training step, in plain differentiable torch.
+"""Ray marching, hash grid, volume rendering and losses in plain, differentiable torch.
 
-The compiled kernels must agree with it; devices without compiled kernels run it.
+The oracle of the compiled kernels (`avatar.kernels.operations`): their constants, and the formulas
+as the papers have them. The paper's training step (`instant_avatar.autograd_steps`) is built on it.
 """
 
 import math
@@ -9,9 +10,17 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int32, Int64
 from torch import Tensor
 
-from avatar.kernels.backend_protocol import (
+from avatar.kernels.numba_rendering import (
+    ALPHA_DEAD_ZONE,
+    BRIGHT_GRAY,
+    COLOR_HUBER_DELTA,
+    DARK_GRAY,
+    OPAQUE_DEPTH,
+)
+from avatar.kernels.numba_shading import MIN_NORMAL_WEIGHT
+from avatar.kernels.operands import (
+    MAX_LOG_DENSITY,
     PRIMES,
-    AdamSettings,
     CorrespondenceTables,
     DensityGrid,
     HashLevels,
@@ -20,19 +29,6 @@ from avatar.kernels.backend_protocol import (
     RayBatch,
     RaySamples,
 )
-
-MAX_LOG_DENSITY = 9.0
-"""Log density (log 1/m) at which the activation is clamped."""
-COLOR_HUBER_DELTA = 0.1
-"""Color error at which the Huber loss turns from quadratic to linear."""
-DARK_GRAY, BRIGHT_GRAY = 0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0)
-"""Backgrounds: the mean loss over both is that over all grays in [0, 1] (Gauss), if quadratic."""
-ALPHA_DEAD_ZONE = 1e-3
-"""Error of alpha up to which the L1 loss on alpha is zero."""
-OPAQUE_DEPTH = 12.0
-"""Optical depth, by cached densities, at which a training ray counts as opaque."""
-MIN_NORMAL_WEIGHT = 1e-3
-"""Weight of a sample in its ray up to which its normal does not count."""
 
 
 def encode(
@@ -47,10 +43,9 @@ def encode(
         table: Entries of all levels.
         levels: Where they lie.
     """
-    device = points.device
     features = []
     for level in range(len(levels.cells_per_m)):
-        counts = torch.from_numpy(levels.vertex_counts[level]).to(device).long()
+        counts = torch.from_numpy(levels.vertex_counts[level]).long()
         scaled = (points - torch.from_numpy(levels.low).to(points)) * float(
             levels.cells_per_m[level]
         )
@@ -58,7 +53,7 @@ def encode(
         within = scaled - cell
         total = 0.0
         for corner in range(8):
-            offset = torch.tensor([corner & 1, corner >> 1 & 1, corner >> 2 & 1], device=device)
+            offset = torch.tensor([corner & 1, corner >> 1 & 1, corner >> 2 & 1])
             weight = torch.where(offset.bool(), within, 1.0 - within).prod(dim=-1)
             entries = _table_entries(cell + offset, levels, level)
             total = total + weight[:, None] * table.index_select(0, entries)
@@ -78,18 +73,6 @@ def _table_entries(
     return first + (hashed & (last - first - 1))
 
 
-def adam_step(
-    how: AdamSettings, grad: Tensor, mean: Tensor, square: Tensor, parameter: Tensor
-) -> None:
-    """Adam's step, in place (Kingma and Ba 2015, algorithm 1); the gradient is zeroed."""
-    (first, second), (rate, scale) = how.betas, how.scales
-    with torch.no_grad():
-        mean.lerp_(grad, 1.0 - first)
-        square.mul_(second).addcmul_(grad, grad, value=1.0 - second)
-        parameter.addcdiv_(mean, square.sqrt().mul_(scale).add_(how.eps), value=-rate)
-        grad.zero_()
-
-
 def activate(
     raw: Float[Tensor, "samples 4"],
 ) -> tuple[Float[Tensor, "samples 3"], Float[Tensor, "samples"]]:
@@ -105,7 +88,7 @@ def composite(
 ) -> Float[Tensor, "rays 4"]:
     """Premultiplied color Σ T_i α_i c_i and alpha 1 - Π (1 - α_i) (InstantAvatar, eq. 4)."""
     most = max(int(counts.max()) if len(counts) else 0, 1)
-    order = torch.arange(most, device=raw.device)
+    order = torch.arange(most)
     held = order < counts[:, None]
     color, density = activate(torch.cat([raw, raw.new_zeros(1, 4)]))
     index = torch.where(held, offsets[:, None] + order, len(raw))
@@ -128,7 +111,7 @@ def mean_normals(
     volume: NormalVolume,
 ) -> Float32[Tensor, "rays 3"]:
     """Mean normal of what each ray sees, Σ T_i α_i n_i; n is that of the skin, warped."""
-    last = torch.tensor(volume.normals.shape[:3], device=raw.device) - 1
+    last = torch.tensor(volume.normals.shape[:3]) - 1
     cell = ((samples.points - volume.low) * volume.cells_per_m).long().clamp(min=0)
     normals = volume.normals[torch.minimum(cell, last).unbind(dim=1)]
     slot = torch.repeat_interleave(slots.long(), samples.counts.long())
@@ -136,7 +119,7 @@ def mean_normals(
     normals = torch.nn.functional.normalize((warp * normals[:, :, None]).sum(dim=1), dim=1)
     optical = torch.exp(raw[:, 3].double().clamp(max=MAX_LOG_DENSITY)) * step_m
     until = torch.cumsum(optical, dim=0)
-    ray = torch.arange(len(slots), device=raw.device).repeat_interleave(samples.counts)
+    ray = torch.arange(len(slots)).repeat_interleave(samples.counts)
     before = until - optical
     before = before - torch.cat([before, before.new_zeros(1)])[samples.offsets][ray]
     weight = torch.exp(-before) * (1.0 - torch.exp(-optical))
@@ -194,7 +177,7 @@ def march(
     enter = torch.minimum(near, far).amax(dim=1).clamp(min=0.0)
     leave = torch.maximum(near, far).amin(dim=1)
     steps = math.ceil(max(float((leave - enter).max()), 0.0) / sample_step_m) + 1
-    t = enter[:, None] + (torch.arange(steps, device=slot.device) + jitter[:, None]) * sample_step_m
+    t = enter[:, None] + (torch.arange(steps) + jitter[:, None]) * sample_step_m
     inside = t < leave[:, None]
     position = origins[:, None] + t[..., None] * directions[:, None]
     local = position - cell_low[slot][:, None]
@@ -221,7 +204,7 @@ def march(
     counted = (opaque & kept).int()
     kept &= torch.cumsum(counted, dim=1) - counted <= how.opaque_margin_steps
     kept &= torch.cumsum(kept.int(), dim=1) <= how.max_samples
-    after = torch.arange(1, steps + 1, device=slot.device) * kept
+    after = torch.arange(1, steps + 1) * kept
     count = kept.sum(dim=1).int()
     samples = RaySamples(points[kept], torch.cumsum(count, 0) - count, count, rows[kept].int())
     return samples, jitter + after.amax(dim=1).int()
@@ -258,7 +241,7 @@ def _cached_density(
     points: Float32[Tensor, "rays steps 3"], grid: DensityGrid
 ) -> tuple[Float32[Tensor, "rays steps"], Bool[Tensor, "rays steps"]]:
     """Cached density of the canonical cells that hold the points, and which are occupied."""
-    shape = torch.tensor(grid.occupied.shape, device=points.device)
+    shape = torch.tensor(grid.occupied.shape)
     cell = torch.floor((points - grid.low) * grid.cells_per_m).long()
     inside = ((cell >= 0) & (cell < shape)).all(dim=-1)
     x, y, z = torch.minimum(cell.clamp(min=0), shape - 1).unbind(dim=-1)
@@ -269,7 +252,7 @@ def scatter_max_density(
     points: Float32[Tensor, "points 3"], log_density: Float32[Tensor, "points"], grid: DensityGrid
 ) -> None:
     """Raises, in place, the cached density of each sample's cell to the sample's own."""
-    shape = torch.tensor(grid.density.shape, device=points.device)
+    shape = torch.tensor(grid.density.shape)
     cell = ((points - grid.low) * grid.cells_per_m).long()
     inside = ((cell >= 0) & (cell < shape)).all(dim=1)
     x, y, z = cell[inside].unbind(dim=1)

@@ -1,0 +1,263 @@
+"""The operations of a training step: one function each, which runs a compiled kernel on the CPU.
+
+Shapes and meanings are stated here; the kernels (`numba_*`) take plain arrays. Kernels for a
+graphics card would be a second module of these functions. Only the trainer's thread may call them,
+except for the serial `solve_correspondences`. `baselines.torch_reference` and
+`baselines.torch_correspondence` say the same in plain torch, and a test compares both.
+"""
+
+import threading
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Int32, Int64
+from torch import Tensor
+
+from avatar.kernels import (
+    numba_correspondence,
+    numba_hash_grid,
+    numba_pose,
+    numba_rendering,
+    numba_shading,
+)
+from avatar.kernels.operands import (
+    AdamSettings,
+    CorrespondenceTables,
+    DensityGrid,
+    Features,
+    HashLevels,
+    HashTable,
+    MarchSettings,
+    NormalVolume,
+    Points,
+    PremultipliedPixels,
+    RawOutputs,
+    RayBatch,
+    RaySamples,
+    SkinningVolume,
+)
+from avatar.rig import Rig
+
+_SCRATCH = threading.local()
+MAX_REUSED_SAMPLES = 1 << 20
+"""Room for more samples than this is given back at once."""
+
+
+def encode(points: Points, table: HashTable, levels: HashLevels) -> Features:
+    """Hash-grid features."""
+    features = torch.empty(len(points), levels.feature_width)
+    numba_hash_grid.encode(
+        points.numpy(), *_level_arrays(levels), table.detach().numpy(), features.numpy()
+    )
+    return features
+
+
+def encode_backward(
+    points: Points, grad_features: Features, levels: HashLevels, grad_table: HashTable
+) -> None:
+    """Adds the table's gradient to `grad_table`."""
+    numba_hash_grid.encode_backward(
+        points.numpy(), *_level_arrays(levels), grad_features.numpy(), grad_table.numpy()
+    )
+
+
+def encode_points_backward(
+    points: Points, grad_features: Features, table: HashTable, levels: HashLevels
+) -> Points:
+    """Gradient of the features with respect to the points."""
+    grad = torch.empty_like(points)
+    numba_hash_grid.encode_points_backward(
+        points.numpy(), *_level_arrays(levels), table.detach().numpy(), grad_features.numpy(),
+        grad.numpy(),
+    )  # fmt: skip
+    return grad
+
+
+def _level_arrays(
+    levels: HashLevels,
+) -> tuple[
+    Float32[np.ndarray, "3"],
+    Float32[np.ndarray, "levels"],
+    Int32[np.ndarray, "levels 3"],
+    Int32[np.ndarray, "levels"],
+    Int64[np.ndarray, "levels+1"],
+]:
+    return levels.low, levels.cells_per_m, levels.vertex_counts, levels.is_dense, levels.offsets
+
+
+def adam_step(
+    how: AdamSettings, grad: Tensor, mean: Tensor, square: Tensor, parameter: Tensor
+) -> None:
+    """Takes Adam's step on contiguous tensors, in place, and zeroes the gradient.
+
+    `mean` and `square` are the running means of the gradient and of its square.
+    """
+    (first, second), (rate, scale) = how.betas, how.scales
+    numba_hash_grid.adam_step(
+        *(part.detach().view(-1).numpy() for part in (grad, mean, square, parameter)),
+        *map(np.float32, (rate, 1.0 - first, 1.0 - second, scale, how.eps)),
+    )
+
+
+def solve_correspondences(
+    rig: Rig, bones: Float32[np.ndarray, "24 12"], band_m: float, cell_m: float
+) -> tuple[Float32[np.ndarray, "3"], Int32[np.ndarray, "gx gy gz"], Float32[np.ndarray, "rows 12"]]:
+    """Corner, packed cells and roots of a pose's `CorrespondenceGrid`.
+
+    Args:
+        rig: Rig of the person.
+        bones: Body-from-canonical transforms.
+        band_m: Distance from the skin that is covered, metres.
+        cell_m: Edge of a cell, metres.
+    """
+    return numba_correspondence.solve_correspondences(rig, bones, band_m, cell_m)
+
+
+def march(
+    rays: RayBatch, cells: CorrespondenceTables, grid: DensityGrid, how: MarchSettings
+) -> RaySamples:
+    """Canonical samples along rays."""
+    return march_resumable(rays, cells, grid, how)[0]
+
+
+def march_resumable(
+    rays: RayBatch, cells: CorrespondenceTables, grid: DensityGrid, how: MarchSettings
+) -> tuple[RaySamples, Float32[Tensor, "rays"]]:
+    """Marches, and returns the jitter at which rays with `max_samples` samples continue."""
+    padded, padded_rows = _scratch_samples(len(rays.slots), how.max_samples)
+    count, reached = torch.empty(2, len(rays.slots), dtype=torch.int32)
+    first = torch.empty(len(rays.slots), dtype=torch.int64)
+    numba_rendering.march(
+        *(part.numpy() for part in rays), np.float32(how.sample_step_m),
+        *(part.numpy() for part in cells[:4]), np.float32(cells.cell_m),
+        *(part.numpy() for part in grid), how.opaque_margin_steps, padded, padded_rows,
+        count.numpy(), reached.numpy(),
+    )  # fmt: skip
+    total = numba_rendering.prefix_sum(count.numpy(), first.numpy())
+    points, rows = torch.empty(total, 3), torch.empty(total, dtype=torch.int32)
+    numba_rendering.pack_samples(
+        padded, padded_rows, first.numpy(), count.numpy(), points.numpy(), rows.numpy()
+    )
+    return RaySamples(points, first, count, rows), rays.jitter + reached
+
+
+def _scratch_samples(
+    rays: int, max_samples: int
+) -> tuple[Float32[np.ndarray, "rays most 3"], Int32[np.ndarray, "rays most"]]:
+    """Room for the samples of rays before they are packed; what a thread asked for last, if small.
+
+    Fresh memory costs a page fault for every 4 KiB: a third of a march of one-sample rays.
+    """
+    key, room = getattr(_SCRATCH, "room", (None, None))
+    if room is None or key != (rays, max_samples):
+        room = (
+            np.empty((rays, max_samples, 3), dtype=np.float32),
+            np.empty((rays, max_samples), dtype=np.int32),
+        )
+        _SCRATCH.room = (
+            ((rays, max_samples), room)
+            if rays * max_samples <= MAX_REUSED_SAMPLES
+            else (None, None)
+        )
+    return room
+
+
+def composite(raw: RawOutputs, samples: RaySamples, step_m: float) -> PremultipliedPixels:
+    """Premultiplied color and alpha of each ray."""
+    rendered = torch.empty(len(samples.counts), 4)
+    numba_rendering.composite(
+        raw.numpy(), samples.offsets.numpy(), samples.counts.numpy(), np.float32(step_m),
+        rendered.numpy(),
+    )  # fmt: skip
+    return rendered
+
+
+def composite_loss(
+    raw: RawOutputs,
+    samples: RaySamples,
+    step_m: float,
+    target: PremultipliedPixels,
+    alpha_weight: float,
+    hard_weight: float,
+) -> tuple[PremultipliedPixels, Float32[Tensor, "rays"], RawOutputs]:
+    """Rendering and loss of each ray, and the mean loss's gradient with respect to `raw`.
+
+    The losses are InstantAvatar's (§3.4): Huber on color, L1 on alpha, hard surface.
+    """
+    rendered, loss = torch.empty(len(samples.counts), 4), torch.empty(len(samples.counts))
+    grad = torch.empty_like(raw)
+    numba_rendering.composite_loss(
+        raw.numpy(), samples.offsets.numpy(), samples.counts.numpy(), np.float32(step_m),
+        target.numpy(), np.float32(alpha_weight), np.float32(hard_weight),
+        rendered.numpy(), loss.numpy(), grad.numpy(),
+    )  # fmt: skip
+    return rendered, loss, grad
+
+
+def mean_normals(
+    raw: RawOutputs,
+    samples: RaySamples,
+    step_m: float,
+    slots: Int32[Tensor, "rays"],
+    cells: CorrespondenceTables,
+    volume: NormalVolume,
+) -> Float32[Tensor, "rays 3"]:
+    """Normals at the samples, in the body frame, composited like colors."""
+    mean = torch.empty(len(slots), 3)
+    numba_shading.mean_normals(
+        raw.numpy(), samples.points.numpy(), samples.offsets.numpy(), samples.counts.numpy(),
+        samples.root_rows.numpy(), slots.numpy(), cells.roots.numpy(), np.float32(step_m),
+        *(part.numpy() for part in volume), mean.numpy(),
+    )  # fmt: skip
+    return mean
+
+
+def scatter_max_density(
+    points: Points, log_density: Float32[Tensor, "points"], grid: DensityGrid
+) -> None:
+    """Raises the cached density of the samples' cells to the samples' own, in place."""
+    numba_rendering.scatter_max_density(
+        points.numpy(), log_density.numpy(), grid.low.numpy(), grid.cells_per_m.numpy(),
+        grid.density.numpy(),
+    )  # fmt: skip
+
+
+def bone_wrenches(
+    samples: RaySamples,
+    grad_points: Float32[Tensor, "samples 3"],
+    slots: Int32[Tensor, "rays"],
+    cells: CorrespondenceTables,
+    skin: SkinningVolume,
+    bones: Float32[Tensor, "slots 24 12"],
+) -> Float32[Tensor, "rays 24 6"]:
+    """Force and moment that each ray's samples exert on every bone, given their gradients."""
+    out = torch.zeros(len(slots), 24, 6)
+    numba_pose.bone_wrenches(
+        samples.points.numpy(), grad_points.numpy(), samples.root_rows.numpy(),
+        samples.offsets.numpy(), samples.counts.numpy(), slots.numpy(), cells.roots.numpy(),
+        *_skinning_arrays(skin), bones.numpy(), out.numpy(),
+    )  # fmt: skip
+    return out
+
+
+def update_roots(
+    cells: CorrespondenceTables, slot: int, skin: SkinningVolume, bones: Float32[Tensor, "24 12"]
+) -> None:
+    """Moves a slot's roots, in place, to follow its changed pose."""
+    numba_pose.update_roots(
+        cells.packed_cells[slot].numpy(), cells.shape[slot].numpy(), cells.low[slot].numpy(),
+        np.float32(cells.cell_m), cells.roots[slot].numpy(),
+        *_skinning_arrays(skin), bones.numpy(),
+    )  # fmt: skip
+
+
+def _skinning_arrays(
+    skin: SkinningVolume,
+) -> tuple[
+    Float32[np.ndarray, "nodes 24"],
+    tuple[int, ...],
+    Float32[np.ndarray, "3"],
+    Float32[np.ndarray, "3"],
+]:
+    nodes = skin.weights.numpy().reshape(-1, skin.weights.shape[3])
+    return nodes, tuple(skin.weights.shape[:3]), skin.low.numpy(), skin.nodes_per_m.numpy()
