@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
 
 from avatar.config import TrainConfig
 from avatar.evaluation.held_out import HeldOutFrame, subsample_evenly
@@ -46,9 +45,6 @@ def save(trainer: Trainer, folder: Path, *, notes: dict[str, Any] | None = None)
         trainer: What has been learnt. Frames are not kept: the video still has them.
         folder: Made if it is not there.
         notes: What the caller wants back (plain data: numbers, text, lists, dicts).
-
-    Raises:
-        OSError: If the disk is full, or the folder cannot be written. An older checkpoint stays.
     """
     return write_state(current_state(trainer, notes=notes), folder)
 
@@ -93,11 +89,7 @@ def detached_state(trainer: Trainer, *, notes: dict[str, Any] | None = None) -> 
 
 
 def write_state(state: dict[str, Any], folder: Path) -> Path:
-    """Writes the content of a checkpoint into `folder`, which is made if it is not there.
-
-    Raises:
-        OSError: If the disk is full, or the folder cannot be written. An older checkpoint stays.
-    """
+    """Writes the content of a checkpoint into `folder`, which is made if it is not there."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / CHECKPOINT_FILE
     save_atomically(state, path)
@@ -159,12 +151,7 @@ def _restored(state: dict[str, Any]) -> Trainer:
 
 
 def save_atomically(state: dict[str, Any], path: Path) -> None:
-    """Writes plain data and tensors as a file that appears whole or not at all.
-
-    Raises:
-        InputError: If the folder's list says that the file there is not ours.
-        OSError: If the disk is full, or the folder cannot be written; what was there before stays.
-    """
+    """Writes plain data and tensors as a file that appears whole or not at all."""
     try:
         with atomic_file(path) as part, part.open("wb") as file:
             torch.save(state, file)
@@ -174,7 +161,7 @@ def save_atomically(state: dict[str, Any], path: Path) -> None:
         raise
 
 
-REPLAY_FILE_FORMAT = 2
+REPLAY_FILE_FORMAT = 3
 """Version of the saved frames' layout; another version is refused."""
 LAST_RUN_FILE = "frames.tensors"
 """File of the frames of the last finished run."""
@@ -215,25 +202,12 @@ class SavedFrames(NamedTuple):
 
     def as_earlier_video(self) -> "SavedFrames":
         """The frames with their indices shifted to those of an earlier video."""
-        held = [
-            replace(
-                kept,
-                observation=replace(
-                    kept.observation,
-                    frame=replace(
-                        kept.observation.frame,
-                        index=kept.observation.frame.index - INDEX_SHIFT_PER_VIDEO,
-                    ),
-                ),
-            )
-            for kept in self.held_out
-        ]
         return SavedFrames(
             [
                 frame._replace(index=frame.index - INDEX_SHIFT_PER_VIDEO)
                 for frame in self.replay_frames
             ],
-            held,
+            [_of_earlier_video(kept) for kept in self.held_out],
         )
 
     def training_frames(self, rig: Rig) -> list[TrainingFrame]:
@@ -241,32 +215,27 @@ class SavedFrames(NamedTuple):
         return [rebuild_frame(*frame[:4], rig, head=frame.head) for frame in self.replay_frames]
 
     def save(self, path: Path) -> None:
-        """Writes them, whole or not at all.
-
-        Raises:
-            OSError: If the disk is full; what was there before stays.
-        """
-        state = {
-            "format": REPLAY_FILE_FORMAT,
-            "key_frames": [_replay_frame_state(frame) for frame in self.replay_frames],
-            "held": [_observation_state(kept.observation) for kept in self.held_out],
-        }
-        save_atomically(state, path)
+        """Writes them, whole or not at all; of held-out frames only what scoring needs."""
+        held = []
+        for observation in (kept.observation for kept in self.held_out):
+            frame = observation.frame
+            frame = Frame(index=frame.index, time_s=frame.time_s, rgb=frame.rgb)
+            held.append(replace(observation, frame=frame, filmed_rgb=None))
+        replay, held = _to_plain(self.replay_frames), _to_plain(held)
+        save_atomically({"format": REPLAY_FILE_FORMAT, "replay": replay, "held_out": held}, path)
 
     @classmethod
     def load(cls, path: Path) -> "SavedFrames":
-        """Reads them; none if there is no such file.
-
-        Raises:
-            InputError: If it cannot be read.
-        """
+        """Reads them; none if there is no such file."""
         if not path.exists():
             return cls([], [])
         try:
             state = torch.load(path, map_location="cpu", weights_only=True)
+            if state["format"] != REPLAY_FILE_FORMAT:
+                raise ValueError(f"format {state['format']} instead of {REPLAY_FILE_FORMAT}")
             return cls(
-                [_replay_frame(kept) for kept in state["key_frames"]],
-                [HeldOutFrame(observation=_observation(kept)) for kept in state["held"]],
+                [_from_plain(frame) for frame in state["replay"]],
+                [HeldOutFrame(observation=_from_plain(kept)) for kept in state["held_out"]],
             )
         except (OSError, RuntimeError, EOFError, KeyError, ValueError, TypeError,
                 pickle.UnpicklingError) as error:  # fmt: skip
@@ -276,77 +245,36 @@ class SavedFrames(NamedTuple):
             ) from error
 
 
-def _replay_frame_state(frame: ReplayFrame) -> dict[str, Any]:
-    return {
-        "index": frame.index,
-        "pose": _pose_state(frame.pose),
-        **_pixels_state(frame.view, frame.colors),
-        "head": frame.head and _pixels_state(*frame.head),
-    }
+def _of_earlier_video(held_out: HeldOutFrame) -> HeldOutFrame:
+    frame = held_out.observation.frame
+    frame = replace(frame, index=frame.index - INDEX_SHIFT_PER_VIDEO)
+    return replace(held_out, observation=replace(held_out.observation, frame=frame))
 
 
-def _replay_frame(state: dict[str, Any]) -> ReplayFrame:
-    head = state.get("head")  # earlier versions saved none
-    return ReplayFrame(
-        state["index"], _pose(state["pose"]), *_pixels(state), head and _pixels(head)
-    )
+SAVED_RECORDS = {
+    record.__name__: record
+    for record in (ReplayFrame, RayView, Observation, Frame, Camera, BodyPose)
+}
+"""Records that saved frames consist of, by name."""
 
 
-def _pixels_state(view: RayView, colors: UInt8[np.ndarray, "pixels 4"]) -> dict[str, Any]:
-    return {
-        "colors": torch.from_numpy(colors),
-        "near": torch.from_numpy(view.near_person_bits),
-        "camera": _camera_state(view.camera),
-    }
+def _to_plain(value: Any) -> Any:
+    """Data that `torch.load` reads without executing any: records as dicts, arrays as tensors."""
+    if isinstance(value, np.ndarray):
+        return torch.from_numpy(np.ascontiguousarray(value))
+    name = type(value).__name__
+    if name in SAVED_RECORDS:
+        fields = value._asdict() if isinstance(value, tuple) else vars(value)
+        kept = {k: _to_plain(v) for k, v in fields.items() if not isinstance(v, frozenset)}
+        return {"record": name} | kept
+    return [_to_plain(part) for part in value] if isinstance(value, tuple | list) else value
 
 
-def _pixels(state: dict[str, Any]) -> tuple[RayView, UInt8[np.ndarray, "pixels 4"]]:
-    view = RayView(camera=_camera(state["camera"]), near_person_bits=state["near"].numpy())
-    return view, state["colors"].numpy()
-
-
-def _observation_state(observation: Observation) -> dict[str, Any]:
-    alpha = np.rint(observation.alpha * 65535.0).astype(np.int32)
-    return {
-        "index": observation.frame.index,
-        "time_s": observation.frame.time_s,
-        "rgb": torch.from_numpy(np.ascontiguousarray(observation.frame.rgb)),
-        "alpha": torch.from_numpy(alpha),
-        "camera": _camera_state(observation.camera),
-        "pose": _pose_state(observation.pose),
-    }
-
-
-def _observation(state: dict[str, Any]) -> Observation:
-    alpha = state["alpha"].numpy().astype(np.float32) / np.float32(65535.0)
-    frame = Frame(index=state["index"], time_s=state["time_s"], rgb=state["rgb"].numpy())
-    return Observation(
-        frame=frame, alpha=alpha, pose=_pose(state["pose"]), camera=_camera(state["camera"])
-    )
-
-
-def _camera_state(camera: Camera) -> dict[str, Any]:
-    return {
-        "focal_px": list(camera.focal_px),
-        "center_px": list(camera.center_px),
-        "size_px": list(camera.size_px),
-        "distortion": list(camera.distortion),
-        "camera_from_world": torch.from_numpy(camera.camera_from_world),
-    }
-
-
-def _camera(state: dict[str, Any]) -> Camera:
-    pairs = {name: tuple(state[name]) for name in ("focal_px", "center_px", "size_px")}
-    return Camera(
-        **pairs,
-        distortion=tuple(state["distortion"]),
-        camera_from_world=state["camera_from_world"].numpy(),
-    )
-
-
-def _pose_state(pose: BodyPose) -> dict[str, torch.Tensor]:
-    return {name: torch.from_numpy(np.array(values)) for name, values in vars(pose).items()}
-
-
-def _pose(state: dict[str, torch.Tensor]) -> BodyPose:
-    return BodyPose(**{name: values.numpy() for name, values in state.items()})
+def _from_plain(value: Any) -> Any:
+    """Records and arrays from what `_to_plain` made of them."""
+    if isinstance(value, torch.Tensor):
+        return value.numpy()
+    if isinstance(value, dict):
+        fields = {name: _from_plain(part) for name, part in value.items()}
+        return SAVED_RECORDS[fields.pop("record")](**fields)
+    return tuple(map(_from_plain, value)) if isinstance(value, list) else value
