@@ -11,6 +11,7 @@ from jaxtyping import Float, Float32, Int, UInt8
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from avatar.evaluation.image_metrics import MASK_THRESHOLD
 from avatar.evaluation.skin_patches import PART_NAMES, SIDE_NAMES, SkinPatches, view_patches
 from capture.camera import Camera
 from capture.source import Frame
@@ -24,8 +25,6 @@ MIN_SEEN_COSINE = 0.3
 """Cosine between normal and view direction below which a patch is not seen (72°)."""
 MIN_WELL_SEEN_COSINE = 0.6
 """Cosine from which a patch is well seen (53°)."""
-MIN_PERSON_ALPHA = 0.5
-"""Alpha above which a pixel shows the person."""
 
 
 class VisibilityStage(IntEnum):
@@ -92,7 +91,7 @@ class Coverage:
         width, height = camera.size_px
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         alpha = observation.alpha[row.clip(0, height - 1), column.clip(0, width - 1)]
-        passed = (cosines > MIN_SEEN_COSINE, inside, free, alpha > MIN_PERSON_ALPHA)
+        passed = (cosines > MIN_SEEN_COSINE, inside, free, alpha > MASK_THRESHOLD)
         stages = np.cumprod(passed, axis=0, dtype=np.uint8).sum(axis=0, dtype=np.uint8)
         np.maximum(self.stages, stages, out=self.stages)
         shown = np.where(stages == VisibilityStage.SEEN, cosines, 0.0).astype(np.float32)
@@ -184,15 +183,13 @@ PARTS_OF_LIMB = {
 }
 PLURALS = {"hand": "hands", "foot": "feet", "arm": "arms", "leg": "legs"}
 
-WHOLE_LIMB_ADVICE = "Show your {limb}: {they} {was} never seen."
-TURN_ADVICE = "Turn until the {side}{s} of your {limb} {has} been seen."
 ADVICE_BY_SIDE = {
-    ("arm", "under"): "Raise your {limb}: {its} underside{s} {was} never seen.",
-    ("arm", "top"): "Lower your {limb}: {its} upper side{s} {was} never seen.",
-    ("hand", "under"): "Turn your palm{s} to the camera: the {limb} {was} never seen from below.",
-    ("hand", "top"): "Turn the back{s} of your {limb} to the camera: {they} {was} never seen.",
-    ("leg", "inner side"): "Stand with your legs apart: {its} inner side{s} {was} never seen.",
-    ("foot", "inner side"): "Put your feet apart: {its} inner side{s} {was} never seen.",
+    ("arm", "under"): "Raise your {limb}: the underside was never seen.",
+    ("arm", "top"): "Lower your {limb}: the upper side was never seen.",
+    ("hand", "under"): "Show the palm of your {limb}: it was never seen.",
+    ("hand", "top"): "Show the back of your {limb}: it was never seen.",
+    ("leg", "inner side"): "Stand with your legs apart: the inner side was never seen.",
+    ("foot", "inner side"): "Put your feet apart: the inner side was never seen.",
     ("head", "top"): "Bow your head: its top was never seen.",
     ("head", "front"): "Look at the camera: your face was never seen.",
     ("torso", "all around"): "Turn round once, so that all of you is seen.",
@@ -202,16 +199,7 @@ ADVICE_BY_SIDE = {
     ("torso", "left"): "Turn until your left side has been seen.",
     ("torso", "right"): "Turn until your right side has been seen.",
 }
-OUTSIDE_IMAGE_ADVICE = "Step back: your {limb} {was} never in the picture."
-OUTSIDE_MASK_ADVICE = (
-    "Look at the masks: your {limb} {was} never in them, though nothing of you hid {it}."
-)
-SELF_OCCLUSION_ADVICE = {
-    ("torso", "left"): "Raise your arms: they hide your left side.",
-    ("torso", "right"): "Raise your arms: they hide your right side.",
-    ("torso", "front"): "Move your arms aside: they hide your front.",
-    ("torso", "back"): "Move your arms aside: they hide your back.",
-}
+"""What shows a piece of skin that faced away, by its limb and side; others have one sentence."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -325,25 +313,17 @@ def _merge_symmetric(found: list[UnseenRegion]) -> UnseenRegion:
 
 
 def _advice_sentence(gap: UnseenRegion) -> str:
-    both = gap.laterality == "both"
-    words = {
-        "limb": PLURALS[gap.limb] if both else f"{gap.laterality} {gap.limb}".strip(),
-        "side": f"{gap.side} side" if gap.side in ("left", "right") else gap.side,
-        "s": "s" if both else "",
-        "it": "them" if both else "it",
-        "they": "they" if both else "it",
-        "its": "their" if both else "its",
-        "was": "were" if both else "was",
-        "has": "have" if both else "has",
-    }
-    kind = (gap.limb, gap.side)
+    limb = PLURALS[gap.limb] if gap.laterality == "both" else f"{gap.laterality} {gap.limb}".strip()
+    side = f"{gap.side} side" if gap.side in ("left", "right") else gap.side
     if gap.stage is VisibilityStage.OUTSIDE_IMAGE:
-        return OUTSIDE_IMAGE_ADVICE.format(
-            **{**words, "limb": words["limb"].replace("torso", "whole body")}
-        )
+        return f"Step back: no picture shows your {limb.replace('torso', 'whole body')}."
     if gap.stage is VisibilityStage.OUTSIDE_MASK:
-        return OUTSIDE_MASK_ADVICE.format(**words)
-    if gap.stage is VisibilityStage.SELF_OCCLUDED and kind in SELF_OCCLUSION_ADVICE:
-        return SELF_OCCLUSION_ADVICE[kind]
-    otherwise = WHOLE_LIMB_ADVICE if gap.side == "all around" else TURN_ADVICE
-    return ADVICE_BY_SIDE.get(kind, otherwise).format(**words)
+        return f"Look at the masks: none shows your {limb}, though nothing of you was before it."
+    around = gap.limb == "torso" and gap.side in ("left", "right", "front", "back")
+    if around and gap.stage is VisibilityStage.SELF_OCCLUDED:
+        return f"Raise your arms: they hide your {side}."
+    if (gap.limb, gap.side) in ADVICE_BY_SIDE:
+        return ADVICE_BY_SIDE[gap.limb, gap.side].format(limb=limb)
+    if gap.side == "all around":
+        return f"Show your {limb} to the camera."
+    return f"Turn until the {side} of your {limb} has been seen."

@@ -131,12 +131,6 @@ def _visible_from_anywhere(
     return shown
 
 
-DEPTH_CELL_M = 0.03
-"""Cell size of the depth buffer for self-occlusion, metres."""
-DEPTH_TOLERANCE_M = 0.03
-"""Depth by which a patch may lie behind the buffer and still be visible, metres."""
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PatchView:
     """The patches of a posed body, as a camera sees them.
@@ -166,9 +160,7 @@ def view_patches(
     if depths.min() <= 0.0:
         return None
     plane = in_camera[:, :2] / depths[:, None] * depths.mean()
-    free = visible_points(
-        plane, depths, cosines, cell_m=DEPTH_CELL_M, tolerance_m=DEPTH_TOLERANCE_M
-    )
+    free = visible_points(plane, depths, cosines)
     return PatchView(cosines=cosines, unoccluded=free, pixels=camera.project(points))
 
 

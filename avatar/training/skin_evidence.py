@@ -14,10 +14,6 @@ from avatar.rig import Rig
 from avatar.training.frame_stream import TrainingFrame
 from preprocess.body.body_surface import visible_points
 
-OCCLUSION_CELL_M = 0.03
-"""Cell size of the depth buffer for self-occlusion, metres."""
-OCCLUSION_TOLERANCE_M = 0.03
-"""Depth by which a patch may lie behind the buffer and still be visible, metres."""
 MIN_PERSON_ALPHA = 127
 """Alpha of 255 above which a pixel shows the person."""
 UNSEEN_COSINE, SEEN_COSINE = 0.1, 0.4
@@ -55,10 +51,8 @@ class SkinEvidence:
         depths = in_camera[:, 2]
         if depths.min() <= 0.0:  # a person behind the camera is not in the image either
             return
-        shown = visible_points(
-            in_camera[:, :2] / depths[:, None] * depths.mean(), depths, cosines,
-            cell_m=OCCLUSION_CELL_M, tolerance_m=OCCLUSION_TOLERANCE_M,
-        )  # fmt: skip
+        plane = in_camera[:, :2] / depths[:, None] * depths.mean()
+        shown = visible_points(plane, depths, cosines)
         shown &= _lies_in_mask(in_camera, frame)
         np.maximum(self.cosines, np.where(shown, cosines, 0.0), out=self.cosines)
 

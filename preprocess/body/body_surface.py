@@ -51,8 +51,8 @@ def visible_points(
     depth: Float[np.ndarray, "points"],
     cosine: Float[np.ndarray, "points"],
     *,
-    cell_m: float,
-    tolerance_m: float,
+    cell_m: float = 0.03,
+    tolerance_m: float = 0.03,
 ) -> Bool[np.ndarray, "points"]:
     """Which points face the camera unoccluded, by a depth buffer of coarse cells.
 

@@ -72,19 +72,19 @@ def test_turning_once_is_enough(observed, coverage):
 def test_feet_below_the_picture_ask_for_a_step_back(observed, coverage):
     for turned in AROUND:
         coverage.add(observed(turned=turned, up_m=1.0))
-    assert coverage_advice(coverage) == "Step back: your legs were never in the picture."
+    assert coverage_advice(coverage) == "Step back: no picture shows your legs."
 
 
 @pytest.mark.parametrize(
     ("parts", "side", "sentence"),
     [
-        (arm("left"), "under", "Raise your left arm: its underside was never seen."),
+        (arm("left"), "under", "Raise your left arm: the underside was never seen."),
         (arm("right"), "back", "Turn until the back of your right arm has been seen."),
-        (arm("left"), "top", "Lower your left arm: its upper side was never seen."),
+        (arm("left"), "top", "Lower your left arm: the upper side was never seen."),
         (
             ("left thigh", "left shin"),
             "right",
-            "Stand with your legs apart: its inner side was never seen.",
+            "Stand with your legs apart: the inner side was never seen.",
         ),
         (
             ("right thigh", "right shin"),
@@ -94,7 +94,7 @@ def test_feet_below_the_picture_ask_for_a_step_back(observed, coverage):
         (("head",), "back", "Turn until the back of your head has been seen."),
         (("head",), "left", "Turn until the left side of your head has been seen."),
         (("head",), "front", "Look at the camera: your face was never seen."),
-        (("left hand",), None, "Show your left hand: it was never seen."),
+        (("left hand",), None, "Show your left hand to the camera."),
     ],
 )
 def test_a_piece_on_one_limb_is_named_by_limb_and_side(coverage, parts, side, sentence):
@@ -104,7 +104,7 @@ def test_a_piece_on_one_limb_is_named_by_limb_and_side(coverage, parts, side, se
 def test_the_same_piece_of_both_arms_is_one_sentence(coverage):
     both = here(coverage, *arm("left"), *arm("right"), side="under")
     said = coverage_advice(without(coverage, both))
-    assert said == "Raise your arms: their undersides were never seen."
+    assert said == "Raise your arms: the underside was never seen."
     assert {gap.laterality for gap in unseen_regions(coverage)} == {"left", "right"}
 
 
@@ -118,7 +118,7 @@ def test_what_only_the_masks_leave_out_is_looked_for_there(coverage):
     said = coverage_advice(
         without(coverage, here(coverage, "right hand"), VisibilityStage.OUTSIDE_MASK)
     )
-    assert said.startswith("Look at the masks: your right hand was never in them")
+    assert said.startswith("Look at the masks: none shows your right hand")
 
 
 def test_the_largest_piece_is_spoken_of_first(coverage):
