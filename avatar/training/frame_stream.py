@@ -110,7 +110,7 @@ def _assemble_frame(
         origin=origin,
         body_from_camera=body_from_camera,
         pixels=pixels,
-        colors=colors[: pixels.near_count],  # earlier versions saved the others' zeros, too
+        colors=colors,
         view=view,
         head=head,
     )
@@ -127,14 +127,9 @@ MAX_KEYFRAME_INTERVAL_S = 0.5
 
 
 def view_descriptor(origin: Shaped[np.ndarray, "3"], pose: BodyPose) -> Float[np.ndarray, " 72"]:
-    """Descriptor of a view; the distance between two descriptors resembles an angle, radians.
+    """View direction and weighted joint rotations; the distance of two resembles an angle, radians.
 
-    Args:
-        origin: Camera center in the body frame, metres.
-        pose: Pose of the body.
-
-    Returns:
-        View direction and weighted joint rotations.
+    `origin` is the camera's center in the body frame, metres.
     """
     facing = origin / np.linalg.norm(origin)
     return np.concatenate([facing, pose.joint_rotations.ravel() * JOINT_ANGLE_WEIGHT])
@@ -202,15 +197,9 @@ def is_held_out(position: int, *, stride: int, total: int | None) -> bool:
 def separate_held_out(
     observations: Iterable[Observation | DroppedFrame], *, stride: int, total: int | None
 ) -> Iterator[SplitItem]:
-    """Wraps the observations that are held out; the only place that decides which these are.
+    """Wraps the observations that are held out (`is_held_out`), one item for each observation.
 
-    Args:
-        observations: Observations of the whole stream, in its order.
-        stride: Every `stride`-th frame is held out; 0 for none.
-        total: Number of frames of the stream, if known.
-
-    Yields:
-        One item for each observation.
+    The only place that decides which these are.
     """
     for position, item in enumerate(observations):
         if isinstance(item, Observation) and is_held_out(position, stride=stride, total=total):
@@ -222,15 +211,9 @@ def separate_held_out(
 def prepare_items(
     items: Iterable[SplitItem], rig: Rig, *, initial_keyframes: int = INITIAL_KEYFRAMES
 ) -> Iterator[StreamItem]:
-    """Prepares the observations to train on, and passes over redundant ones.
+    """Prepares the observations to train on, one item for each of `separate_held_out`.
 
-    Args:
-        items: Items of `separate_held_out`, some of which may have been dropped since.
-        rig: Rig of the person.
-        initial_keyframes: Frames that are trained on before any is called redundant.
-
-    Yields:
-        One item for each item.
+    After `initial_keyframes` frames redundant ones are passed over.
     """
     selector = KeyframeSelector(rig, initial_keyframes=initial_keyframes)
     for item in items:

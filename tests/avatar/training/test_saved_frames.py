@@ -47,14 +47,6 @@ def test_a_frame_is_rebuilt_from_its_colors_alone(frames, rig):
         )
 
 
-def test_the_zeros_that_were_once_saved_for_the_background_are_left_out(frames, rig):
-    for frame in frames:
-        zeros = np.zeros((frame.pixels.count - frame.pixels.near_count, 4), dtype=np.uint8)
-        colors = np.concatenate([frame.colors, zeros])
-        again = rebuild_frame(frame.index, frame.pose, frame.view, colors, rig)
-        np.testing.assert_array_equal(again.colors, frame.colors)
-
-
 def test_replay_returns_the_colors_it_was_given(frames):
     replay = ReplayBuffer(3)
     for frame in frames:
