@@ -120,13 +120,7 @@ class OrientationShading:
         target: PremultipliedPixels,
         rendered: PremultipliedPixels,
     ) -> None:
-        """Updates the coefficients.
-
-        Args:
-            normals: World normals.
-            target: Pixels, at neutral exposure.
-            rendered: Shaded rendering of the same rays.
-        """
+        """Updates the coefficients by world normals, neutral pixels and their shaded rendering."""
         self._steps += 1
         if (self._steps - 1) % OBSERVATION_INTERVAL:
             return

@@ -160,14 +160,11 @@ class TrainConfig:
         """Derives the configuration from a budget and the size of a pixel on the body.
 
         Args:
-            seconds: Time budget, seconds; 60 if neither budget is given.
-            steps: Number of training steps instead of `seconds`.
+            seconds, steps: Time budget, or training steps instead; 60 s if neither is given.
             footprint_m: Size of a pixel on the body, metres.
             filmed_footprint_m: The same before the film is reduced, as the head is learnt; None
                 where it is not reduced.
-            pose_uncertainty: How far the poses are estimates, in [0, 1].
-            seed: Seed of all random numbers.
-            held_out_stride: Stride between held-out frames.
+            pose_uncertainty, seed, held_out_stride: As in the configuration.
         """
         if seconds is None:
             seconds = 60.0 if steps is None else steps / NOMINAL_STEPS_PER_S

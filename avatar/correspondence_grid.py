@@ -153,13 +153,7 @@ class CorrespondenceCheck:
         joint_rotations: Float[np.ndarray, "23 3"],
         cells: CorrespondenceGrid,
     ) -> "CorrespondenceCheck":
-        """Checks the corners of every full cell.
-
-        Args:
-            rig: Rig of the person.
-            joint_rotations: Pose of the cells.
-            cells: Correspondence grid of the pose, culled.
-        """
+        """Checks the corners of every full cell of a pose's culled grid."""
         bones = rig.body_from_canonical(joint_rotations)[:, :3].reshape(24, 12)
         volume = blended_transform_volume(
             rig, bones.astype(np.float32), CLOTHING_BAND_M + 2.0 * SEARCH_MARGIN_M

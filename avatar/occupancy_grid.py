@@ -205,9 +205,7 @@ def find_floaters(
 ) -> UInt8[Tensor, "x y z"]:
     """Cells in and about the connected components that are not part of the person.
 
-    Args:
-        solid: Solid cells.
-        near_skin: Cells that count towards a component's size.
+    A component's size is the number of its solid cells near the skin.
     """
     # scipy has no types, and what pyright guesses of this function is wrong
     pieces, count = label(solid.numpy())  # pyright: ignore[reportGeneralTypeIssues]

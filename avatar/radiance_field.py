@@ -259,11 +259,8 @@ def density_tv_gradient(
 
     The total variation of a solid is its surface area (Rudin, Osher and Fatemi 1992); of all
     surfaces that explain the images it prefers the smallest, which is the smoothest. It does not
-    penalise sharp edges, but it does not penalise thick, half-transparent layers either.
-
-    Args:
-        raw: Raw outputs at the first points of the pairs, then at the second.
-        weight: Weight of the term.
+    penalise sharp edges, but it does not penalise thick, half-transparent layers either. `raw` has
+    the first points of the pairs, then the second.
     """
     count, opacity = len(raw) // 2, OpacityWithSlope.of(raw)
     sign = torch.sign(opacity.value[:count] - opacity.value[count:])
@@ -295,13 +292,8 @@ def density_slope_gradient(
     A few images in slightly wrong poses are explained as well by a razor-sharp surface that is
     rough between pixels. Neither the renderer's samples nor the player's voxels can represent it: a
     shift of the samples by half a step changed the image by 38 dB. Density above
-    `MAX_USEFUL_LOG_DENSITY` is penalised too, since it only steepens the edge.
-
-    Args:
-        raw: Raw outputs at the first points of the pairs, then at the second.
-        points: Positions of these points, metres.
-        max_slope_per_m: Largest unpenalised slope k of the log density, 1/m.
-        weight: Weight of the term.
+    `MAX_USEFUL_LOG_DENSITY` is penalised too, since it only steepens the edge. Pairs are as in
+    `density_tv_gradient`; k is `max_slope_per_m`.
     """
     count, logs = len(raw) // 2, raw[:, 3]
     change = logs[:count] - logs[count:]
@@ -315,12 +307,7 @@ def density_slope_gradient(
 def color_tv_gradient(
     raw: Float32[Tensor, "points 4"], weight: float
 ) -> Float32[Tensor, "points 4"]:
-    """Gradient of the mean |c - c'| of visible pairs, summed over channels.
-
-    Args:
-        raw: Raw outputs at the first points of the pairs, then at the second.
-        weight: Weight of the term.
-    """
+    """Gradient of the mean |c - c'| of visible pairs, as in `density_tv_gradient`."""
     count, color = len(raw) // 2, torch.sigmoid(raw[:, :3])
     seen = torch.maximum(raw[:count, 3:], raw[count:, 3:]) > VISIBLE_LOG_DENSITY
     pull = weight / max(count, 1) * seen * torch.sign(color[:count] - color[count:])

@@ -155,9 +155,7 @@ def render(
     (`avatar.correspondence_grid`).
 
     Args:
-        avatar: Avatar to render.
-        pose: Pose in the camera's world frame.
-        camera: Camera and size of the image.
+        avatar, pose, camera: What is rendered, in the camera's world frame.
         cells: Correspondence grid of the pose, if it has been solved already.
         shaded: Whether the light of the room in which the person was filmed falls on the avatar;
             otherwise its colors are neutral, as in the package.
@@ -196,12 +194,9 @@ def trace_rays(
     """Premultiplied neutral color and alpha along rays, and the normals of what they see.
 
     Args:
-        field: Radiance field to render.
-        rays: Rays in the body frames of one or several slots.
-        cells: Correspondence grids of these slots.
+        field, rays, cells, sample_step_m: As in training.
         grid: Occupancy outside which the field is taken to be empty.
         check: Finds spurious samples, whose density is taken to be zero.
-        sample_step_m: Distance between samples, metres.
         shading: Has the normals, in the body frame; all are zero without it.
     """
     normals = torch.zeros(len(rays.slots), 3)

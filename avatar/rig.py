@@ -225,13 +225,8 @@ def skinning_weight_volume(
     the warp invertible near creases. More of either pulls clothes off the body that they move
     with: 30 neighbors and smoothing everywhere cost 0.65 dB in poses never filmed.
 
-    Args:
-        vertices: Canonical vertices, metres.
-        vertex_weights: Their weights, rows sum to 1.
-        low, high: Corners of the box, metres.
-        cell_m: Node spacing, metres.
-        reach_m: Nodes farther than this from every vertex all take the root's weight: nothing is
-            rendered there, but the values must be finite.
+    Nodes farther than `reach_m` from every canonical vertex all take the root's weight: nothing is
+    rendered there, but the values must be finite.
     """
     shape = tuple(n + 1 for n in volume_shape(low, high, cell_m))
     axes = [np.linspace(low[k], high[k], shape[k]) for k in range(3)]
@@ -271,16 +266,9 @@ def skin_distance_volume(
 ) -> tuple[Float32[np.ndarray, "x y z"], Bool[np.ndarray, "x y z"]]:
     """Distance of each cell's center from the skin, metres, and whether it lies under it.
 
-    Args:
-        vertices: Canonical vertices, metres.
-        normals: Outward, at the vertices.
-        low, high: Corners of the box, metres.
-        cell_m: About the edge of a cell, metres.
-        reach_m: Cells farther than this from every vertex count as 1 m away, and outside.
-
-    Returns:
-        Unsigned distance to the nearest vertex, metres; and whether the centre is on the inner side
-        of that vertex, which is right wherever it is farther off than vertices from each other.
+    The distance is to the nearest vertex, unsigned; cells farther than `reach_m` count as 1 m away,
+    and outside. Which side of that vertex a center is on is right wherever it is farther off than
+    vertices are from each other.
     """
     shape = volume_shape(low, high, cell_m)
     size = (high - low) / shape

@@ -47,10 +47,7 @@ class FrameExposures:
     def __init__(self, capacity: int, *, avatar_frozen: bool = False) -> None:
         """Starts without frames.
 
-        Args:
-            capacity: Number of slots.
-            avatar_frozen: Whether the avatar no longer changes. Its brightness is then known, and
-                gains are neither centered nor shrunk.
+        The brightness of a frozen avatar is known: gains are neither centered nor shrunk.
         """
         self.gains: Float32[Tensor, "slots 3"] = torch.ones(capacity, 3)
         self._avatar_frozen = avatar_frozen
@@ -77,12 +74,9 @@ class FrameExposures:
         return known[nearest]
 
     def set_frame(self, slot: int, frame: int, gain: ChannelGains | None = None) -> None:
-        """Gives a slot to a frame.
+        """Gives the next slot, or one whose frame is replaced, to a frame of the source.
 
-        Args:
-            slot: The next one, or one whose frame is replaced.
-            frame: Index of the frame in its source.
-            gain: Its initial gains; those of the nearest known frame if None.
+        Its gains start from `gain`, or from those of the nearest known frame.
         """
         gain = self.expected_gain(frame) if gain is None else gain
         self._frames[slot : slot + 1] = [frame]
@@ -97,12 +91,7 @@ class FrameExposures:
         return batch._replace(target=target)
 
     def observe(self, batch: TrainingBatch, rendered: PremultipliedPixels) -> None:
-        """Updates the gains.
-
-        Args:
-            batch: Rays with their pixels as filmed.
-            rendered: Neutral rendering of the same rays.
-        """
+        """Updates the gains by rays with their pixels as filmed, and their neutral rendering."""
         held = len(self._frames)
         gains = np.zeros((held, 3), dtype=np.float32)
         _update_gains(

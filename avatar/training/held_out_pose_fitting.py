@@ -45,10 +45,7 @@ def fit_test_poses(
     frames. Each correction follows some of the frame's rays, so that even an exact pose moves a
     little; the given pose, or exposure, is kept where it scores higher on a sample of the pixels.
 
-    Args:
-        trainer: Trainer of the avatar; the gradients of its field are overwritten.
-        frames: Frames that were never trained on.
-        progress: Receives the completed share, from 0 to 1.
+    The gradients of the avatar's field are overwritten.
     """
     if not frames:
         return

@@ -131,9 +131,6 @@ def neighbor_precision(
     while errors change gradually, in the simplest case with correlations r, r² at one, two frames
     apart. So r is the ratio of the estimates' correlations, the share of noise is what is missing
     to 1 at distance 0, and neighbors leave (1 - r²) / (1 + r²) of the errors' power unknown.
-
-    Args:
-        frames, estimates, known: As in `neighbor_correlations`.
     """
     one_apart, two_apart = neighbor_correlations(frames, estimates, known)
     share = (one_apart - MIN_CORRELATION) / (FULL_CORRELATION - MIN_CORRELATION)
@@ -184,12 +181,7 @@ def prior_from_neighbors(
 def interpolate_correction(
     frame: int, corrections: Mapping[int, Float[np.ndarray, "25 3"]]
 ) -> Float[np.ndarray, "25 3"]:
-    """The correction of a frame that was never learnt from, by those of its neighbors.
-
-    Args:
-        frame: Its number.
-        corrections: Of frames' poses, by their numbers.
-    """
+    """The correction of a frame that was never learnt from, by those of other frames' poses."""
     if not corrections:
         return UNINFORMATIVE_PRIOR.mean
     frames, found = np.array(list(corrections)), np.array(list(corrections.values()))
@@ -258,13 +250,7 @@ class RaySums:
     def __init__(
         self, parents: Int64[np.ndarray, "24"], capacity: int, *, with_moments: bool
     ) -> None:
-        """Starts without rays.
-
-        Args:
-            parents: Parent of each joint, before its children.
-            capacity: Number of slots.
-            with_moments: Whether the rays' agreement will be asked for.
-        """
+        """Starts without rays; moments are for the rays' agreement. Parents precede children."""
         self._parents = parents
         self.counts = np.zeros(capacity, dtype=np.int64)
         self._gradients = np.zeros((capacity, numba_pose.PADDED), dtype=np.float32)
@@ -281,12 +267,9 @@ class RaySums:
         room: Int64[np.ndarray, "slots"],
         joints: JointFrames,
     ) -> None:
-        """Adds rays, by the wrenches that they exert on the bones.
+        """Adds rays, by the wrenches that they exert on the bones; `room` is the most of a slot.
 
-        Args:
-            slots, wrenches, loss: Slot, wrenches and loss of each ray.
-            room: Most rays of each slot; rays beyond are left out.
-            joints: Joints of the poses at which the wrenches were found.
+        The wrenches were found at the poses of `joints`.
         """
         numba_pose.add_rays(
             slots, wrenches, loss, MIN_RAY_LOSS, (PRIOR_SIGMA_RAD, PRIOR_SIGMA_M), room,
@@ -303,12 +286,9 @@ class RaySums:
         return NormalEquations(self._curvatures[slot], self._gradients[slot], moments, stiffness)
 
     def fade(self, slot: int, moved: Float[np.ndarray, "25 3"], decay: float) -> None:
-        """Lets a slot's rays count less, linearized where its pose has moved since.
+        """Lets a slot's rays count less, linearized where its correction has moved since.
 
-        Args:
-            slot: The slot, whose count starts again from 0.
-            moved: Change of its correction.
-            decay: Factor of the rays so far, in [0, 1).
+        The count starts again from 0; the rays so far weigh `decay`, in [0, 1).
         """
         curvature, gradient = self._curvatures[slot], self._gradients[slot]
         steps = (moved / PRIOR_SIGMAS).astype(np.float32).reshape(75)

@@ -169,12 +169,10 @@ class PoseOptimizer:
         frame: int | None = None,
         step: int = 0,
     ) -> None:
-        """Assigns a frame's pose to a slot.
+        """Assigns the tracker's pose of a frame to a slot.
 
         Args:
-            slot: Slot of the frame.
-            pose: The tracker's pose.
-            correction: Initial correction, if one is known.
+            slot, pose, correction: The pose, and its initial correction if one is known.
             frame: Index of the frame, whose neighbors have similar errors; None if it has none.
             step: Training step from which the frame is trained on.
         """
@@ -194,11 +192,6 @@ class PoseOptimizer:
 
     def replace_pose(self, slot: int, pose: BodyPose, *, frame: int, step: int) -> bool:
         """Assigns a better pose of its tracker to a slot's frame, without a correction.
-
-        Args:
-            slot: Slot of the frame.
-            pose: The tracker's pose.
-            frame, step: As in `set_pose`.
 
         Returns:
             Whether it is too far from the one before for the roots to follow: the caller is
@@ -264,9 +257,6 @@ class PoseOptimizer:
     def correct_next(self, *, rate: float) -> int | None:
         """Corrects the pose with the most accumulated rays; its roots and rays have to follow.
 
-        Args:
-            rate: Factor of the steps, in (0, 1].
-
         Returns:
             The slot, or None if no frame has enough rays or the pose does not move.
         """
@@ -301,11 +291,7 @@ class PoseOptimizer:
         return slot if moves else None
 
     def correction_interval(self, rate: float) -> int:
-        """Steps between pose gradients: more where poses prove to be exact, or steps are short.
-
-        Args:
-            rate: Factor of the Gauss-Newton steps, in (0, 1].
-        """
+        """Steps between pose gradients: more where poses prove to be exact, or steps are short."""
         if self.poses_may_be_exact:
             return min(max(round(0.5 / max(self._moved_share, 1e-3)), 1), MAX_CORRECTION_INTERVAL)
         return min(max(round(0.5 / max(rate, 1e-3)), 1), MAX_ESTIMATED_INTERVAL)

@@ -174,12 +174,7 @@ class ReplayBuffer:
         self._turns[slot] = turn @ self._body_from_camera[slot]
 
     def sample_rays(self, count: int, generator: torch.Generator) -> TrainingBatch:
-        """Draws rays from the kept frames.
-
-        Args:
-            count: How many.
-            generator: Source of random numbers.
-        """
+        """Draws rays from the kept frames."""
         chances = torch.rand(DRAWS_PER_RAY, count, generator=generator)
         slots = np.empty(count, dtype=np.int32)
         origins, directions = np.empty((2, count, 3), dtype=np.float32)

@@ -90,10 +90,7 @@ def train(
     for the first. A live source is left when the time is up. Where steps are counted, one more
     frame of a recording is read before each step until all are read.
 
-    Args:
-        trainer: Trainer to continue.
-        inbox: Prepared frames.
-        held_out: Held-out frames; those that arrive are appended.
+    Held-out frames that arrive are appended to `held_out`.
 
     Yields:
         Events, on the caller's thread; the time the caller spends on one counts as training time.

@@ -53,13 +53,7 @@ def cosine_decay(progress: float) -> float:
 
 @torch.no_grad()
 def update_ema(average: RadianceField, field: RadianceField, steps: int) -> None:
-    """Updates the exponential mean of a field's parameters, every `EMA_INTERVAL` steps.
-
-    Args:
-        average: Mean, changed in place.
-        field: Field after `steps` steps.
-        steps: Number of steps, at least 1.
-    """
+    """Updates the exponential mean of a field, in place, every `EMA_INTERVAL` steps."""
     if steps % EMA_INTERVAL and steps > EMA_INTERVAL:
         return
     share = min(1.0, EMA_INTERVAL / min(EMA_HORIZON_STEPS, max(steps * MAX_HORIZON_SHARE, 1.0)))
@@ -182,14 +176,9 @@ class Trainer:
         return self.wall_seconds
 
     def add_frame(self, frame: TrainingFrame, *, is_restored: bool = False) -> int:
-        """Adds a frame to the replay buffer and its pose to the optimizer.
+        """Adds a frame to the replay buffer and its pose to the optimizer; returns its slot.
 
-        Args:
-            frame: Frame to train on.
-            is_restored: Whether it was trained on before a checkpoint, and is not counted again.
-
-        Returns:
-            The replay slot that holds the frame.
+        A restored frame was trained on before a checkpoint, and is not counted again.
         """
         slot = self.replay.add(frame)
         self.unseen.add(frame)
@@ -207,9 +196,7 @@ class Trainer:
     def revise_pose(self, frame: int, pose: BodyPose) -> None:
         """Gives a frame a better pose of its tracker, from which corrections start again.
 
-        Args:
-            frame: Index of the frame; nothing happens if the replay buffer does not hold it.
-            pose: Its pose.
+        Nothing happens if the replay buffer does not hold the frame.
         """
         self.pose_corrections.pop(frame, None)
         if frame not in self.replay.frame_indices:
@@ -326,13 +313,7 @@ def resolve_correspondences(
 def correct_one_pose(
     rig: Rig, replay: ReplayBuffer, poses: PoseOptimizer, *, rate: float
 ) -> int | None:
-    """Corrects one pose; its frame's correspondences and rays follow.
-
-    Args:
-        rig: Rig of the person.
-        replay: The frames.
-        poses: Their poses, slot by slot.
-        rate: Factor of the step, in (0, 1].
+    """Corrects one pose by a step times `rate`; its frame's correspondences and rays follow.
 
     Returns:
         The slot of the corrected pose, or None if no pose has enough evidence.
@@ -352,13 +333,7 @@ def move_correspondences(
     *,
     far: bool,
 ) -> None:
-    """Lets a frame's correspondences and rays follow its pose.
-
-    Args:
-        rig, replay, poses: See `correct_one_pose`.
-        slot: Slot of the frame.
-        far: Whether the correspondences must be solved again.
-    """
+    """Lets a frame's correspondences and rays follow its pose; far poses are solved again."""
     if far:
         resolve_correspondences(rig, replay, poses, slot)
         return

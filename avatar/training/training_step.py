@@ -121,10 +121,8 @@ def compute_gradients(
     """Renders a batch and adds the gradient of its mean loss to the field's parameters.
 
     Args:
-        learner: Avatar whose field receives the gradients.
-        sampler: Chooses the canonical samples.
-        correspondences: Correspondence grids of the frames that the batch's slots name.
-        batch: Rays and their target pixels.
+        learner, sampler: Avatar whose field receives the gradients, at the sampler's points.
+        correspondences, batch: Rays and pixels, and the grids of the frames that these name.
         config: Weights, step lengths and sample counts.
         hard_surface_share: Share of the hard-surface loss's weight, in [0, 1]; it grows in, because
             a surface has to be found before it can be made hard.
@@ -239,11 +237,7 @@ def draw_by_strength(
 
     Half of the samples have a negligible gradient. Leaving these out biases the sum, and Adam
     enlarges small gradients; a few of them, divided by their chance, keep the expected sum.
-
-    Args:
-        grads: Gradients of all points.
-        faint_share: Strength, as a share of the mean, below which a gradient is faint.
-        generator: Decides.
+    A gradient is faint below `faint_share` of the mean strength.
 
     Returns:
         The points that were drawn, and their gradients, divided by the chance of each.

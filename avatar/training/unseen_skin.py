@@ -241,12 +241,7 @@ def reflect(
 ) -> Float[np.ndarray, "points 3"]:
     """Canonical points mirrored in the body's middle plane, through a limb's bone, or both.
 
-    Args:
-        frames: Frames of the bones.
-        points: Canonical points.
-        parts: Their body parts.
-        reflection: See `Sources`.
-        middle_x: Position of the body's middle plane, metres.
+    `reflection` says which (`Sources`).
     """
     mirrors, reverses = np.isin(reflection, (1, 3)), np.isin(reflection, (2, 3))
     local = frames.to_bone(points, parts)
@@ -259,14 +254,7 @@ def reflect(
 def find_sources(
     rig: Rig, frames: _BoneFrames, seen: Float32[np.ndarray, "seeds"], middle_x: float
 ) -> Sources:
-    """The source of each patch, by the least cost.
-
-    Args:
-        rig: Rig of the person.
-        frames: Frames of its bones.
-        seen: How far each patch was seen, in [0, 1].
-        middle_x: Position of the body's middle plane, metres.
-    """
+    """The source of each patch, by the least cost; `seen` is how far each was, in [0, 1]."""
     parts = rig.seed_parts.astype(np.int64)
     best, cost = np.zeros(len(parts), dtype=np.int64), np.full(len(parts), np.inf)
     kind = np.zeros(len(parts), dtype=np.int64)
