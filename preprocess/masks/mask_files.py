@@ -22,7 +22,7 @@ from capture.image_folder import (
 from capture.input_error import InputError
 from capture.source import FrameSource
 from capture.video import VIDEO_SUFFIXES
-from preprocess.file_content import read_npy_header, read_npz, read_untrusted_file
+from preprocess.file_content import read_npz, read_untrusted_file
 from preprocess.masks.encoded_masks import is_phalp_tracks, open_mask_video, open_rle_masks
 
 MAX_PERSON_FRACTION = 0.5
@@ -90,13 +90,8 @@ def _coverage(alpha: Float32[np.ndarray, "height width"]) -> Float[np.ndarray, "
 
 
 MALFORMED_TRACK_ERRORS = (
-    ValueError,
-    KeyError,
-    IndexError,
-    TypeError,
-    AttributeError,
-    OverflowError,
-)
+    ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError,
+)  # fmt: skip
 """Errors that a malformed file of tracks raises."""
 
 RLE_SUFFIXES = frozenset({".json", ".npy", ".pkl", ".pickle", ".pth", ".pt"})
@@ -258,9 +253,8 @@ def _open_file(path: Path, person: str | None) -> tuple[int, MaskReader]:
     if path.suffix.lower() in VIDEO_SUFFIXES:
         count, read = open_mask_video(path)
         return count, lambda row: _to_alpha(read(row), path)
-    if path.suffix.lower() in RLE_SUFFIXES and not (
-        path.suffix.lower() == ".npy" and _is_numeric_npy(path)
-    ):
+    stack = _load_npy(path) if path.suffix.lower() == ".npy" else None
+    if path.suffix.lower() in RLE_SUFFIXES and stack is None:
         coded = _open_rle(path, person)
         if coded is None:
             raise InputError(
@@ -268,12 +262,10 @@ def _open_file(path: Path, person: str | None) -> tuple[int, MaskReader]:
             )
         count, decode = coded
         return count, lambda row: _to_alpha(decode(row), path)
-    if path.suffix.lower() == ".npy":
-        stack = _load_npy(path)
-    elif path.suffix.lower() == ".npz":
+    if path.suffix.lower() == ".npz":
         arrays = {key: a for key, a in read_npz(path).items() if a.ndim == 3}
         stack = arrays.get("masks", next(iter(arrays.values()), None))
-    else:
+    elif stack is None:
         raise InputError(
             f"{path} holds no masks that can be read; expected a folder of images, a video, an "
             ".npz or .npy (N, height, width), or COCO's run-length codes (.json, .npy, .pkl)."
@@ -283,20 +275,12 @@ def _open_file(path: Path, person: str | None) -> tuple[int, MaskReader]:
     return len(stack), lambda row: _to_alpha(stack[row], path)
 
 
-def _is_numeric_npy(path: Path) -> bool:
-    """Whether an .npy holds no objects; a damaged file counts as numeric and fails when read."""
-    try:
-        with path.open("rb") as file:
-            return not read_npy_header(file)[2].hasobject
-    except Exception:  # whatever a damaged header raises
-        return True
-
-
-def _load_npy(path: Path) -> Shaped[np.ndarray, "..."]:
+def _load_npy(path: Path) -> Shaped[np.ndarray, "..."] | None:
+    """Open an .npy of numbers; None if it is damaged, or holds objects."""
     try:
         return np.load(path, allow_pickle=False, mmap_mode="r")
-    except Exception as cause:  # numpy parses headers as Python: damaged ones fail in any way
-        raise InputError(f"{path} is not a readable .npy of numbers ({cause}).") from cause
+    except Exception:  # numpy parses headers as Python: damaged ones fail in any way
+        return None
 
 
 def read_mask(path: Path) -> Float32[np.ndarray, "height width"]:
@@ -306,7 +290,10 @@ def read_mask(path: Path) -> Float32[np.ndarray, "height width"]:
         InputError: If it cannot be decoded, or is not complete.
     """
     if path.suffix.lower() == ".npy":
-        return _to_alpha(np.asarray(_load_npy(path)), path)
+        stored = _load_npy(path)
+        if stored is None:
+            raise InputError(f"{path} is not a readable .npy of numbers.")
+        return _to_alpha(np.asarray(stored), path)
     try:
         with Image.open(path) as image:
             image.load()

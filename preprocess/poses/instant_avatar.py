@@ -56,9 +56,6 @@ RECOGNIZED_KEYS = (
 CLIFF_FOCAL = RelativeFocalLength(ratio=1.0, reference="diagonal")
 """The camera in which CLIFF's `global_t` is."""
 
-GENDERED_MODELS = {"f": "female", "m": "male"}
-"""Bodies of SMPL whose betas are not the neutral one's."""
-
 SCALE_TOLERANCE = 0.01
 """A stated scale that is nearer to 1 says nothing."""
 
@@ -87,20 +84,7 @@ def parse_instant_avatar(content: Any, path: Path, default_model: str) -> Motion
     motion = motion_from_arrays(collect_arrays(named, path), path, default_model=default_model)
     if "global_t" in held:
         motion = replace(motion, assumed_focal=CLIFF_FOCAL, space="camera")
-    sex = str(_gender(held, content)).lower()[:1]
-    if default_model == "smpl" and motion.body_model == "smpl" and sex in GENDERED_MODELS:
-        motion = replace(
-            motion,
-            note=f"The shape in {path.name} is one of SMPL's {GENDERED_MODELS[sex]} body; with "
-            "another body (--body) it is another person's.",
-        )
     return {"0": motion}
-
-
-def _gender(held: Mapping[Any, Any], content: Mapping[Any, Any]) -> Any:
-    """What the file says of the body's gender, if it does."""
-    said = held.get("gender", content.get("gender", ""))
-    return said.item() if isinstance(said, np.ndarray) and said.size == 1 else said
 
 
 def normalize_keys(held: Mapping[Any, Any]) -> dict[str, Any]:

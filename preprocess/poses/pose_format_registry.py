@@ -1,4 +1,4 @@
-"""Read any pose file: recognise its tracker, choose the person, explain files that are not read."""
+"""Read any pose file: recognise its tracker, choose the person, fill gaps."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,68 +16,6 @@ from preprocess.poses import mocap_formats, video_trackers
 from preprocess.poses.instant_avatar import parse_instant_avatar, parse_per_frame
 from preprocess.poses.motion_builder import MAX_GAP_FRAMES, MotionByPerson, fill_gaps
 from preprocess.poses.pose_file import read_motion
-
-ADVICE_BY_KEYS = (
-    (
-        {"mhr_model_params", "shape_params", "body_pose_params"},
-        "it is SAM 3D Body's, whose poses move another body (MHR); bring them to SMPL first "
-        "(facebookresearch/MHR converts).",
-    ),
-    (
-        {"pred_thetas", "pred_xyz_29", "pred_cam_root"},
-        "it is HybrIK's, whose places are in a crop of each picture; 4D-Humans, WHAM or GVHMR say "
-        "where people are in the whole picture.",
-    ),
-    (
-        {"pose_keypoints_2d", "keypoints", "landmarks", "people", "pose_landmarks"},
-        "it has joints in the picture, not a body's rotations; fit SMPL to them, or use a tracker "
-        "such as 4D-Humans, WHAM or GVHMR.",
-    ),
-    (
-        {"verts", "vertices", "pred_vertices"},
-        "it has vertices of meshes, not the rotations that made them.",
-    ),
-)
-"""Keys of files that are not read (one of a set is enough), and the advice for each."""
-
-ADVICE_BY_ROW_SIZE = {
-    322: "(N, 322) is Motion-X's: write root_orient = [:, :3], pose_body = [:, 3:66] and trans = "
-    "[:, 309:312] to an .npz.",
-    263: "(N, 263) is HumanML3D's, which has no rotations of SMPL.",
-    72: "(N, 72) alone does not say where the person is; write it as `poses`, with `trans` (N, 3) "
-    "in metres, to an .npz.",
-}
-"""Arrays by how many numbers a row has."""
-
-
-def describe_unknown_content(content: Any) -> str:
-    """What a file holds, and what could be done about it; a sentence."""
-    if isinstance(content, np.ndarray):
-        known = ADVICE_BY_ROW_SIZE.get(content.shape[-1]) if content.ndim == 2 else None
-        return known or f"it is an array of the shape {content.shape}."
-    keys = _keys(content)
-    for some, words in ADVICE_BY_KEYS:
-        if some & set(keys):
-            return words
-    if isinstance(content, dict):
-        listed = [key[:40] for key in keys]
-        return f"its keys are {', '.join(listed[:12]) or 'none'}{' …' if len(keys) > 12 else ''}."
-    return f"it is a {type(content).__name__}."
-
-
-def _keys(content: Any) -> list[str]:
-    """Keys of a file, or of the first of its items."""
-    if isinstance(content, (list, tuple)):
-        return _keys(content[0]) if content else []
-    if not isinstance(content, dict):
-        return []
-    keys = [str(key) for key in content]
-    first = next(iter(content.values()), None)
-    known = {key for some, _ in ADVICE_BY_KEYS for key in some}
-    return _keys(first) if isinstance(first, dict) and not known & set(keys) and (
-        known & set(_keys(first))
-    ) else keys  # fmt: skip
-
 
 TRACKERS: dict[str, Callable[[Any, bool], MotionByPerson | None]] = {
     "PHALP (4D-Humans)": video_trackers.parse_phalp,
@@ -171,11 +109,20 @@ def _recognize(
         ) from cause
     if people is None:
         raise InputError(
-            f"{path} holds no poses that are known: {describe_unknown_content(content)} Expected "
+            f"{path} holds no poses that are known: {_describe_content(content)}. Expected "
             "global_orient, body_pose and transl (or poses and trans), or a file of "
             f"{', '.join(TRACKERS)}; see docs/formats.md."
         )
     return "its tracker", people
+
+
+def _describe_content(content: Any) -> str:
+    """Tell what a file holds instead of poses."""
+    if isinstance(content, np.ndarray):
+        return f"it is an array of the shape {content.shape}"
+    if isinstance(content, dict):
+        return f"its keys are {', '.join(str(key)[:40] for key in list(content)[:12]) or 'none'}"
+    return f"it is a {type(content).__name__}"
 
 
 def _select_person(people: MotionByPerson, person: str | None, path: Path) -> Motion:
