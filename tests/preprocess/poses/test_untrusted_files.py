@@ -157,7 +157,7 @@ def test_what_is_harmless_is_read_from_any_container(tmp_path, joblib_bytes, kin
 
 
 @pytest.mark.parametrize("kind", [*TORCH_KINDS, "tensor in an array"])
-def test_without_pytorch_a_file_of_tensors_is_said_to_need_it(tmp_path, monkeypatch, kind):
+def test_without_pytorch_a_file_of_tensors_asks_for_its_installation(tmp_path, monkeypatch, kind):
     path = tmp_path / "poses.pt"
     path.write_bytes(containers(1, lambda thing: b"")[kind])
     monkeypatch.setitem(sys.modules, "torch", None)
