@@ -186,24 +186,30 @@ def run_command(program: str, work: Callable[[], int]) -> int:
 def _run_translating_errors(program: str, work: Callable[[], int]) -> int:
     try:
         return work()
-    except CommandExit as end:
-        code, message = end.code, str(end)
-    except InputError as error:
-        code, message = BAD_INPUT, str(error)
-    except ModuleNotFoundError as error:
-        missing = install_advice(error)
-        if missing is None:
-            raise
-        code, message = BAD_INPUT, missing
-    except KeyboardInterrupt as error:
-        code, message = INTERRUPTED, _with_notes("stopped by Ctrl-C.", error)
-    except (OSError, RuntimeError, MemoryError) as error:
-        failure = _machine_failure(error)
+    except (Exception, KeyboardInterrupt) as error:
+        failure = describe_failure(error)
         if failure is None:
             raise
-        code, message = failure[0], _with_notes(failure[1], error)
-    print_error(program, message)
-    return code
+        print_error(program, failure[1])
+        return failure[0]
+
+
+def describe_failure(error: BaseException) -> tuple[int, str] | None:
+    """Return exit code and message of what user or machine has caused; None for a bug."""
+    match error:
+        case CommandExit():
+            return error.code, str(error)
+        case InputError():
+            return BAD_INPUT, str(error)
+        case ModuleNotFoundError():
+            advice = install_advice(error)
+            return None if advice is None else (BAD_INPUT, advice)
+        case KeyboardInterrupt():
+            return INTERRUPTED, _with_notes("stopped by Ctrl-C.", error)
+        case OSError() | RuntimeError() | MemoryError():
+            failure = _machine_failure(error)
+            return None if failure is None else (failure[0], _with_notes(failure[1], error))
+    return None
 
 
 def print_error(program: str, message: str) -> None:

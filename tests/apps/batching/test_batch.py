@@ -1,18 +1,43 @@
-"""ia-batch as a command: its exit codes, and real captures learnt on this machine."""
+"""ia-batch as a command: its exit codes, and real captures learnt by Ray on this machine."""
 
 import json
 import os
-import signal
 import subprocess
 import sys
-import time
-from collections import Counter
 from pathlib import Path
 
 import pytest
 
 from apps import batch
-from apps.batching.ingest_attempt import ROOT
+
+ROOT = Path(batch.__file__).parents[1]
+HOOK = """
+import os, signal, sys
+
+class BeforeIngest:
+    def find_spec(self, name, path=None, target=None):
+        if name == "apps.ingest":
+            sys.meta_path.remove(self)
+            import apps.batching.ingest_attempt as attempt
+            ingest = attempt._ingest
+            from apps.animation.driving_motion import demo_motion
+            from avatar.training import held_out_pose_fitting
+            from export.bake import bake_tables, fine_tuning
+            demo_motion.__defaults__ = (6,)
+            fine_tuning.ROUNDS = 1
+            bake_tables.FINE_TUNING_PICTURES = 2
+            bake_tables.VOXEL_FACTORS = (1.6, 1.6)
+            fine_tuning.TRAINING_PX = fine_tuning.VALIDATION_PX = 128
+            held_out_pose_fitting.CORRECTIONS_PER_FRAME = 4
+            marker = os.environ["KILL_ONCE"]
+            if os.path.exists(marker):
+                os.unlink(marker)
+                os.kill(os.getpid(), signal.SIGKILL)
+
+if "KILL_ONCE" in os.environ and "default_worker.py" in " ".join(sys.orig_argv):
+    sys.meta_path.insert(0, BeforeIngest())
+"""
+"""What a process of Ray does first: it shortens the end of training, and one kills itself."""
 
 
 def records(out: Path) -> list[dict]:
@@ -20,27 +45,15 @@ def records(out: Path) -> list[dict]:
     return [json.loads(line) for line in (out / "results.jsonl").read_text().splitlines()]
 
 
-def start(captures: Path, out: Path, *words: str) -> subprocess.Popen:
-    """Start ia-batch in a process of its own."""
-    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    command = [sys.executable, "-m", "apps.batch", str(captures), "--out", str(out), *words]
-    return subprocess.Popen(
-        command, env={**os.environ, "PYTHONPATH": path}, stderr=subprocess.PIPE, text=True
-    )
-
-
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (["--out", "o"], "No captures were named"),
         (["empty", "--out", "o"], "holds no capture"),
-        (["films", "--out", "films/o"], "lies in an input"),
-        (["films", "--out", "o", "--index", "2", "--of", "2"], "between 0 and 1"),
-        (["films", "--out", "o", "--index", "1"], "belong together"),
-        (["films", "--out", "o", "--cores", "0"], "--cores is 0"),
-        (["films", "--out", "o", "--price", "x"], "--price is 'x'"),
-        (["films", "--out", "o", "--", "--resume"], "--resume cannot be given"),
-        (["films", "--out", "o", "--", "--steps", "0"], "--steps is 0"),
+        (["films", "--out", "films/o"], "--out"),
+        (["films", "--out", "o", "--cores", "0"], "--cores"),
+        (["films", "--out", "o", "--", "--resume"], "--resume"),
+        (["films", "--out", "o", "--", "--steps", "0"], "--steps"),
     ],
 )
 def test_what_cannot_be_done_is_refused_before_anything_starts(
@@ -51,110 +64,93 @@ def test_what_cannot_be_done_is_refused_before_anything_starts(
     (tmp_path / "empty").mkdir()
     monkeypatch.chdir(tmp_path)
     assert batch.main(words) == 2
-    said = capsys.readouterr().err
-    assert message in said
-    assert "Traceback" not in said
+    err = capsys.readouterr().err
+    assert message in err
+    assert "Traceback" not in err
     assert not (tmp_path / "o").exists()
 
 
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (["a", "--ray"], ["a", "--ray", "local"]),
-        (["--ray", "a", "--out", "o"], ["--ray", "local", "a", "--out", "o"]),
-        (["--ray", "auto", "a"], ["--ray", "auto", "a"]),
-        (["--ray", "10.0.0.1:6379", "a"], ["--ray", "10.0.0.1:6379", "a"]),
-        (["--ray", "s3://bucket/a"], ["--ray", "local", "s3://bucket/a"]),
-    ],
-)
-def test_the_address_of_a_cluster_may_be_left_out(words, expected):
-    assert batch.fill_ray_address(words) == expected
+def test_without_ray_it_says_what_to_install(monkeypatch, capsys):
+    monkeypatch.setattr(batch, "find_spec", lambda module: None if module == "ray" else True)
+    assert batch.main(["films", "--out", "o"]) == 2
+    assert "[learn,cluster]" in capsys.readouterr().err
 
 
-def test_refused_captures_end_with_1_and_are_not_tried_again(tmp_path, copies, capsys):
-    copies(tmp_path / "films", ["bad", "bad2"])
-    out = tmp_path / "out"
-    words = [str(tmp_path / "films"), "--out", str(out), "--price", "0.04 EUR"]
-    assert batch.main(words) == 1
-    assert [record["exit_code"] for record in records(out)] == [2, 2]
-    assert "is no video that can be opened" in (out / "summary.html").read_text()
-    assert "refused  bad: " in capsys.readouterr().err
-    assert batch.main(words) == 1
-    assert len(records(out)) == 2
-    copies(tmp_path / "films", ["bad3"])  # the input grows
-    assert batch.main(words) == 1
-    assert [record["capture"] for record in records(out)[2:]] == ["bad3"]
-
-
-def test_parts_and_their_merge(tmp_path, copies):
-    copies(tmp_path / "films", ["bad", "bad2", "bad3"])
+def test_a_broken_capture_costs_a_line_and_what_ended_is_not_learnt_again(
+    tmp_path, copies, scripted, capsys
+):
+    copies(tmp_path / "films", ["bad", "a", "weak"])
     out = tmp_path / "out"
     words = [str(tmp_path / "films"), "--out", str(out)]
-    for index in "01":
-        assert batch.main([*words, "--index", index, "--of", "2"]) == 1
-    assert sorted(path.parent.name for path in out.glob("_parts/*/results.jsonl")) == [
-        "0-of-2", "1-of-2",
-    ]  # fmt: skip
-    assert not (out / "summary.html").exists()
-    assert batch.main([*words, "--merge"]) == 1
-    assert Counter(record["part"] for record in records(out)) == {"0/2": 2, "1/2": 1}
-    assert (out / "summary.html").exists()
     assert batch.main(words) == 1
-    assert len(records(out)) == 3
+    assert scripted == ["a", "bad", "weak"]
+    assert [r["exit_code"] for r in records(out)] == [0, 2, 1]
+    assert "no <person>" in capsys.readouterr().err
+    copies(tmp_path / "films", ["b"])  # the input grows
+    assert batch.main(words) == 1
+    assert scripted[3:] == ["b"]
+    assert (out / "summary.html").read_text().count("turning.webp") == 2
+    assert batch.main([*words, "--again"]) == 1
+    assert scripted[4:] == ["bad", "weak"]
+    assert batch.main([str(tmp_path / "films" / "a"), "--out", str(out)]) == 0
 
 
-@pytest.mark.parametrize("signals", [[signal.SIGTERM], [signal.SIGINT, signal.SIGINT]])
-def test_sigterm_or_a_second_ctrl_c_ends_what_runs(tmp_path, copies, hooked, signals):
-    copies(tmp_path / "films", ["hangs"])
-    running = start(tmp_path / "films", tmp_path / "out", "--scratch", str(tmp_path / "work"))
-    for _ in range(1200):
-        logs = (tmp_path / "work").glob("*/ingest.log")
-        if any("about to hang" in log.read_text() for log in logs):
-            break
-        assert running.poll() is None
-        time.sleep(0.05)
-    assert running.stderr is not None
-    running.send_signal(signals[0])
-    said = ""
-    if signals[1:]:  # the first one waits for what runs
-        while "Stopping; captures that run are finished first" not in said:
-            said += running.stderr.readline()
-        running.send_signal(signals[1])
-    said += running.communicate(timeout=60)[1]
-    assert running.returncode == 130
-    assert "To go on: ia-batch" in said
-    assert not (tmp_path / "out" / "results.jsonl").exists()
-    assert not list((tmp_path / "work").glob("ia-batch-*"))
+def test_ctrl_c_keeps_what_is_done(tmp_path, copies, scripted, monkeypatch, ended):
+    copies(tmp_path / "films", ["a", "b"])
+    words = [str(tmp_path / "films"), "--out", str(tmp_path / "out")]
+
+    def stop_after_one(captures, arguments):
+        yield ended(captures[0])
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as context:
+        context.setattr(batch, "run_attempts", stop_after_one)
+        assert batch.main(words) == 130
+    assert "not learnt yet" in (tmp_path / "out" / "summary.html").read_text()
+    assert batch.main(words) == 0
+    assert scripted == ["b"]
+
+
+def call(*words: object, cwd: Path = ROOT, **environment: str) -> subprocess.CompletedProcess:
+    """Run ia-batch in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-m", "apps.batch", *map(str, words)],
+        cwd=cwd, env={**os.environ, **environment}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
 
 
 @pytest.mark.slow
-def test_a_killed_batch_goes_on_where_it_ended(tmp_path, copies, hooked):
-    copies(tmp_path / "films", ["a", "b", "c", "eats", "bad"])
-    out = tmp_path / "out"
-    words = ["--cores", "1", "--memory", "2", "--retries", "0"]
-    words += ["--scratch", str(tmp_path / "work"), "--", "--steps", "60"]
-    first = start(tmp_path / "films", out, *words)
-    while first.poll() is None:
-        time.sleep(0.2)
-        if (out / "results.jsonl").exists() and any(r["status"] == "done" for r in records(out)):
-            break
-    first.kill()
-    first.communicate()
-    before = records(out)
-    second = start(tmp_path / "films", out, *words)
-    _, said = second.communicate(timeout=900)
-    assert second.returncode == 1, said
-    ended = {record["capture"]: record for record in records(out)}
-    assert len(records(out)) == len(ended) == 5  # nothing was learnt twice
-    assert records(out)[: len(before)] == before
-    causes = {name: record["cause"] for name, record in ended.items()}
-    assert causes["a"] == causes["b"] == causes["c"] == ""
-    assert "2.0 GB were allowed" in causes["eats"]
-    assert "no video" in causes["bad"]
-    for name in "abc":
-        assert {"avatar.iavatar", "report.html", "turning.webp"} <= set(os.listdir(out / name))
-    assert not list((tmp_path / "work").glob("ia-batch-*"))
-    assert "3 done" in said
+def test_ray_learns_captures_though_one_is_broken_and_a_process_is_killed(tmp_path, copies):
+    copies(tmp_path / "films", ["a", "b", "bad"])
+    (tmp_path / "hook").mkdir()
+    (tmp_path / "hook" / "sitecustomize.py").write_text(HOOK, encoding="utf-8")
+    (tmp_path / "kill").touch()
+    path = os.pathsep.join([str(tmp_path / "hook"), str(ROOT)])
+    words = [tmp_path / "films", "--out", tmp_path / "out", "--cores", "1", "--retries", "1"]
+    first = call(*words, "--", "--steps", "60", PYTHONPATH=path, KILL_ONCE=str(tmp_path / "kill"))
+    assert first.returncode == 1, first.stderr
+    assert not (tmp_path / "kill").exists()
+    ends = {r["capture"]: r for r in records(tmp_path / "out")}
+    assert {name: r["status"] for name, r in ends.items()} == {
+        "a": "done", "b": "done", "bad": "refused",
+    }  # fmt: skip
+    assert ends["a"]["figures"]["steps"] == 60
+    kept = {"avatar.iavatar", "ingest.log", "report.html", "report.json", "turning.webp"}
+    for name in "ab":
+        assert kept <= set(os.listdir(tmp_path / "out" / name))
+    again = call(*words, "--", "--steps", "60", PYTHONPATH=path)
+    assert again.returncode == 1, again.stderr
+    assert len(records(tmp_path / "out")) == 3
+
+
+@pytest.mark.slow
+def test_a_capture_that_fits_no_node_is_bad_input(tmp_path, copies):
+    copies(tmp_path / "films", ["bad"])
+    done = call(tmp_path / "films", "--out", tmp_path / "out", "--memory", "100000")
+    assert done.returncode == 2, done.stderr
+    assert "--memory" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_help_teaches(capsys):

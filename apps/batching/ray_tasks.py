@@ -1,0 +1,118 @@
+"""Attempts as tasks of a Ray cluster, which places them and repeats those that fail."""
+
+import logging
+import os
+from collections.abc import Generator, Iterable
+from itertools import islice
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from apps.batching.batch_arguments import RAY_LOCAL, BatchArguments
+from apps.batching.capture_discovery import BatchCapture
+from apps.batching.ingest_attempt import Attempt, AttemptFailure, learn_capture, record_of
+from apps.cli.hardware import usable_cores
+from capture.input_error import InputError
+
+MAX_SUBMITTED = 1000
+"""Tasks that Ray holds at a time, running or waiting."""
+OBJECT_STORE_BYTES = 200_000_000
+"""Memory for what attempts bring back (about 5 MB each), where this machine alone is used."""
+
+
+def run_attempts(
+    captures: Iterable[BatchCapture], arguments: BatchArguments
+) -> Generator[Attempt, None, None]:
+    """Learn captures, and yield the last attempt at each as it ends.
+
+    Closing the iterator ends what runs.
+
+    Args:
+        captures: To learn.
+        arguments: Of the batch.
+
+    Raises:
+        InputError: If there is no cluster, or no node has room for a capture.
+    """
+    import ray
+
+    captures = list(captures)
+    with TemporaryDirectory(prefix="ia-batch-") as folder:  # also of workers that are killed
+        scratch = folder if arguments.ray == RAY_LOCAL else None
+        _connect(ray, arguments.ray)
+        try:
+            needs = {capture.name: _resources(capture, arguments) for capture in captures}
+            _check_room(ray, needs.values())
+            task = ray.remote(learn_capture).options(
+                max_calls=1,  # a process of its own
+                max_retries=arguments.retries,
+                retry_exceptions=[AttemptFailure],
+            )
+            waiting, running = iter(captures), {}
+            while True:
+                for capture in islice(waiting, MAX_SUBMITTED - len(running)):
+                    one = task.options(name=capture.name, **needs[capture.name])
+                    running[one.remote(capture, arguments, scratch)] = capture
+                if not running:
+                    return
+                (ended,), _ = ray.wait(list(running), num_returns=1)
+                yield _attempt(ray, ended, running.pop(ended))
+        finally:
+            ray.shutdown()
+
+
+def _connect(ray: Any, address: str) -> None:
+    """Connect to a cluster, or start one of this machine."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent anywhere
+    own: dict[str, Any] = {}
+    if address == RAY_LOCAL:
+        own = {"num_cpus": usable_cores(), "object_store_memory": OBJECT_STORE_BYTES}
+        own["include_dashboard"] = False
+    try:
+        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **own)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise InputError(
+            f"--ray {address}: there is no cluster to connect to ({error}). Start one: ray start "
+            "--head; or omit --ray to use this machine alone."
+        ) from error
+
+
+def _resources(capture: BatchCapture, arguments: BatchArguments) -> dict[str, Any]:
+    """Return what a capture needs, as options of a Ray task."""
+    return {
+        "num_cpus": arguments.cores_of(capture),
+        "num_gpus": arguments.gpus_of(capture),
+        "memory": int(1e9 * arguments.memory),
+    }
+
+
+def _check_room(ray: Any, needs: Iterable[dict[str, Any]]) -> None:
+    """Raise if a capture fits no node: its task would wait for ever."""
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    for need in needs:
+        wanted = {"CPU": need["num_cpus"], "GPU": need["num_gpus"], "memory": need["memory"]}
+        if not any(all(n.get(key, 0) >= wanted[key] for key in wanted) for n in nodes):
+            sizes = ", ".join(
+                f"{n.get('CPU', 0):g} cores and {n.get('GPU', 0):g} GPUs with "
+                f"{n.get('memory', 0) / 1e9:.1f} GB"
+                for n in nodes
+            )
+            raise InputError(
+                f"No node has {wanted['CPU']} cores and {wanted['GPU']:g} GPUs with "
+                f"{wanted['memory'] / 1e9:.1f} GB for a capture; there are {sizes}. Lower --cores, "
+                "--gpus or --memory, or add a larger node."
+            )
+
+
+def _attempt(ray: Any, task: Any, capture: BatchCapture) -> Attempt:
+    """Return the last attempt of a task that has ended."""
+    try:
+        return ray.get(task)
+    except ray.exceptions.RayTaskError as error:
+        if isinstance(error.cause, AttemptFailure):
+            return error.cause.attempt
+        cause = f"{type(error.cause).__name__}: {error.cause}"
+    except ray.exceptions.OutOfMemoryError:
+        cause = "its node ran out of memory, and Ray ended the attempt"
+    except ray.exceptions.RayError as error:
+        cause = f"its process or its node was lost ({type(error).__name__})"
+    return Attempt(record=record_of(capture, None, cause))
