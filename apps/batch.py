@@ -11,7 +11,7 @@ from apps.batching.batch_folder import RESULTS_NAME, BatchFolder
 from apps.batching.capture_discovery import find_captures, parse_options, split_paths
 from apps.batching.ray_tasks import run_attempts
 from apps.batching.remote_files import RemoteFileError
-from apps.batching.summary_page import describe_result, headline, summary_page
+from apps.batching.summary_page import Results, describe_result, headline, summary_page
 from apps.cli.command_line import (
     DISTRIBUTION,
     DONE,
@@ -82,12 +82,18 @@ def batch(arguments: BatchArguments, ingest_words: Sequence[str], console: Conso
                         states[record.capture] = record
                         console.info(f"{record.capture}: {describe_result(record)}")
         finally:
-            folder.write_text(PAGE_NAME, summary_page(states, Path(folder.place).name))
-            console.info(headline(states))
-            console.print_artifact("results", f"{folder.place}/{RESULTS_NAME}")
-            console.print_artifact("look at it", f"{folder.place}/{PAGE_NAME}")
+            if folder.records:
+                _sum_up(folder, states, console)
     done = all(record is not None and record.status == "done" for record in states.values())
     return DONE if done else NO_AVATAR
+
+
+def _sum_up(folder: BatchFolder, results: Results, console: Console) -> None:
+    """Write the contact sheet, and print what it says in short."""
+    folder.write_text(PAGE_NAME, summary_page(results, Path(folder.place).name))
+    console.info(headline(results))
+    console.print_artifact("results", f"{folder.place}/{RESULTS_NAME}")
+    console.print_artifact("look at it", f"{folder.place}/{PAGE_NAME}")
 
 
 if __name__ == "__main__":

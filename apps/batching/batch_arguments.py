@@ -50,8 +50,6 @@ class BatchArguments:
     because --seconds makes fewer steps on fewer cores."""
     memory: Annotated[float, arg(metavar="GB")] = 2.5
     """Memory that is set aside per capture; Ray ends and repeats attempts where it runs out."""
-    gpus: float = 1.0
-    """GPUs per capture with --device cuda; a fraction shares one."""
     limit: float = 3600.0
     """Seconds after which an attempt is ended; 0 for none."""
     retries: int = 2
@@ -71,7 +69,7 @@ class BatchArguments:
         """
         if not self.captures:
             raise InputError("No captures were named; name a folder, a video or a table.")
-        for name, least in (("cores", 1), ("retries", 0), ("limit", 0), ("memory", 0), ("gpus", 0)):
+        for name, least in (("cores", 1), ("retries", 0), ("limit", 0), ("memory", 0)):
             if not getattr(self, name) >= least:
                 raise InputError(
                     f"--{name} is {getattr(self, name)}, but must be at least {least}."
@@ -92,7 +90,3 @@ class BatchArguments:
         """Return the cores of a capture: its own --threads, or --cores, or all of this machine."""
         cores = min(self.cores, usable_cores()) if self.ray == RAY_LOCAL else self.cores
         return parse_options(capture.options).threads or cores
-
-    def gpus_of(self, capture: BatchCapture) -> float:
-        """Return the GPUs of a capture."""
-        return self.gpus if parse_options(capture.options).device == "cuda" else 0.0

@@ -63,13 +63,19 @@ class BatchFolder:
 
         Raises:
             CommandExit: If another batch is writing here.
-            InputError: If a file of another program is called like the results.
+            InputError: If it holds files of another program.
         """
         with ExitStack() as held:
             if self.path is not None:
+                marker = OutputFileList(self.path)
+                if self.path.exists() and any(self.path.iterdir()) and not marker.exists():
+                    raise InputError(
+                        f"{self.path} holds files that ia-batch did not write. Name a folder that "
+                        "is empty or new (--out)."
+                    )
                 held.enter_context(claim_folder(self.path, console))
-                OutputFileList(self.path).create()
-                held.callback(OutputFileList(self.path).remove_if_empty)
+                marker.create()
+                held.callback(marker.remove_if_empty)
             self._read()
             try:
                 yield
@@ -85,17 +91,16 @@ class BatchFolder:
             again: Whether it is learnt if it was refused or has failed before.
 
         Raises:
-            InputError: If files of another program lie where its avatar would be written.
+            InputError: If files of another program lie where it would be written.
         """
         latest = next((r for r in reversed(self.records) if r.capture == capture.name), None)
         if latest is not None and latest.key == (capture.input_key, capture.options_key):
             is_there = capture.name in self._packages
             if is_there if latest.status == "done" else not again:
                 return latest
-        if capture.name in (RESULTS_NAME, FAILED_NAME):
-            raise InputError(f"A capture cannot be called {capture.name}. Rename it.")
         if self.path is not None:
             check_replaceable_folder(self.path / capture.name)
+            check_replaceable_folder(self.path / FAILED_NAME / capture.name)
         return None
 
     def place_attempt(self, attempt: Attempt) -> AttemptRecord:
@@ -128,7 +133,7 @@ class BatchFolder:
         if self.path is None:
             self._send(name, text.encode())
         else:
-            write_text_atomically(self.path / name, text)
+            write_text_atomically(self.path / name, text, replace=True)
 
     def _read(self) -> None:
         """Read the results, and which packages are there."""
@@ -149,12 +154,8 @@ class BatchFolder:
 
     def _save(self) -> None:
         """Write all results."""
-        text = "".join(map(_line, self.records))
         self._saved_at = time.monotonic()
-        if self.path is None:
-            self._send(RESULTS_NAME, text.encode())
-        else:
-            write_text_atomically(self.path / RESULTS_NAME, text, replace=True)
+        self.write_text(RESULTS_NAME, "".join(map(_line, self.records)))
 
     def _send(self, name: str, content: bytes) -> None:
         """Write a file behind a URL."""

@@ -18,7 +18,14 @@ from rich.console import Console as RichConsole
 from apps.batching.batch_arguments import BatchArguments
 from apps.batching.capture_discovery import BatchCapture
 from apps.batching.remote_files import fetch_files, is_url
-from apps.cli.command_line import BAD_INPUT, DONE, NO_AVATAR, describe_failure, parse_arguments
+from apps.cli.command_line import (
+    BAD_INPUT,
+    DONE,
+    NO_AVATAR,
+    CommandExit,
+    describe_failure,
+    parse_arguments,
+)
 from apps.cli.console import Console
 from apps.cli.hardware import describe_machine
 from apps.run.ingest_arguments import IngestArguments
@@ -105,10 +112,6 @@ class AttemptFailure(Exception):  # noqa: N818 - of an attempt, which may be mad
         return self.attempt.record.cause
 
 
-class TimeLimitError(Exception):
-    """An attempt took longer than --limit."""
-
-
 def record_of(
     capture: BatchCapture, exit_code: int | None, cause: str, **more: Any
 ) -> AttemptRecord:
@@ -189,10 +192,10 @@ def _ingest(
 
 @contextmanager
 def _time_limit(seconds: float, log: TextIO) -> Iterator[None]:
-    """Raise `TimeLimitError` in a block that takes too long; end the process if that fails."""
+    """Raise `CommandExit` in a block that takes too long; end the process if that fails."""
 
     def stop(signal_number: int, frame: object) -> None:
-        raise TimeLimitError(f"took longer than {seconds:g} s (--limit)")
+        raise CommandExit(f"took longer than {seconds:g} s (--limit)", NO_AVATAR)
 
     if seconds:
         signal.signal(signal.SIGALRM, stop)

@@ -2,6 +2,7 @@
 
 import logging
 import os
+import signal
 from collections.abc import Generator, Iterable
 from itertools import islice
 from tempfile import TemporaryDirectory
@@ -42,11 +43,11 @@ def run_attempts(
         try:
             needs = {capture.name: _resources(capture, arguments) for capture in captures}
             _check_room(ray, needs.values())
-            task = ray.remote(learn_capture).options(
+            task = ray.remote(
                 max_calls=1,  # a process of its own
                 max_retries=arguments.retries,
                 retry_exceptions=[AttemptFailure],
-            )
+            )(learn_capture)
             waiting, running = iter(captures), {}
             while True:
                 for capture in islice(waiting, MAX_SUBMITTED - len(running)):
@@ -67,6 +68,7 @@ def _connect(ray: Any, address: str) -> None:
     if address == RAY_LOCAL:
         own = {"num_cpus": usable_cores(), "object_store_memory": OBJECT_STORE_BYTES}
         own["include_dashboard"] = False
+    on_sigterm = signal.getsignal(signal.SIGTERM)
     try:
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **own)
     except (ConnectionError, ValueError, RuntimeError) as error:
@@ -74,32 +76,25 @@ def _connect(ray: Any, address: str) -> None:
             f"--ray {address}: there is no cluster to connect to ({error}). Start one: ray start "
             "--head; or omit --ray to use this machine alone."
         ) from error
+    signal.signal(signal.SIGTERM, on_sigterm)  # Ray's own would print a stack and exit
 
 
-def _resources(capture: BatchCapture, arguments: BatchArguments) -> dict[str, Any]:
+def _resources(capture: BatchCapture, arguments: BatchArguments) -> dict[str, int]:
     """Return what a capture needs, as options of a Ray task."""
-    return {
-        "num_cpus": arguments.cores_of(capture),
-        "num_gpus": arguments.gpus_of(capture),
-        "memory": int(1e9 * arguments.memory),
-    }
+    return {"num_cpus": arguments.cores_of(capture), "memory": int(1e9 * arguments.memory)}
 
 
-def _check_room(ray: Any, needs: Iterable[dict[str, Any]]) -> None:
+def _check_room(ray: Any, needs: Iterable[dict[str, int]]) -> None:
     """Raise if a capture fits no node: its task would wait for ever."""
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    sizes = [(int(node.get("CPU", 0)), int(node.get("memory", 0))) for node in nodes]
     for need in needs:
-        wanted = {"CPU": need["num_cpus"], "GPU": need["num_gpus"], "memory": need["memory"]}
-        if not any(all(n.get(key, 0) >= wanted[key] for key in wanted) for n in nodes):
-            sizes = ", ".join(
-                f"{n.get('CPU', 0):g} cores and {n.get('GPU', 0):g} GPUs with "
-                f"{n.get('memory', 0) / 1e9:.1f} GB"
-                for n in nodes
-            )
+        cores, memory = need["num_cpus"], need["memory"]
+        if not any(cores <= most and memory <= available for most, available in sizes):
+            present = ", ".join(f"{most} cores with {each / 1e9:.1f} GB" for most, each in sizes)
             raise InputError(
-                f"No node has {wanted['CPU']} cores and {wanted['GPU']:g} GPUs with "
-                f"{wanted['memory'] / 1e9:.1f} GB for a capture; there are {sizes}. Lower --cores, "
-                "--gpus or --memory, or add a larger node."
+                f"No node has {cores} cores with {memory / 1e9:.1f} GB for a capture; there are "
+                f"{present}. Lower --cores or --memory, or add a larger node."
             )
 
 

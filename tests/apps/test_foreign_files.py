@@ -139,8 +139,6 @@ def test_a_place_with_other_peoples_files_is_refused(
         "ia-batch {capture} --out {capture}/runs",
         "ia-batch {capture} --out {above}",
         "ia-batch {above}/rows.csv --out {above}/others",
-        "ia-batch {above}/film.mp4 --out {above}/new --scratch {above}/film.mp4",
-        "ia-batch {capture} --out {above}/new --scratch {capture}/masks",
         "ia-batch {above}/film.mp4 --out {capture}/masks -- --masks {capture}/masks",
     ],
 )
@@ -159,24 +157,6 @@ def test_no_command_writes_over_what_it_reads(
     assert called(line, capture=capture, above=tmp_path, run=run, package=package) == 2
     assert contents(tmp_path) == before
     assert "Traceback" not in capsys.readouterr().err
-
-
-def test_a_batch_beside_other_peoples_files_leaves_them(hoard, tmp_path, monkeypatch, capsys):
-    for name in ("ia-batch-avatars/a.txt", "ia-batch-1-2/in-use-by-me.txt", "in-use"):
-        (hoard / name).parent.mkdir(exist_ok=True)
-        (hoard / name).write_text("mine")
-    (tmp_path / "bad.mp4").write_text("no video")
-    before = contents(tmp_path)
-    monkeypatch.chdir(tmp_path)
-    line = "ia-batch bad.mp4 --out {hoard} --scratch {hoard} --retries 0"
-    for again in ("", " --again"):
-        assert called(line + again, hoard=hoard) == 1, capsys.readouterr().err
-        assert unchanged(before, tmp_path), again
-    assert (hoard / "_failed" / "bad" / "ingest.log").is_file()
-    (hoard / "results.jsonl").write_text("mine")
-    before = contents(hoard)
-    assert called(line + " --again", hoard=hoard) == 2
-    assert contents(hoard) == before
 
 
 @pytest.mark.slow

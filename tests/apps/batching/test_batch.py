@@ -111,12 +111,13 @@ def test_ctrl_c_keeps_what_is_done(tmp_path, copies, scripted, monkeypatch, ende
     assert scripted == ["b"]
 
 
-def call(*words: object, cwd: Path = ROOT, **environment: str) -> subprocess.CompletedProcess:
+def call(*words: object, **environment: str) -> subprocess.CompletedProcess:
     """Run ia-batch in a process of its own."""
+    command = [sys.executable, "-m", "apps.batch", *map(str, words)]
+    environment = {**os.environ, "RAY_worker_niceness": "0", **environment}
     return subprocess.run(
-        [sys.executable, "-m", "apps.batch", *map(str, words)],
-        cwd=cwd, env={**os.environ, **environment}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False
+    )
 
 
 @pytest.mark.slow

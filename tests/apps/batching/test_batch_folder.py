@@ -81,13 +81,20 @@ def test_a_line_that_was_cut_short_is_dropped(named, ended, tmp_path):
 
 
 def test_files_of_others_stay(named, ended, tmp_path):
-    (tmp_path / "a").mkdir()
-    (tmp_path / "a" / "notes.txt").write_text("mine")
+    (tmp_path / "others").mkdir()
+    (tmp_path / "others" / "results.jsonl").write_text("mine")
+    with pytest.raises(InputError, match="others"):
+        waiting(str(tmp_path / "others"), [])
+    out = tmp_path / "out"
+    place(str(out), ended(named("a")))
+    (out / "b").mkdir()
+    (out / "b" / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match=r"notes\.txt"):
-        waiting(str(tmp_path), [named("a")])
-    (tmp_path / "results.jsonl").write_text('{"mine": 1}\n')
+        waiting(str(out), [named("b")])
+    (out / "results.jsonl").write_text('{"mine": 1}\n')
     with pytest.raises(InputError, match=r"results\.jsonl"):
-        waiting(str(tmp_path), [])
+        waiting(str(out), [])
+    assert (out / "results.jsonl").read_text() == '{"mine": 1}\n'
 
 
 def test_one_batch_at_a_time(tmp_path):
