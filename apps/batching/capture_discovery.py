@@ -29,7 +29,7 @@ KEYWORDS = re.compile(r"static|solve|segmenter:.*")
 """Values of path options that are no paths."""
 BATCH_OPTIONS = ("out", "resume", "overwrite", "json", "view", "live", "realtime")
 """Options of ia-ingest that a batch sets itself, or that need a person or a camera."""
-COST_OPTIONS = ("video", "threads", "device")
+COST_OPTIONS = ("video", "threads")
 """Options that do not change the avatar; with others it is learnt again."""
 
 Options = tuple[dict[str, str], tuple[str, ...]]

@@ -43,11 +43,9 @@ def run_attempts(
         try:
             needs = {capture.name: _resources(capture, arguments) for capture in captures}
             _check_room(ray, needs.values())
-            task = ray.remote(
-                max_calls=1,  # a process of its own
-                max_retries=arguments.retries,
-                retry_exceptions=[AttemptFailure],
-            )(learn_capture)
+            own_process: dict[str, Any] = {"max_calls": 1}
+            retrying = {"max_retries": arguments.retries, "retry_exceptions": [AttemptFailure]}
+            task = ray.remote(**own_process, **retrying)(learn_capture)
             waiting, running = iter(captures), {}
             while True:
                 for capture in islice(waiting, MAX_SUBMITTED - len(running)):
