@@ -1,4 +1,4 @@
-"""ia-evaluate: score avatars, and pictures of other systems, as a table."""
+"""ia-evaluate: score avatars as a table."""
 
 import sys
 from collections.abc import Iterator, Sequence
@@ -17,6 +17,8 @@ from apps.cli.command_line import (
 from apps.cli.console import Console
 from apps.cli.shared_options import parse_frame_range
 from apps.evaluation.evaluate_arguments import EvaluateArguments
+from apps.ingest import ingest
+from apps.run.ingest_arguments import IngestArguments
 from apps.run.run_folder import RunFolder
 from capture.input_error import InputError
 
@@ -28,12 +30,12 @@ if TYPE_CHECKING:  # torch is loaded after --help has been answered
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
-    given = parse_arguments(EvaluateArguments, "ia-evaluate", argv)
-    return run_command("ia-evaluate", lambda: evaluate(given, Console()))
+    arguments = parse_arguments(EvaluateArguments, "ia-evaluate", argv)
+    return run_command("ia-evaluate", lambda: evaluate(arguments, Console()))
 
 
 def evaluate(arguments: EvaluateArguments, console: Console) -> int:
-    """Score avatars and print the table.
+    """Score avatars, print the table, and write the files that were asked for.
 
     Raises:
         InputError: If an input is missing, unreadable or does not match the others.
@@ -42,35 +44,38 @@ def evaluate(arguments: EvaluateArguments, console: Console) -> int:
     arguments.validate()
     with console.status("loading torch"):
         from apps.cli.command_line import stop_on_interrupt
+        from apps.evaluation.evaluation_card import evaluation_conditions, evaluation_page
         from apps.evaluation.evaluation_session import EvaluationSession
         from apps.evaluation.score_table import evaluations_to_json, markdown_table
+        from avatar.evaluation.perceptual import Lpips
         from capture.atomic_files import write_text_atomically
 
-    found: list[AvatarEvaluation] = []
+    lpips = Lpips(arguments.lpips, arguments.lpips_weights)
+    scored: list[AvatarEvaluation] = []
+    if lpips.unavailable is not None:
+        console.info(lpips.unavailable)
     with stop_on_interrupt(console, "the table shows the frames scored by now") as stop:
-        session = EvaluationSession.begin(arguments, console, stop)
-        found += (
+        session = EvaluationSession(arguments=arguments, console=console, stop=stop, lpips=lpips)
+        scored += (
             evaluation
             for evaluation in _evaluate_all(session)
             if any(row.scores for row in evaluation.rows)
         )
-    if not found:
+    if not scored:
         if stop.is_set():
             return INTERRUPTED
         raise InputError("No frame shows the person, so there is nothing to score.")
-    table = markdown_table(found)
+    table, conditions = markdown_table(scored), evaluation_conditions(scored, lpips)
     print(table, end="")  # noqa: T201 - the table goes to stdout, for scripts
     if arguments.json is not None:
-        write_text_atomically(
-            arguments.json, evaluations_to_json(found), replace=arguments.overwrite
-        )
+        text = evaluations_to_json(scored, conditions)
+        write_text_atomically(arguments.json, text, replace=arguments.overwrite)
     if arguments.markdown is not None:
         write_text_atomically(arguments.markdown, table, replace=arguments.overwrite)
-    if arguments.card is not None:
-        from apps.evaluation.evaluation_card import write_card
-
-        write_card(arguments.card, found, session.lpips)
-        console.print_artifact("card", arguments.card / "card.html")
+    if arguments.page is not None:
+        page = evaluation_page(scored, conditions)
+        write_text_atomically(arguments.page, page, replace=arguments.overwrite)
+        console.print_artifact("page", arguments.page)
     return INTERRUPTED if stop.is_set() else DONE
 
 
@@ -91,18 +96,14 @@ def _evaluate_all(session: "EvaluationSession") -> "Iterator[AvatarEvaluation]":
                 raise InputError(f"{path} is a dataset with its own test frames; omit --on.")
             above = arguments.out or Path("runs") / path.resolve().name
             for subject in subjects:
-                if stop.is_set():
-                    return
-                yield from _evaluate_subject(subject, above, session)
+                if not stop.is_set():
+                    yield from _evaluate_subject(subject, above, session)
         else:
             raise InputError(
                 f"{path} is neither a run (with checkpoint/), nor an .iavatar package, nor a "
                 "folder with subjects of PeopleSnapshot (such as male-3-casual) or of NeuMan (such "
                 "as seattle)."
             )
-    for folder in arguments.pictures:
-        if not stop.is_set():
-            yield session.evaluate_pictures(folder)
 
 
 def _evaluate_package(path: Path, session: "EvaluationSession") -> "AvatarEvaluation":
@@ -144,8 +145,9 @@ def _evaluate_subject(
         frames=parse_frame_range(test.frames),
     )
     frames = capture_frames(inputs, run.body_file, arguments.size or subject.size_px)
-    scored = session.evaluate_run(subject.name, run, frames, tuple(BACKGROUNDS))
-    yield replace(scored, paper=subject.paper or None)
+    yield session.evaluate_run(
+        subject.name, run, frames, backgrounds=tuple(BACKGROUNDS), paper=subject.paper or None
+    )
 
 
 def _train_subject(
@@ -157,15 +159,13 @@ def _train_subject(
         Whether training is complete; after Ctrl-C the next evaluation continues it.
     """
     from apps.evaluation.evaluation_frames import is_trained
-    from apps.ingest import ingest
-    from apps.run.ingest_arguments import IngestArguments
 
     arguments, console = session.arguments, session.console
     if is_trained(run, seconds=arguments.seconds, steps=arguments.steps):
         console.info(f"{subject.name} was trained before, in {run.path}.")
         return True
     console.info(f"Training {subject.name}.")
-    words = IngestArguments(
+    training = IngestArguments(
         video=train.folder,
         poses=train.poses,
         frames=train.frames,
@@ -178,7 +178,7 @@ def _train_subject(
         hold_out=0,
     )
     try:
-        return ingest(words, console) != INTERRUPTED
+        return ingest(training, console) != INTERRUPTED
     except CommandExit as end:
         if end.code not in (NO_AVATAR, INTERRUPTED):
             raise

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import tyro
 
-from apps.report.report_figures import CurvePoint, largest_drop
+from apps.report.report_schema import CurvePoint
 from avatar.evaluation.image_metrics import composite_on_white, ground_truth_on_white, psnr, ssim
 from benchmarks.hardware import ROOT, Hardware
 from export.player import Player, premultiply
@@ -164,6 +164,19 @@ def training_rows(report: dict[str, Any]) -> list[EndToEndRow]:
         *rows,
         EndToEndRow(name="largest fall of a frame from its best, dB", value=fall, reference=told),
     ]
+
+
+def largest_drop(curve: list[CurvePoint]) -> float | None:
+    """Return the largest drop of a frame below its own earlier best, dB; None if none can have."""
+    best: dict[tuple[int, int], float] = {}
+    drops = list[float]()
+    for point in curve:
+        for number, score in point.frames:
+            frame = point.video, number
+            if frame in best:
+                drops.append(max(0.0, best[frame] - score))
+            best[frame] = max(best.get(frame, score), score)
+    return max(drops, default=None)
 
 
 def novel_rows(run: Path, unseen: list[Observation]) -> list[EndToEndRow]:

@@ -141,12 +141,12 @@ Lens = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "k"]]
 
 def find_people_snapshot(folder: Path) -> list[DatasetSubject]:
     """Find the paper's subjects in a folder, which may be a subject itself."""
-    found = []
+    subjects = []
     for name in SPLITS:
         for place in (folder / name, folder):
             if place.resolve().name == name and place.is_dir():
                 opening = _open_raw if _is_raw(place) else _open_prepared
-                found.append(
+                subjects.append(
                     DatasetSubject(
                         name=name,
                         open_splits=partial(opening, name, place),
@@ -155,7 +155,7 @@ def find_people_snapshot(folder: Path) -> list[DatasetSubject]:
                     )
                 )
                 break
-    return found
+    return subjects
 
 
 def _is_raw(folder: Path) -> bool:
@@ -177,11 +177,7 @@ def _open_prepared(
 def _open_raw(
     name: str, place: Path, into: Path, console: Console
 ) -> tuple[SplitFrames, SplitFrames]:
-    """Write the protocol's frames of the original files: undistorted, at half the resolution.
-
-    Raises:
-        InputError: If a file is missing or damaged, or h5py is not installed.
-    """
+    """Write the protocol's frames of the original files: undistorted, at half the resolution."""
     splits = {
         split: range(*map(int, frames.split(":")))
         for split, frames in zip(("train", "test"), SPLITS[name], strict=True)
@@ -230,11 +226,7 @@ def _write_images(
 
 
 def _read_camera(path: Path) -> tuple[dict[str, Any], Lens]:
-    """Read camera.pkl: contents of cameras.npz, and the matrix and distortion of the lens.
-
-    Raises:
-        InputError: If it lacks something, or moves the camera.
-    """
+    """Read camera.pkl: contents of cameras.npz, and the matrix and distortion of the lens."""
     stored = read_untrusted_file(path)
     missing = [key for key in CAMERA_KEYS if not isinstance(stored, dict) or key not in stored]
     if missing:
@@ -250,11 +242,7 @@ def _read_camera(path: Path) -> tuple[dict[str, Any], Lens]:
 
 
 def _open_hdf5(path: Path, keys: tuple[str, ...]) -> Any:
-    """Open an HDF5 file of plain arrays.
-
-    Raises:
-        InputError: If it is missing, damaged or lacks a key, or h5py is not installed.
-    """
+    """Open an HDF5 file of plain arrays."""
     try:
         import h5py
     except ImportError as cause:
@@ -302,11 +290,7 @@ def split_by_rule(count: int) -> tuple[list[int], list[int]]:
 
 
 def _open_subject(place: Path, into: Path, console: Console) -> tuple[SplitFrames, SplitFrames]:
-    """Write both splits with cameras and poses in meters.
-
-    Raises:
-        InputError: If a part is missing or does not match the others.
-    """
+    """Write both splits with cameras and poses in meters."""
     model = find_colmap_model(place / "sparse")
     if model is None:
         raise InputError(f"{place / 'sparse'} holds no COLMAP model (cameras and images).")

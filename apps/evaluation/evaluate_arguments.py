@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from apps.cli.shared_options import check_output_file, check_output_folder, parse_frame_range
+from apps.cli.shared_options import check_output_file, parse_frame_range
 from capture.input_error import InputError
 from preprocess.capture_session import CaptureInputs
 
@@ -21,8 +21,7 @@ class EvaluateArguments:
         ia-evaluate run other/run --json table.json  several, with their mean
         ia-evaluate run --on another/capture         the same person in another video
         ia-evaluate run/avatar.iavatar --on capture --frames 100:200:5      the player alone
-        ia-evaluate run --card card                  a page with conditions, tables and pictures
-        ia-evaluate --pictures theirs --on capture   what another system rendered of its frames
+        ia-evaluate run --card run.html              a page with conditions, scores and pictures
         ia-evaluate PeopleSnapshot --out evaluation --body SMPL_MALE.pkl    the paper's protocol
         ia-evaluate neuman/dataset --out evaluation --body SMPL_NEUTRAL.pkl    NeuMan's
 
@@ -46,12 +45,8 @@ class EvaluateArguments:
     """Folders written by ia-ingest, .iavatar packages, or folders of PeopleSnapshot or NeuMan."""
     on: Annotated[Path | None, arg(metavar="CAPTURE", help_behavior_hint="")] = None
     """Score all frames of this video or capture folder instead of the run's held-out frames."""
-    pictures: Annotated[tuple[Path, ...], arg(metavar="DIR", help_behavior_hint="")] = ()
-    """Score these folders of pictures, too, which other systems rendered of the frames of --on.
-    A picture's name is that of the frame's file, or ends with the frame's number, from 0."""
     background: Annotated[tuple[Literal["white", "black"], ...], arg(help_behavior_hint="")] = ()
-    """Backgrounds behind the person, one or both (default: white; both for a dataset). Pictures
-    without an alpha channel have one already: name it."""
+    """Backgrounds behind the person, one or both (default: white; both for a dataset)."""
     lpips: Annotated[tuple[Literal["alex01", "alex", "vgg"], ...], arg(help_behavior_hint="")] = (
         "alex01",
         "alex",
@@ -85,23 +80,27 @@ class EvaluateArguments:
     """Folder for the runs of a dataset, and for its frames under captures/ (default: runs/NAME,
     named after the dataset)."""
     json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """Write the scores of every frame to this file."""
+    """Write conditions and the scores of every frame to this file."""
     markdown: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Write the table to this file as well."""
-    card: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
-    """Write an evaluation card into this folder: card.html, card.md, card.csv and card.json."""
+    card: Annotated[Path | None, arg(metavar="FILE|DIR", help_behavior_hint="")] = None
+    """Write a page with conditions, scores and pictures: this .html file, or card.html in this
+    folder."""
     dance: Annotated[tuple[Path, ...], arg(metavar="FILE", help_behavior_hint="")] = ()
-    """Motions that the card shows the packages in, 6 s of each at most."""
+    """Motions that the page of --card shows the packages in, 6 s of each at most."""
     overwrite: Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")] = False
-    """Replace the files that --json and --markdown name, if they exist."""
+    """Replace the files that --json, --markdown and --card name, if they exist."""
+
+    @property
+    def page(self) -> Path | None:
+        """The file of --card."""
+        if self.card is None or self.card.suffix == ".html":
+            return self.card
+        return self.card / "card.html"
 
     def validate(self) -> None:
-        """Check ranges, combinations and output files.
-
-        Raises:
-            InputError: Naming the option.
-        """
-        if not self.targets and not self.pictures:
+        """Check ranges, combinations and output files; an `InputError` names the option."""
+        if not self.targets:
             raise InputError("Pass a run, a package or a dataset: ia-evaluate run (see --help).")
         if self.lpips_weights is not None and not self.lpips_weights.is_dir():
             raise InputError(f"--lpips-weights is {self.lpips_weights}, which is no folder.")
@@ -112,33 +111,27 @@ class EvaluateArguments:
         if self.steps is not None and self.steps < 1:
             raise InputError(f"--steps is {self.steps}, but must be at least 1.")
         parse_frame_range(self.frames)
-        given = [
-            f"--{name}" for name in ("poses", "masks", "cameras") if getattr(self, name) is not None
-        ] + ["--pictures"] * bool(self.pictures)
-        if self.frames != "::":
-            given.append("--frames")
-        if given and self.on is None:
-            raise InputError(f"{', '.join(given)} require a capture: pass it with --on.")
-        for flag, place in (("--json", self.json), ("--markdown", self.markdown)):
-            if place is not None:
-                check_output_file(place, flag, self._inputs(), overwrite=self.overwrite)
-        if self.card is not None:
-            check_output_folder(self.card, "--card", self._inputs())
-        elif self.dance:
-            raise InputError("--dance needs a card to be shown on: pass --card DIR.")
-        for path in self.dance:
-            if not path.exists():
-                raise InputError(f"--dance {path} does not exist; expected a file of poses.")
-        for path in self.targets:
+        named = ("poses", "masks", "cameras")
+        of_capture = [f"--{name}" for name in named if getattr(self, name) is not None]
+        of_capture += ["--frames"] * (self.frames != "::")
+        if of_capture and self.on is None:
+            raise InputError(f"{', '.join(of_capture)} require a capture: pass it with --on.")
+        if self.dance and self.card is None:
+            raise InputError("--dance needs a page to be shown on: pass --card FILE.")
+        for path in (*self.targets, *self.dance):
             if not path.exists():
                 raise InputError(
-                    f"{path} does not exist; expected the folder of a run, or a package."
+                    f"{path} does not exist; expected a run, a package or a data set, or for "
+                    "--dance a file of poses."
                 )
+        outputs = {"--json": self.json, "--markdown": self.markdown, "--card": self.page}
+        for flag, path in outputs.items():
+            if path is not None:
+                check_output_file(path, flag, self._inputs(), overwrite=self.overwrite)
 
     def _inputs(self) -> list[Path]:
         """Return files that are read and must not be written to."""
         packages = [path for path in self.targets if path.is_file()]
-        packages += self.pictures
         if self.on is not None:
             return [*packages, *self.capture_inputs(self.on).input_paths()]
         return packages if self.body is None else [*packages, self.body]

@@ -1,47 +1,46 @@
-"""Scores of one rendering against its frame, and both as the evaluation card shows them."""
+"""Scores of one rendering against its frame, and both as the evaluation's page shows them."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import final
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Float32
 
-from apps.report.report_page import to_uint8, webp_data_uri
+from apps.report.page_rendering import to_uint8, webp_data_uri
 from avatar.evaluation.held_out import HeldOutFrame, score_rendering
 from avatar.evaluation.image_metrics import (
-    SSIM_BORDER_PX,
     composite_over,
     ground_truth_over,
     psnr_of_errors,
     silhouette_of,
-    ssim,
-    ssim_map,
 )
 from avatar.evaluation.perceptual import LPIPS_CONVENTIONS, Lpips
-from avatar.evaluation.skin_patches import SCORED_PARTS, SkinPatches, label_parts, psnr_by_part
 from avatar.events import HeldOutScore
-from preprocess.body.parametric_body import ShapedBody
 from preprocess.observation import Observation
 
 PremultipliedImage = Float32[np.ndarray, "height width 4"]
 """RGBA with premultiplied alpha."""
-FrameRenderer = Callable[[Observation], PremultipliedImage | None]
-"""Renders the pose of a frame with its camera; None if there is no image of this frame."""
+FrameRenderer = Callable[[Observation], PremultipliedImage]
+"""Renders the pose of a frame with its camera."""
 
 BACKGROUNDS = {"white": 1.0, "black": 0.0}
 """Gray behind the person, by name."""
-REGIONS = ("", "_box", "_mask")
-"""Suffixes of a metric over the whole image, the box of the person, and the mask."""
 METRICS = (
-    *(f"psnr{region}" for region in REGIONS),
-    *(f"ssim{region}" for region in REGIONS),
-    *(f"lpips_{name}{region}" for name in LPIPS_CONVENTIONS for region in REGIONS),
-    *(f"psnr_{part}" for part in SCORED_PARTS),
+    "psnr",
+    "psnr_box",
+    "psnr_mask",
+    "ssim",
+    *(f"lpips_{name}" for name in LPIPS_CONVENTIONS),
     "cpu_ms",
 )
 """All values of a frame that are averaged."""
+MARGIN = 0.08
+"""Width of the rim around the person on the page, as a fraction of the box."""
+LARGEST_SHOWN_ERROR = 0.25
+"""Error that is drawn in the brightest color, of 1."""
+SHOWN_FRAMES = 6
+"""Frames that the page shows of an avatar."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,130 +49,48 @@ class FrameScore(HeldOutScore):
 
     Attributes:
         psnr_box: PSNR in the bounding box of the mask, dB.
-        cpu_ms: CPU time of rendering, over all threads; NaN if it was not rendered here.
-        others: The others of `METRICS` that were measured.
+        cpu_ms: CPU time of rendering, over all threads.
+        lpips: LPIPS of the whole image by convention, as far as it was measured.
     """
 
     psnr_box: float
     cpu_ms: float
-    others: Mapping[str, float] = field(default_factory=dict)
+    lpips: Mapping[str, float] = field(default_factory=dict)
 
-    def value(self, metric: str) -> float:
-        """Return one of `METRICS`; NaN if it was not measured."""
-        return getattr(self, metric, self.others.get(metric, float("nan")))
+    def as_json(self) -> dict[str, float]:
+        """Return all values by name."""
+        values = {key: value for key, value in vars(self).items() if key != "lpips"}
+        return values | {f"lpips_{name}": value for name, value in self.lpips.items()}
 
 
-@final
-class FrameJudge:
-    """Scores renderings of frames.
+def score_picture(
+    observation: Observation,
+    picture: PremultipliedImage,
+    background: str,
+    lpips: Lpips | None = None,
+    *,
+    cpu_ms: float = float("nan"),
+) -> FrameScore:
+    """Compare a rendering with its frame, both on a background of `BACKGROUNDS`.
 
-    Attributes:
-        backgrounds: Names of `BACKGROUNDS`, in the order of the scores.
+    Args:
+        observation: The frame.
+        picture: The rendering.
+        background: Name of the background.
+        lpips: LPIPS; None to leave it out.
+        cpu_ms: CPU time that the rendering took.
     """
-
-    def __init__(
-        self,
-        backgrounds: tuple[str, ...] = ("white",),
-        lpips: Lpips | None = None,
-        shaped: ShapedBody | None = None,
-    ) -> None:
-        """Prepare the metrics.
-
-        Args:
-            backgrounds: Names of `BACKGROUNDS`.
-            lpips: LPIPS; None to leave it out.
-            shaped: The person, to score body parts; None to leave them out.
-        """
-        self.backgrounds, self._lpips, self._shaped = backgrounds, lpips, shaped
-        self._patches = None if shaped is None else SkinPatches.from_shaped_body(shaped)
-
-    def score(
-        self,
-        observation: Observation,
-        picture: PremultipliedImage,
-        *,
-        cpu_ms: float = float("nan"),
-    ) -> list[FrameScore]:
-        """Compare a rendering with its frame, on each background.
-
-        Args:
-            observation: The frame.
-            picture: The rendering; if it is opaque, it is on the background already.
-            cpu_ms: CPU time that it took.
-        """
-        held, labels = HeldOutFrame(observation=observation), None
-        if self._patches is not None and self._shaped is not None:
-            labels = label_parts(self._patches, self._shaped, observation)
-        silhouette, opaque = silhouette_of(observation), bool(picture[..., 3].min() >= 1.0)
-        box, scores = _bounding_box(silhouette), list[FrameScore]()
-        for name in self.backgrounds:
-            gray = BACKGROUNDS[name]
-            truth = ground_truth_over(observation, gray)
-            shown = np.clip(composite_over(picture, gray), 0.0, 1.0)
-            errors = (shown.astype(np.float64) - truth) ** 2
-            score = score_rendering(picture, held, gray)
-            score = replace(score, overlap=float("nan")) if opaque else score
-            scores.append(
-                FrameScore(
-                    **vars(score),
-                    psnr_box=psnr_of_errors(errors[box]),
-                    cpu_ms=cpu_ms,
-                    others={
-                        "ssim_box": ssim(shown[box], truth[box]),
-                        "ssim_mask": _ssim_within(shown, truth, silhouette),
-                        **self._compare_perceptually(shown, truth, silhouette, box),
-                        **psnr_by_part(errors, observation, labels),
-                    },
-                )
-            )
-        return scores
-
-    def _compare_perceptually(
-        self,
-        shown: Float32[np.ndarray, "height width 3"],
-        truth: Float32[np.ndarray, "height width 3"],
-        silhouette: Bool[np.ndarray, "height width"],
-        box: tuple[slice, slice],
-    ) -> dict[str, float]:
-        """LPIPS of the whole image, of the box as an image, and of its map within the mask."""
-        lpips, values = self._lpips, dict[str, float]()
-        for name in () if lpips is None else lpips.conventions:
-            assert lpips is not None
-            part = np.ascontiguousarray(shown[box]), np.ascontiguousarray(truth[box])
-            values |= {
-                f"lpips_{name}": lpips.compare(shown, truth, name),
-                f"lpips_{name}_box": lpips.compare(*part, name),
-                f"lpips_{name}_mask": lpips.compare_within(*part, silhouette[box], name),
-            }
-        return values
-
-
-def _ssim_within(
-    shown: Float32[np.ndarray, "height width 3"],
-    truth: Float32[np.ndarray, "height width 3"],
-    silhouette: Bool[np.ndarray, "height width"],
-) -> float:
-    inner = slice(SSIM_BORDER_PX, -SSIM_BORDER_PX)
-    similarity = ssim_map(shown, truth)
-    inside = similarity[silhouette[inner, inner]] if similarity.size else similarity
-    return float(inside.mean()) if inside.size else float("nan")
-
-
-def _bounding_box(silhouette: Bool[np.ndarray, "height width"]) -> tuple[slice, slice]:
-    """Return rows and columns of the bounding box; empty for an empty silhouette."""
-    spans = []
-    for axis in (1, 0):
-        where = np.flatnonzero(silhouette.any(axis=axis))
-        spans.append(slice(where[0], where[-1] + 1) if where.size else slice(0, 0))
-    return spans[0], spans[1]
-
-
-MARGIN = 0.08
-"""Width of the rim around the person, as a fraction of the box."""
-LARGEST_SHOWN_ERROR = 0.25
-"""Error that is drawn in the brightest color, of 1."""
-SHOWN_FRAMES = 6
-"""Frames that a card shows of an avatar."""
+    gray, box = BACKGROUNDS[background], _bounding_box(observation)
+    truth = ground_truth_over(observation, gray)
+    shown = np.clip(composite_over(picture, gray), 0.0, 1.0)
+    errors = (shown.astype(np.float64) - truth) ** 2
+    conventions = () if lpips is None else lpips.conventions
+    return FrameScore(
+        **vars(score_rendering(picture, HeldOutFrame(observation=observation), gray)),
+        psnr_box=psnr_of_errors(errors[box]),
+        cpu_ms=cpu_ms,
+        lpips={name: lpips.compare(shown, truth, name) for name in conventions if lpips},
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -200,8 +117,8 @@ class ShownFrame:
         background: str,
         score: FrameScore,
     ) -> "ShownFrame":
-        """Encode a frame and its rendering."""
-        gray, cut = BACKGROUNDS[background], _box_with_margin(observation)
+        """Encode a frame and its rendering, cut to the person."""
+        gray, cut = BACKGROUNDS[background], _bounding_box(observation, margin=MARGIN)
         truth = ground_truth_over(observation, gray)[cut]
         shown = np.clip(composite_over(picture, gray), 0.0, 1.0)[cut]
         error = np.abs(shown - truth).mean(axis=-1) / LARGEST_SHOWN_ERROR
@@ -222,14 +139,18 @@ def choose_shown(frames: Sequence[ShownFrame]) -> list[ShownFrame]:
     return [ranked[place] for place in places]
 
 
-def _box_with_margin(observation: Observation) -> tuple[slice, slice]:
-    """Rows and columns around the person; the whole image without one."""
+def _bounding_box(observation: Observation, *, margin: float = 0.0) -> tuple[slice, slice]:
+    """Return rows and columns of the person; of the whole image without one.
+
+    Args:
+        observation: The frame.
+        margin: Width of the rim around the person, as a fraction of the box.
+    """
     silhouette, spans = silhouette_of(observation), []
     for axis in (1, 0):
         where = np.flatnonzero(silhouette.any(axis=axis))
         if not where.size:
-            spans.append(slice(None))
-            continue
-        rim = 2 + int(MARGIN * (where[-1] - where[0]))
+            return slice(None), slice(None)
+        rim = int(np.ceil(margin * (where[-1] - where[0])))
         spans.append(slice(max(0, int(where[0]) - rim), int(where[-1]) + 1 + rim))
     return spans[0], spans[1]

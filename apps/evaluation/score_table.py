@@ -1,10 +1,8 @@
-"""Scores of an avatar by renderer, poses and background: a Markdown table, CSV and JSON."""
+"""Scores of an avatar by renderer, poses and background: a Markdown table, and JSON."""
 
-import csv
-import io
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,8 +17,8 @@ class ScoreRow:
     """Scores of one renderer with one kind of poses, on one background.
 
     Attributes:
-        renderer: "renderer", "player hq", "player lite", or "pictures" of another system.
-        poses: "given", "fitted", or "theirs" of pictures.
+        renderer: "renderer", "player hq" or "player lite".
+        poses: "given" or "fitted".
         background: "white" or "black".
         scores: Scores of each frame.
     """
@@ -30,9 +28,14 @@ class ScoreRow:
     background: str = "white"
     scores: list[FrameScore] = field(default_factory=list)
 
+    @property
+    def way(self) -> tuple[str, str, str]:
+        """Renderer, poses and background."""
+        return self.renderer, self.poses, self.background
+
     def mean_of(self, name: str) -> float | None:
         """Return the mean of one of `METRICS` over the frames; None without finite values."""
-        return finite_mean([score.value(name) for score in self.scores])
+        return finite_mean([score.as_json().get(name, math.nan) for score in self.scores])
 
     @property
     def verdict(self) -> SharpnessVerdict | None:
@@ -47,11 +50,7 @@ class ScoreRow:
             "background": self.background,
             **{name: self.mean_of(name) for name in METRICS},
             "verdict": self.verdict,
-            "frames": [
-                {key: value for key, value in vars(score).items() if key != "others"}
-                | dict(score.others)
-                for score in self.scores
-            ],
+            "frames": [score.as_json() for score in self.scores],
         }
 
 
@@ -65,7 +64,7 @@ class AvatarEvaluation:
         size: Width and height of the images; None without any.
         rows: Scores by renderer and poses, at least one.
         paper: Scores in the paper, if the subject is in it.
-        shown: Frames with their renderings, for the card.
+        shown: Frames with their renderings, for the page.
         report: Content of the run's report.json, if there is one.
         dances: Animations of novel poses as data URIs, by name.
     """
@@ -91,39 +90,23 @@ class AvatarEvaluation:
 
 
 def evaluations_to_json(
-    evaluations: Iterable[AvatarEvaluation], conditions: dict[str, str] | None = None
+    evaluations: Sequence[AvatarEvaluation], conditions: Mapping[str, str]
 ) -> str:
     """Return the content of the file for --json."""
     avatars = [each.as_json() for each in evaluations]
-    content = {"format": 2, "conditions": conditions or {}, "avatars": avatars}
+    content = {"format": 2, "conditions": conditions, "avatars": avatars}
     return json.dumps(to_json_value(content), indent=1, allow_nan=False) + "\n"
 
 
-def evaluations_to_csv(evaluations: Iterable[AvatarEvaluation]) -> str:
-    """Return one line per row with the mean of every metric; empty where it was not measured."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    ways = ("avatar", "capture", "width", "height", "renderer", "poses", "background", "frames")
-    writer.writerow([*ways, *METRICS, "verdict"])
-    for each in evaluations:
-        for row in each.rows:
-            means = [row.mean_of(metric) for metric in METRICS]
-            writer.writerow(
-                [
-                    each.name, each.capture, *(each.size or ("", "")), row.renderer, row.poses,
-                    row.background, len(row.scores),
-                    *("" if mean is None else f"{mean:.6g}" for mean in means), row.verdict or "",
-                ]
-            )  # fmt: skip
-    return text.getvalue()
-
-
-TEXT_COLUMNS = ("avatar", "drawn by", "poses", "on", "looks", "clock", "region")
-"""Columns of tables that are left-aligned."""
-FORMATS = {"psnr": ".2f", "psnr_box": ".2f", "psnr_mask": ".2f", "ssim": ".4f"}
-"""Format of each metric in the table, but those of LPIPS and time."""
-HEADINGS = {"psnr": "PSNR", "psnr_box": "in the box", "psnr_mask": "in the mask", "ssim": "SSIM"}
-"""Heading of each of them."""
+TEXT_COLUMNS = ("avatar", "drawn by", "poses", "on", "looks")
+"""Columns of the table that are left-aligned."""
+COLUMNS = {
+    "psnr": ("PSNR", ".2f"),
+    "psnr_box": ("in the box", ".2f"),
+    "psnr_mask": ("in the mask", ".2f"),
+    "ssim": ("SSIM", ".4f"),
+}
+"""Heading and format of each metric in the table, but those of LPIPS and time."""
 PAPER_ROW_NAME = "InstantAvatar (paper)"
 """Renderer of the rows with the paper's scores."""
 NOT_MEASURED = "n/a"
@@ -131,38 +114,50 @@ NOT_MEASURED = "n/a"
 
 def table_cells(evaluations: Sequence[AvatarEvaluation]) -> list[list[str]]:
     """Return the header, all rows of all avatars, and their means over several avatars."""
-    lpips = [
-        f"lpips_{name}"
-        for name in LPIPS_CONVENTIONS
-        if any(row.mean_of(f"lpips_{name}") is not None for e in evaluations for row in e.rows)
-    ]
-    formats = FORMATS | dict.fromkeys(lpips or ["lpips"], ".4f") | {"cpu_ms": ".0f"}
-    labels = [LPIPS_CONVENTIONS[name.removeprefix("lpips_")].label for name in lpips] or ["LPIPS"]
-    ways = ["avatar", "frames", "drawn by", "poses", "on"]
-    lines = [[*ways, *HEADINGS.values(), *labels, "ms", "looks"]]
+    rows = [row for each in evaluations for row in each.rows]
+    lpips = {
+        f"lpips_{name}": (convention.label, ".4f")
+        for name, convention in LPIPS_CONVENTIONS.items()
+        if any(name in score.lpips for row in rows for score in row.scores)
+    }
+    columns = COLUMNS | (lpips or {"lpips": ("LPIPS", ".4f")}) | {"cpu_ms": ("ms", ".0f")}
+    headings = [heading for heading, _ in columns.values()]
+    lines = [["avatar", "frames", "drawn by", "poses", "on", *headings, "looks"]]
+
+    def add(name: str, frames: str, way: Sequence[str], means: Mapping[str, float | None]) -> None:
+        cells = [
+            _format_cell(metric, means.get(metric), form) for metric, (_, form) in columns.items()
+        ]
+        lines.append([name, frames, *way, *cells])
+
+    def means_of(row: ScoreRow) -> dict[str, float | None]:
+        return {metric: row.mean_of(metric) for metric in columns}
+
     for each in evaluations:
         for row in each.rows:
-            way = [each.name, str(len(row.scores)), row.renderer, row.poses, row.background]
-            figures = {metric: row.mean_of(metric) for metric in formats}
-            lines.append([*way, *_format_cells(figures, formats), row.verdict or ""])
+            add(each.name, str(len(row.scores)), row.way, means_of(row))
+            lines[-1].append(row.verdict or "")
         if each.paper is not None:
-            figures = {metric: each.paper.get(metric) for metric in formats}
-            way = [each.name, "", PAPER_ROW_NAME, "fitted", "white"]
-            lines.append([*way, *_format_cells(figures, formats), ""])
-    if len(evaluations) > 1:
-        lines += _mean_rows(evaluations, formats)
+            add(each.name, "", (PAPER_ROW_NAME, "fitted", "white"), each.paper)
+            lines[-1].append("")
+    for first in evaluations[0].rows if len(evaluations) > 1 else ():
+        alike = [row for row in rows if row.way == first.way]
+        if len(alike) == len(evaluations):  # all avatars have such a row
+            means = [means_of(row) for row in alike]
+            overall = {
+                metric: finite_mean([math.nan if m[metric] is None else m[metric] for m in means])
+                for metric in columns
+            }
+            add("mean", str(sum(len(row.scores) for row in alike)), first.way, overall)
+            lines[-1].append("")
     return lines
 
 
 def markdown_table(evaluations: Sequence[AvatarEvaluation]) -> str:
     """Return `table_cells` as aligned Markdown."""
-    return align_markdown(table_cells(evaluations))
-
-
-def align_markdown(lines: Sequence[Sequence[str]]) -> str:
-    """Return lines of cells, the first of which is the header, as aligned Markdown."""
-    header = lines[0]
-    widths = [max(3, *(len(line[column]) for line in lines)) for column in range(len(header))]
+    header, *lines = table_cells(evaluations)
+    columns = list(zip(header, *lines, strict=True))
+    widths = [max(3, *map(len, column)) for column in columns]
     is_text = [name in TEXT_COLUMNS for name in header]
     rule = [
         "-" * width if text else "-" * (width - 1) + ":"
@@ -173,42 +168,12 @@ def align_markdown(lines: Sequence[Sequence[str]]) -> str:
             cell.ljust(width) if text else cell.rjust(width)
             for cell, width, text in zip(line, widths, is_text, strict=True)
         ]
-        for line in lines
+        for line in (header, rule, *lines)
     ]
-    drawn = [padded[0], rule, *padded[1:]]
-    return "\n".join(f"| {' | '.join(line)} |" for line in drawn) + "\n"
+    return "\n".join(f"| {' | '.join(line)} |" for line in padded) + "\n"
 
 
-def _mean_rows(evaluations: Sequence[AvatarEvaluation], formats: dict[str, str]) -> list[list[str]]:
-    """Return the mean over avatars for each kind of row that all of them have."""
-    lines = []
-    for first in evaluations[0].rows:
-        way = (first.renderer, first.poses, first.background)
-        alike = [
-            row
-            for each in evaluations
-            for row in each.rows
-            if (row.renderer, row.poses, row.background) == way
-        ]
-        if len(alike) != len(evaluations):
-            continue
-        figures = {
-            metric: finite_mean(
-                [math.nan if (mean := row.mean_of(metric)) is None else mean for row in alike]
-            )
-            for metric in formats
-        }
-        frames = str(sum(len(row.scores) for row in alike))
-        lines.append(["mean", frames, *way, *_format_cells(figures, formats), ""])
-    return lines
-
-
-def _format_cells(figures: dict[str, float | None], formats: dict[str, str]) -> list[str]:
-    return [
-        format(value, form) if (value := figures[metric]) is not None else _blank(metric)
-        for metric, form in formats.items()
-    ]
-
-
-def _blank(metric: str) -> str:
+def _format_cell(metric: str, value: float | None, form: str) -> str:
+    if value is not None:
+        return format(value, form)
     return NOT_MEASURED if metric.startswith("lpips") else ""

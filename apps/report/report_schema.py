@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from apps.report.report_figures import CurvePoint
 from avatar.evaluation.all_round_verdict import AllRoundVerdict
 from avatar.evaluation.coverage import Coverage, coverage_advice
 from avatar.evaluation.image_metrics import (
@@ -62,8 +61,8 @@ class TrainingStats:
         wall_seconds: From the first frame handed to the trainer to the last step.
         cpu_seconds: CPU time of the whole process in that time.
         step_cpu_seconds: The part of it during training steps.
-        cpu_contention_seconds: Time for which threads were ready to run while other programs held
-            the cores, summed over threads; a resumed run counts its own part only.
+        cpu_contention_seconds: Wall time of training steps above their CPU time: at least so long
+            did other programs hold the cores; a resumed run counts its own part only.
         startup_seconds: Before training: imports, opening and checking the capture, kernels.
         steps: Training steps.
         rays: Rays trained on.
@@ -136,6 +135,42 @@ class HeldOutStats:
 
 
 @dataclass(frozen=True, kw_only=True)
+class CurvePoint:
+    """One evaluation of held-out frames during training.
+
+    Its scores are estimates from a sample of each frame's pixels, the same ones every time.
+
+    Attributes:
+        wall_seconds: Training time up to here, wall clock.
+        cpu_seconds: Training time up to here, CPU.
+        frames_seen: Frames trained on up to here.
+        psnr: Mean PSNR of the whole images of the frames scored here, dB.
+        psnr_mask: Mean PSNR inside their masks, dB.
+        verdict: Verdict on the scores (`avatar.evaluation.image_metrics`).
+        frames: Frame number in the video and PSNR of the whole image of each frame scored here.
+            Evaluations may score different frames, so only a frame's own scores show a drop.
+        video: Number of the video that the frames are from, 1 for the first.
+        pixels: Pixels sampled of each frame, at most; None if all were scored.
+    """
+
+    wall_seconds: float
+    cpu_seconds: float
+    frames_seen: int
+    psnr: float | None
+    psnr_mask: float | None
+    verdict: str | None = None
+    frames: tuple[tuple[int, float], ...] = ()
+    video: int = 1
+    pixels: int | None = None
+
+    @classmethod
+    def from_checkpoint(cls, content: dict[str, Any]) -> "CurvePoint":
+        """Restore a point from a checkpoint."""
+        frames = content.get("frames", [])
+        return cls(**{**content, "frames": tuple((frame, psnr) for frame, psnr in frames)})
+
+
+@dataclass(frozen=True, kw_only=True)
 class Percentiles:
     """Median and 95th percentile."""
 
@@ -204,15 +239,11 @@ class CoverageStats:
     @classmethod
     def of(cls, coverage: Coverage) -> "CoverageStats":
         """Summarize the coverage in its current state."""
-        parts = {
-            name: {"seen": part.seen_share, **part.sides}
-            for name, part in coverage.by_part().items()
-        }
         return cls(
             seen=coverage.seen_share,
             well=coverage.well_seen_share,
             advice=coverage_advice(coverage),
-            parts=parts,
+            parts=coverage.by_part(),
         )
 
 

@@ -10,15 +10,9 @@ from apps.animation.driving_motion import FollowingCamera, ResampledMotion, demo
 from apps.cli.command_line import DONE, INTERRUPTED, NO_AVATAR, CommandExit
 from apps.cli.console import Console
 from apps.cli.shared_options import option_words
+from apps.report.page_rendering import data_uri, encode_webp, to_uint8, webp_data_uri
 from apps.report.report_figures import CoverageMap
-from apps.report.report_page import (
-    ComparisonPair,
-    data_uri,
-    encode_webp,
-    report_page,
-    to_uint8,
-    webp_data_uri,
-)
+from apps.report.report_page import ComparisonPair, report_page
 from apps.report.report_schema import (
     CoverageStats,
     FrameStats,
@@ -313,7 +307,7 @@ def _training_stats(result: TrainingResult, startup_seconds: float) -> TrainingS
         wall_seconds=trainer.wall_seconds,
         cpu_seconds=trainer.cpu_seconds,
         step_cpu_seconds=trainer.step_cpu_seconds,
-        cpu_contention_seconds=result.cpu_time.waited_s,
+        cpu_contention_seconds=max(0.0, trainer.step_wall_seconds - trainer.step_cpu_seconds),
         startup_seconds=startup_seconds,
         steps=trainer.steps,
         rays=trainer.rays,

@@ -9,7 +9,7 @@ from typing import Any, final
 
 import numpy as np
 
-from apps.report.report_figures import CurvePoint
+from apps.report.report_schema import CurvePoint
 from apps.run.run_folder import RunFolder
 from avatar.evaluation.held_out import HeldOutFrame, subsample_evenly
 from avatar.training import checkpoint

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from apps.animation.driving_motion import demo_motion
-from apps.report.report_figures import CurvePoint
+from apps.report.report_schema import CurvePoint
 from avatar.rig import canonical_rotations
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose, Motion

@@ -2,16 +2,17 @@
 
 import json
 import shutil
-import threading
+import subprocess
 
 import numpy as np
 import pytest
 
-from apps import evaluate, ingest
+from apps import evaluate
+from apps.cli import hardware
 from apps.cli.command_line import INTERRUPTED
-from apps.cli.console import Console
-from apps.evaluation import datasets, evaluation_session
-from apps.evaluation.frame_scoring import FrameJudge, FrameScore
+from apps.evaluation import datasets
+from apps.evaluation.evaluation_session import FrameScorer
+from apps.evaluation.frame_scoring import SHOWN_FRAMES, FrameScore, score_picture
 from apps.evaluation.score_table import (
     AvatarEvaluation,
     ScoreRow,
@@ -22,6 +23,7 @@ from avatar.evaluation.perceptual import Lpips
 from preprocess.capture_session import CaptureInputs
 from preprocess.open_capture import open_capture
 from tests.apps.conftest import Outcome
+from tests.apps.report.test_report_page import Tags
 
 
 @pytest.fixture
@@ -134,12 +136,12 @@ def test_the_papers_frames_are_learnt_scored_and_set_beside_the_papers_figures(
 def test_a_stopped_lesson_leaves_the_table_of_those_before(
     dataset, call_evaluate, without_baking, tmp_path, monkeypatch
 ):
-    learn = ingest.ingest
+    train = evaluate.ingest
 
     def stopped_in_the_second(given, console):
-        return INTERRUPTED if given.video.name == "male-3-casual" else learn(given, console)
+        return INTERRUPTED if given.video.name == "male-3-casual" else train(given, console)
 
-    monkeypatch.setattr(ingest, "ingest", stopped_in_the_second)
+    monkeypatch.setattr(evaluate, "ingest", stopped_in_the_second)
     ended = call_evaluate(
         dataset, "--out", tmp_path / "out", "--steps", 10, "--size", 64, "--no-player"
     )
@@ -161,52 +163,33 @@ def test_a_box_is_scored_without_the_white_around_it(film):
     (seen, *_) = open_capture(CaptureInputs(video=film)).observations()
     truth = ground_truth_on_white(seen)
     wrong = np.dstack([np.clip(truth - 0.1, 0.0, 1.0), np.ones(truth.shape[:2])]).astype(np.float32)
-    (score,) = FrameJudge().score(seen, wrong)
+    score = score_picture(seen, wrong, "white")
     rows, columns = np.nonzero(seen.alpha > 0.5)
     box = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
     error = ((wrong[..., :3] - truth)[box].astype(float) ** 2).mean()
     assert score.psnr_box == pytest.approx(-10.0 * np.log10(error), abs=1e-4)
     perfect = np.dstack([truth, np.ones(truth.shape[:2], np.float32)])
-    (score,) = FrameJudge().score(seen, perfect)
-    assert score.psnr_box == np.inf
-    assert [score.value(name) for name in ("ssim", "ssim_box", "ssim_mask")] == pytest.approx(
-        [1.0] * 3
-    )
-    assert np.isnan(score.overlap)  # an opaque picture says nothing about the person's outline
+    score = score_picture(seen, perfect, "white")
+    assert (score.psnr_box, score.ssim) == (np.inf, pytest.approx(1.0))
 
 
-def test_each_background_has_its_own_scores_of_one_rendering(film):
+def test_each_background_has_its_own_scores_of_one_rendering(film, monkeypatch):
+    monkeypatch.setattr(Lpips, "compare", lambda self, image, truth, name: image.mean())
+    lpips = Lpips(())
+    lpips.conventions = ("alex",)
     (seen, *_) = open_capture(CaptureInputs(video=film)).observations()
     alpha = 0.5 * seen.alpha[..., None]
     picture = np.concatenate([alpha * (seen.frame.rgb / np.float32(255.0)), alpha], axis=-1)
-    white, black = FrameJudge(("white", "black")).score(seen, picture)
+    drawn = FrameScorer({"hq": lambda _: picture}, None, ("white", "black"), lpips)
+    drawn.score_frame(seen)
+    white, black = (row.scores[0] for row in drawn.rows)
     for score, gray in ((white, 1.0), (black, 0.0)):
         shown = picture[..., :3] + np.float32(gray) * (1.0 - picture[..., 3:])
         error = ((shown - ground_truth_over(seen, gray)).astype(float) ** 2).mean()
         assert score.psnr == pytest.approx(-10.0 * np.log10(error), abs=1e-3)
+        assert score.as_json()["lpips_alex"] == pytest.approx(shown.mean(), abs=1e-4)
     assert white.psnr != black.psnr
     assert white.overlap == black.overlap
-
-
-def test_perceptual_distances_are_measured_over_image_box_and_mask(film, monkeypatch):
-    def mean_error(self, image, truth, convention):
-        return float(np.abs(image - truth).mean())
-
-    def mean_error_within(self, image, truth, silhouette, convention):
-        return float(np.abs(image - truth)[silhouette].mean())
-
-    monkeypatch.setattr(Lpips, "compare", mean_error)
-    monkeypatch.setattr(Lpips, "compare_within", mean_error_within)
-    lpips = Lpips(())
-    lpips.conventions = ("alex",)
-    (seen, *_) = open_capture(CaptureInputs(video=film)).observations()
-    truth = ground_truth_on_white(seen)
-    inside = seen.alpha[..., None] > 0.5
-    wrong = np.dstack([np.where(inside, truth + 0.25, truth), np.ones(truth.shape[:2])])
-    (score,) = FrameJudge(lpips=lpips).score(seen, wrong.astype(np.float32))
-    whole, box, mask = (score.value(f"lpips_alex{where}") for where in ("", "_box", "_mask"))
-    assert whole < box < mask <= 0.2501
-    assert np.isnan(score.value("lpips_vgg"))
 
 
 def test_a_table_is_markdown_and_its_means_are_means():
@@ -226,20 +209,25 @@ def test_a_table_is_markdown_and_its_means_are_means():
     assert lines[2].endswith("| soft  |")
 
 
-def test_what_was_scored_before_it_was_stopped_is_in_the_table(film):
-    seen = list(open_capture(CaptureInputs(video=film)).observations())[:3]
-    stop, console = threading.Event(), Console()
-
-    def stopped_in_the_second():
-        yield seen[0]
-        stop.set()
-        yield from seen[1:]
-
-    players = {"hq": lambda seen: np.zeros((*seen.alpha.shape, 4), np.float32)}
-    found = evaluation_session.AvatarScorer(None, players, FrameJudge(), fit_poses=True)
-    with console.progress("scoring", 3.0) as bar:
-        found.score_frames(stopped_in_the_second(), bar, stop)
-    assert [len(row.scores) for row in found.rows] == [0]
+def test_a_page_holds_conditions_scores_and_pictures(run, film, call_evaluate, tmp_path):
+    words = ("--no-fitted", "--background", "white", "black", "--dance", film / "poses.npz")
+    out = ("--card", tmp_path / "card.html", "--json", tmp_path / "t.json")
+    ended = call_evaluate(run, *words, *out)
+    assert ended.code == 0, ended.err
+    content = json.loads((tmp_path / "t.json").read_text())
+    conditions, (avatar,) = content["conditions"], content["avatars"]
+    assert conditions["background"] == "white and black"
+    assert conditions["resolution"] == "64x64 px"
+    page = (tmp_path / "card.html").read_text()
+    tags = Tags(page)
+    scored = len(avatar["rows"][0]["frames"])
+    assert len(tags.addresses) == 3 * min(scored, SHOWN_FRAMES) + 1  # and the dance
+    assert all(address.startswith("data:image/webp;base64,") for address in tags.addresses)
+    assert f"{avatar['rows'][0]['psnr']:.2f}" in page
+    assert conditions["software"] in page
+    again = call_evaluate(run, *words, *out)
+    assert again.code == 2
+    assert "card.html" in again.complaint("ia-evaluate") or "t.json" in again.err
 
 
 def test_a_run_is_found_again_from_another_folder(run, film, call_evaluate, tmp_path, monkeypatch):
@@ -260,8 +248,7 @@ def test_a_run_is_found_again_from_another_folder(run, film, call_evaluate, tmp_
     ("words", "told"),
     [
         (["{run}", "--frames", "0:5"], "--on"),
-        (["--pictures", "{film}"], "--on"),
-        (["--pictures", "{tmp}", "--on", "{film}"], "no pictures"),
+        (["{run}", "--dance", "{film}/poses.npz"], "--card"),
         (["{run}", "--lpips-weights", "{tmp}/nothing"], "--lpips-weights"),
         (["{run}/avatar.iavatar"], "--on"),
         (["{tmp}"], "neither a run"),
@@ -285,3 +272,10 @@ def test_what_cannot_be_scored_is_refused_with_the_reason(
     assert ended.code == 2
     assert told in ended.complaint("ia-evaluate")
     assert ended.out == ""
+
+
+def test_an_installation_within_another_checkout_has_no_commit(monkeypatch, tmp_path):
+    subprocess.run(["git", "init", "-q", tmp_path], check=True)
+    (tmp_path / "site-packages").mkdir()
+    monkeypatch.setattr(hardware, "ROOT", tmp_path / "site-packages")
+    assert hardware._commit() == "unknown"

@@ -32,7 +32,7 @@ def weights(tmp_path_factory):
 def lpips(weights):
     found = Lpips(tuple(LPIPS_CONVENTIONS), weights)
     assert found.unavailable is None
-    assert found.versions["LPIPS alex"].startswith(FILES["alex"])
+    assert FILES["alex"] in found.describe()
     return found
 
 
@@ -99,20 +99,9 @@ def test_values_are_those_of_the_packages_own_forward(
 
 
 @pytest.mark.parametrize("convention", LPIPS_CONVENTIONS)
-def test_equal_images_have_no_distance_and_an_error_counts_where_it_is(lpips, pair, convention):
+def test_equal_images_have_no_distance_and_small_ones_none_at_all(lpips, pair, convention):
     image, truth = pair
-    everywhere = np.ones(truth.shape[:2], dtype=bool)
     assert lpips.compare(truth, truth, convention) == 0.0
-    assert lpips.compare_within(truth, truth, everywhere, convention) == 0.0
-    left = truth.copy()
-    left[:, :8] = image[:, :8]
-    columns = np.broadcast_to(np.arange(truth.shape[1]), truth.shape[:2])
-    near, far = (
-        lpips.compare_within(left, truth, where, convention)
-        for where in (columns < 12, columns >= 28)
-    )
-    assert near > 2.0 * far
-    assert np.isnan(lpips.compare_within(image, truth, ~everywhere, convention))
     assert np.isnan(lpips.compare(image[:16], truth[:16], convention))
 
 
@@ -120,7 +109,7 @@ def test_nothing_is_downloaded_and_what_lacks_is_named(weights, tmp_path, monkey
     monkeypatch.setattr(torch.hub, "load_state_dict_from_url", None)
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     found = Lpips(tuple(LPIPS_CONVENTIONS))
-    assert (found.conventions, found.versions) == ((), {})
+    assert found.conventions == ()
     assert FILES["vgg"] in found.unavailable
     assert str(tmp_path / "checkpoints") in found.unavailable
     (tmp_path / "checkpoints").mkdir()
