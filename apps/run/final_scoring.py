@@ -17,11 +17,10 @@ import numpy as np
 from jaxtyping import UInt8
 
 from apps.cli.console import Console
-from apps.report.report_figures import CurvePoint
-from apps.report.report_schema import ForgettingStats, finite_mean, format_psnr
+from apps.report.report_schema import CurvePoint, ForgettingStats, finite_mean, format_psnr
 from apps.run.run_folder import RunFolder
-from apps.run.run_timing import CpuTime, StreamMeter
 from apps.run.snapshot_writer import PackageSnapshot
+from apps.run.stream_meter import StreamMeter
 from avatar.avatar_model import Avatar
 from avatar.evaluation.all_round_verdict import AllRoundVerdict
 from avatar.evaluation.coverage import Coverage, coverage_advice
@@ -105,7 +104,6 @@ class TrainingResult:
         coverage: Skin that the training frames show.
         frames_added: Frames of this capture that were trained on.
         interrupted: Whether Ctrl-C ended training.
-        cpu_time: CPU time used, and lost to other programs.
         package: Outcome of packaging; None before `TrainingSession.bake`.
         scores: Final scores of the held-out frames; empty before `bake`.
         earlier_videos: Forgetting of earlier videos, if there were any.
@@ -118,7 +116,6 @@ class TrainingResult:
     coverage: Coverage
     frames_added: int
     interrupted: bool
-    cpu_time: CpuTime
     package: PackageSnapshot | None = None
     scores: FinalScores = field(default_factory=FinalScores)
     earlier_videos: ForgettingStats | None = None
@@ -314,10 +311,8 @@ class EarlierVideos:
         )  # fmt: skip
         if note.psnr_after is not None:
             console.info(
-                "Held-out frames of the earlier video: "
-                f"{format_psnr(note.psnr_before, overall_verdict(before))} before, "
-                f"{format_psnr(note.psnr_after, overall_verdict(after))} now (largest drop "
-                f"{note.largest_drop:.2f} dB)."
+                f"Held-out frames of the earlier video: {format_psnr(note.psnr_before, None)} "
+                f"before, {format_psnr(note.psnr_after, None)} now."
             )
         return note
 

@@ -1,6 +1,5 @@
 """Start of a training session: threads, kernels, a new, resumed or extended trainer, the viewer."""
 
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -11,18 +10,16 @@ import numpy as np
 import torch
 
 from apps.cli.command_line import exit_on_interrupt, stop_on_interrupt
-from apps.cli.console import Console, format_duration
+from apps.cli.console import Console
 from apps.cli.hardware import usable_cores
-from apps.run.final_scoring import SCORING_LIMIT_S, EarlierVideos
+from apps.run.final_scoring import EarlierVideos
 from apps.run.ingest_arguments import PROGRAM, IngestArguments
 from apps.run.missing_inputs import remove_unused_tracking
 from apps.run.run_folder import RunFolder
-from apps.run.run_timing import expected_held_out, post_training_seconds
 from apps.run.training_session import TrainingSession
 from avatar.config import HELD_OUT_STRIDE, TrainConfig
 from avatar.evaluation.all_round_verdict import SEEN
 from avatar.evaluation.coverage import coverage_advice, expected_coverage
-from avatar.evaluation.held_out import MAX_HELD_OUT
 from avatar.rig import Rig
 from avatar.training import checkpoint, train
 from avatar.training.trainer import Trainer
@@ -85,7 +82,7 @@ def prepare_trainer(
         train.warm_up(prepared.trainer)
         proxy_surface.warm_up()
     _announce_coverage(capture, console)
-    _announce_duration(arguments, capture, prepared.trainer, console)
+    _announce_duration(prepared.trainer, console)
     return prepared
 
 
@@ -270,23 +267,14 @@ def _announce_coverage(capture: Capture, console: Console) -> None:
         )
 
 
-def _announce_duration(
-    arguments: IngestArguments, capture: Capture, trainer: Trainer, console: Console
-) -> None:
-    """Print the expected duration of training, and of packaging and evaluation."""
-    source, config = capture.source, trainer.config
-    longer_side_px = max(source.size_px)
-    rest = post_training_seconds(
-        expected_held_out(source.frame_count, arguments.hold_out, MAX_HELD_OUT),
-        min(longer_side_px, capture.size_px or longer_side_px),
-        fit_poses=config.refine_poses,
-        scoring_limit_s=math.inf if config.steps else SCORING_LIMIT_S,
-    )
+def _announce_duration(trainer: Trainer, console: Console) -> None:
+    """Print how long training will take, and roughly what comes after it."""
+    config = trainer.config
     seconds = max(0.0, config.seconds - trainer.wall_seconds)
     duration = f"{seconds:.0f} s" if seconds >= 10.0 else f"{seconds:.1g} s"
     if config.steps:
         duration = f"{config.steps - trainer.steps} steps"
     console.info(
-        f"Training for {duration}, then about {format_duration(rest)} for packaging and evaluation "
-        "on an otherwise idle machine."
+        f"Training for {duration}, then about half a minute for packaging and evaluation on an "
+        "otherwise idle machine."
     )

@@ -1,6 +1,5 @@
 """A training session: frames in, steps, checkpoints, package, scores."""
 
-import math
 import threading
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -8,24 +7,15 @@ from dataclasses import replace
 from typing import Any, Protocol, final, runtime_checkable
 
 from apps.cli.command_line import BAD_INPUT, INTERRUPTED, CommandExit
-from apps.cli.console import Console, ProgressBar, format_duration
-from apps.report.report_figures import CurvePoint
-from apps.report.report_schema import finite_mean, format_percent, format_psnr
+from apps.cli.console import Console, ProgressBar
+from apps.report.report_schema import CurvePoint, finite_mean, format_percent, format_psnr
 from apps.run.final_scoring import (
-    SCORING_LIMIT_S,
     EarlierVideos,
     TrainingResult,
     earlier_video_names,
     score_finally,
 )
 from apps.run.run_folder import RunFolder
-from apps.run.run_timing import (
-    CpuContentionMeter,
-    CpuTime,
-    StreamMeter,
-    describe_position,
-    post_training_seconds,
-)
 from apps.run.snapshot_writer import (
     CheckpointWriter,
     PackageSnapshot,
@@ -34,6 +24,7 @@ from apps.run.snapshot_writer import (
     validation_views,
     write_package_snapshot,
 )
+from apps.run.stream_meter import StreamMeter
 from avatar.evaluation.coverage import Coverage, coverage_advice
 from avatar.evaluation.held_out import PIXELS_PER_FRAME, HeldOutFrame, add_held_out
 from avatar.evaluation.image_metrics import overall_verdict
@@ -169,7 +160,6 @@ class TrainingSession:
             added = self._restore_frames(inbox, self._restore_count) - self.trainer.frames_seen
             self._set_unpaced(False)
             self._checkpoints.restart_interval()
-            waited = CpuContentionMeter(self.trainer)
             with self._console.progress("training", self.trainer.config.seconds) as bar:
                 for event in train(self.trainer, inbox, self.held_out):
                     self._handle_event(event, bar)
@@ -183,16 +173,14 @@ class TrainingSession:
             source.close()
             inbox.close()
             self._checkpoints.settle()
-        self.meter.inbox_dropped, cpu = inbox.dropped, waited.measure()
-        interrupted = self.stop.is_set()
-        late = [*self.meter.lateness_warnings(), *filter(None, [cpu.warning()])]
+        self.meter.inbox_dropped, interrupted = inbox.dropped, self.stop.is_set()
+        late = self.meter.lateness_warnings()
         for warning in [*source.warnings, *late, *self._recording.final_notes()]:
             self._console.warning(warning)
         self._console.summarize_warnings()
         if len(self.trainer.replay):
             seen = format_percent(self.coverage.seen_share)
             self._console.info(f"Body coverage: {seen}. {coverage_advice(self.coverage)}")
-            self._console.info(f"Packaging and evaluation take {self._remaining_text(cpu)}.")
         return TrainingResult(
             trainer=self.trainer,
             held_out=self.held_out,
@@ -201,7 +189,6 @@ class TrainingSession:
             coverage=self.coverage,
             frames_added=added + self.trainer.frames_seen,
             interrupted=interrupted,
-            cpu_time=cpu,
         )
 
     def bake(self, result: TrainingResult) -> TrainingResult:
@@ -338,29 +325,16 @@ class TrainingSession:
             case Warned(message=message):
                 self._console.warning(message)
 
-    def _remaining_text(self, cpu: CpuTime) -> str:
-        """Estimate the time from the last step to the report."""
-        config, size = self.trainer.config, self.meter.size_px or (0, 0)
-        rest = post_training_seconds(
-            len(self.held_out),
-            max(size),
-            fit_poses=config.refine_poses,
-            slowdown=1.0 / max(cpu.granted_share, 0.05),
-            scoring_limit_s=math.inf if config.steps else SCORING_LIMIT_S,
-        )
-        return f"about {format_duration(rest)}"
-
     def _progress_text(self) -> str:
         trainer, last = self.trainer, self.curve[-1] if self.curve else None
         rays = trainer.rays / max(trainer.wall_seconds, 1e-6)
-        frames_read = self.meter.frames_read, self._recording.source.frame_count
-        position = describe_position(
-            elapsed_s=trainer.wall_seconds,
-            budget_s=trainer.config.seconds,
-            step=trainer.steps,
-            steps=trainer.config.steps,
-            frames_read=None if self._inbox.finished else frames_read,
-        )
+        elapsed_s, budget_s = trainer.wall_seconds, trainer.config.seconds
+        if trainer.config.steps:
+            position = f"step {trainer.steps} of {trainer.config.steps}, {elapsed_s:.0f} s"
+        elif elapsed_s <= budget_s or self._inbox.finished:
+            position = f"{elapsed_s:.0f} of {budget_s:g} s, step {trainer.steps}"
+        else:
+            position = f"{elapsed_s:.0f} s: the first pass over the video goes on"
         parts = [position]  # terminals cut off the end of a long line
         if last is not None and last.psnr is not None:
             score = format_psnr(last.psnr, last.verdict, digits=1, provisional=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from apps.run.run_timing import MAX_DROPPED_LISTED, StreamMeter
+from apps.run.stream_meter import MAX_DROPPED_LISTED, StreamMeter
 from capture.source import Frame, FrameSelection
 from preprocess.observation import DroppedFrame
 
