@@ -1,15 +1,13 @@
 """Coverage: which skin the camera has seen, at what angle, and what to show it next."""
 
 import base64
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, final
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from jaxtyping import Bool, Float32, UInt8
 
 from avatar.evaluation.image_metrics import MASK_THRESHOLD
 from avatar.evaluation.skin_patches import PART_NAMES, SIDE_NAMES, SkinPatches, view_patches
@@ -40,19 +38,6 @@ class VisibilityStage(IntEnum):
     """No part of the body hid it, but it was outside the mask."""
     SEEN = 4
     """It was seen."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class PartCoverage:
-    """Seen share of a body part's surface, in total and by side.
-
-    Attributes:
-        seen_share: Seen share of the surface, in [0, 1].
-        sides: Seen share of each side that the part has, in the order of `SIDE_NAMES`.
-    """
-
-    seen_share: float
-    sides: dict[str, float]
 
 
 @final
@@ -107,21 +92,18 @@ class Coverage:
         """The share that was seen within 53° of squarely."""
         return _area_share(self.patches.areas, self.cosines >= MIN_WELL_SEEN_COSINE)
 
-    def by_part(self) -> dict[str, PartCoverage]:
-        """How much of each part was seen, by its name."""
+    def by_part(self) -> dict[str, dict[str, float]]:
+        """Share of each part that was seen, under "seen", then of each of its sides."""
         patches, seen = self.patches, self.cosines > 0.0
-        found: dict[str, PartCoverage] = {}
+        shares: dict[str, dict[str, float]] = {}
         for part, name in enumerate(PART_NAMES):
             here = patches.parts == part
-            sides = {
-                side: _area_share(patches.areas[among], seen[among])
-                for k, side in enumerate(SIDE_NAMES)
-                if (among := here & (patches.sides == k)).any()
-            }
-            found[name] = PartCoverage(
-                seen_share=_area_share(patches.areas[here], seen[here]), sides=sides
-            )
-        return found
+            shares[name] = {"seen": _area_share(patches.areas[here], seen[here])}
+            for k, side in enumerate(SIDE_NAMES):
+                among = here & (patches.sides == k)
+                if among.any():
+                    shares[name][side] = _area_share(patches.areas[among], seen[among])
+        return shares
 
     def to_state(self) -> dict[str, Any]:
         """Encode cosines and stages as text, for a checkpoint."""
@@ -160,21 +142,20 @@ def _area_share(areas: Float32[np.ndarray, "patches"], seen: Any) -> float:
 
 
 MIN_REGION_SHARE = 0.02
-"""Share of the skin below which an unseen piece is not mentioned: one hand is 2.3 %."""
+"""Share of the skin below which an unseen region is not mentioned: one hand is 2.3 %."""
 HEAD_WEIGHT = 2.0
 """Weight of the head's skin relative to other skin, since viewers look at the face."""
+MIN_UNSEEN_OF_SIDE, MIN_UNSEEN_OF_LIMB = 0.5, 0.75
+"""Unseen share from which a limb's side, and a whole limb, are called unseen."""
+MIN_UNSEEN_OF_BODY = 0.9
+"""Unseen share from which torso and head, the whole body, and one side of it are."""
+MIN_TOP_NORMAL_Y = 0.6
+"""Upward component of the normals on top of head and shoulders."""
 NEARLY_COMPLETE = 0.95
 """Share of seen skin from which the capture counts as complete."""
 NOT_SEEN_YET = "No person has been seen yet."
-SEEN_COMPLETELY = "It was seen from all sides: no piece as large as a hand is missing."
+SEEN_COMPLETELY = "It was seen from all sides."
 SMALL_REGIONS_LEFT = "Nearly everything was seen; the {rest:.0%} that are missing are small pieces."
-
-MIN_LIMB_SHARE = 0.7
-"""Share of a piece that a limb must hold to give the piece its name."""
-MIN_TOP_NORMAL_Y = 0.6
-"""A piece whose mean normal points up this much is the top of its limb."""
-MAX_SIDELESS_NORMAL = 0.12
-"""A piece whose mean normal is shorter than this has no side."""
 PARTS_OF_LIMB = {
     "hand": ("hand",),
     "foot": ("foot",),
@@ -182,6 +163,8 @@ PARTS_OF_LIMB = {
     "leg": ("thigh", "shin", "foot"),
 }
 PLURALS = {"hand": "hands", "foot": "feet", "arm": "arms", "leg": "legs"}
+ALL_AROUND = "all around"
+"""Side of a limb that was not seen at all."""
 
 ADVICE_BY_SIDE = {
     ("arm", "under"): "Raise your {limb}: the underside was never seen.",
@@ -192,7 +175,7 @@ ADVICE_BY_SIDE = {
     ("foot", "inner side"): "Put your feet apart: the inner side was never seen.",
     ("head", "top"): "Bow your head: its top was never seen.",
     ("head", "front"): "Look at the camera: your face was never seen.",
-    ("torso", "all around"): "Turn round once, so that all of you is seen.",
+    ("torso", ALL_AROUND): "Turn round once, so that all of you is seen.",
     ("torso", "top"): "Bend forward: the top of your shoulders was never seen.",
     ("torso", "front"): "Face the camera: your front was never seen.",
     ("torso", "back"): "Turn until your back has been seen.",
@@ -204,19 +187,16 @@ ADVICE_BY_SIDE = {
 
 @dataclass(frozen=True, kw_only=True)
 class UnseenRegion:
-    """A connected piece of skin that no frame shows.
+    """A side of a limb, or all of it, that no frame shows.
 
     Attributes:
-        share: Share of the whole skin, in [0, 1].
-        limb: "arm", "hand", "leg", "foot", "head" or "torso"; the last also stands for pieces
-            that reach over several limbs.
+        limb: "arm", "hand", "leg", "foot", "head" or "torso"; the last also stands for the body.
         laterality: "left", "right", "both", or "" for head and torso.
         side: Of the limb: "front", "back", "top", "left" or "right" of head and torso, "under" of
-            arms, "inner side" or "outer side" of legs; "all around" if it has none.
+            arms, "inner side" or "outer side" of legs; "all around" for all of it.
         stage: Stage at which most of it stopped being seen.
     """
 
-    share: float
     limb: str
     laterality: str
     side: str
@@ -224,106 +204,89 @@ class UnseenRegion:
 
 
 def coverage_advice(coverage: Coverage) -> str:
-    """What the person should do next, in one sentence.
-
-    The sentence names the largest connected unseen piece of skin, and both pieces if its mirror
-    image on the other arm or leg is unseen as well.
-    """
+    """Tell the person in one sentence what to do next: about the largest unseen region."""
     if not coverage.stages.any():
         return NOT_SEEN_YET
-    found = unseen_regions(coverage)
-    if found:
-        return _advice_sentence(_merge_symmetric(found))
-    return (
-        SEEN_COMPLETELY
-        if coverage.seen_share >= NEARLY_COMPLETE
-        else SMALL_REGIONS_LEFT.format(rest=1.0 - coverage.seen_share)
-    )
+    region = largest_unseen_region(coverage)
+    if region is not None:
+        return _advice_sentence(region)
+    if coverage.seen_share >= NEARLY_COMPLETE:
+        return SEEN_COMPLETELY
+    return SMALL_REGIONS_LEFT.format(rest=1.0 - coverage.seen_share)
 
 
-def unseen_regions(coverage: Coverage) -> list[UnseenRegion]:
-    """The connected unseen pieces that are worth mentioning, the largest first."""
-    patches = coverage.patches
-    unseen = coverage.stages < VisibilityStage.SEEN
-    links = patches.adjacent_pairs[unseen[patches.adjacent_pairs].all(axis=1)]
-    count = len(unseen)
-    graph = coo_array((np.ones(len(links), dtype=bool), tuple(links.T)), shape=(count, count))
-    _, piece = connected_components(graph, directed=False)
-    counts = np.where(patches.parts == PART_NAMES.index("head"), HEAD_WEIGHT, 1.0)
-    weights = np.bincount(piece, weights=unseen * counts * patches.areas)
-    least = MIN_REGION_SHARE * float(patches.areas.sum())
-    large = [k for k in np.argsort(-weights) if weights[k] >= least]
-    return [_describe_region(coverage, np.flatnonzero(piece == k)) for k in large]
+def largest_unseen_region(coverage: Coverage) -> UnseenRegion | None:
+    """Return the unseen region with the most skin; None if none is worth mentioning.
 
-
-def _describe_region(coverage: Coverage, piece: Int[np.ndarray, "piece"]) -> UnseenRegion:
-    patches, areas = coverage.patches, coverage.patches.areas[piece].astype(np.float64)
-    share = float(areas.sum() / patches.areas.sum())
-    limb, whose = _limb(patches, piece)
-    stage = VisibilityStage(int(np.bincount(coverage.stages[piece], weights=areas).argmax()))
-    looks = np.average(patches.normals[piece], axis=0, weights=areas)
+    A region of one limb grows by the same region of the other one if that is unseen as well.
+    """
+    patches, unseen = coverage.patches, coverage.stages < VisibilityStage.SEEN
+    weights = patches.areas * np.where(patches.parts == PART_NAMES.index("head"), HEAD_WEIGHT, 1.0)
+    regions: dict[tuple[str, str], dict[str, np.ndarray]] = {}
+    for limb, whose, side, least, where in _limb_sides(patches):
+        if _area_share(patches.areas[where], unseen[where]) >= least:
+            regions.setdefault((limb, side), {})[whose] = where & unseen
+    sizes = {
+        key: sum(float(weights[where].sum()) for where in halves.values())
+        for key, halves in regions.items()
+    }
+    largest = max(sizes, key=sizes.__getitem__, default=None)
+    if largest is None or sizes[largest] < MIN_REGION_SHARE * float(patches.areas.sum()):
+        return None
+    halves = regions[largest]
+    where = np.logical_or.reduce(list(halves.values()))
+    stages = np.bincount(coverage.stages[where], weights=patches.areas[where])
     return UnseenRegion(
-        share=share, limb=limb, laterality=whose, side=_side(looks, limb, whose), stage=stage
+        limb=largest[0],
+        side=largest[1],
+        laterality="both" if len(halves) == 2 else next(iter(halves)),
+        stage=VisibilityStage(int(stages.argmax())),
     )
 
 
-def _side(mean_normal: Float[np.ndarray, "3"], limb: str, whose: str) -> str:
-    """The side of a limb that a mean normal looks to, in the T-pose."""
-    if np.linalg.norm(mean_normal) < MAX_SIDELESS_NORMAL:
-        return "all around"
-    x, y, z = mean_normal
-    if limb in ("arm", "hand"):
-        return (
-            ("front" if z > 0.0 else "back") if abs(z) > abs(y) else "top" if y > 0.0 else "under"
-        )
-    if y > MIN_TOP_NORMAL_Y:
-        return "top"
-    if abs(z) >= abs(x):
-        return "front" if z > 0.0 else "back"
-    side = "left" if x > 0.0 else "right"
-    if limb in ("leg", "foot"):
-        return "outer side" if side == whose else "inner side"
-    return side
+def _limb_sides(
+    patches: SkinPatches,
+) -> Iterator[tuple[str, str, str, float, Bool[np.ndarray, "patches"]]]:
+    """Yield limb, whose it is, side, bound and patches of all regions, those of the body last.
 
-
-def _limb(patches: SkinPatches, piece: Int[np.ndarray, "piece"]) -> tuple[str, str]:
-    """The smallest limb that holds most of a piece, and whose it is."""
-    areas = np.bincount(patches.parts[piece], weights=patches.areas[piece], minlength=14)
-    held: dict[str, float] = dict(zip(PART_NAMES, areas.tolist(), strict=True))
-    enough = MIN_LIMB_SHARE * float(areas.sum())
+    The bound is the unseen share from which a region counts as unseen.
+    """
+    everywhere = np.ones(len(patches.parts), dtype=bool)
+    limbs = {(limb, ""): patches.parts == PART_NAMES.index(limb) for limb in ("torso", "head")}
     for limb, parts in PARTS_OF_LIMB.items():
-        left, right = (sum(held[f"{whose} {p}"] for p in parts) for whose in ("left", "right"))
-        for whose, area in (("left", left), ("right", right), ("both", left + right)):
-            if area >= enough:
-                return limb, whose
-    return ("head", "") if held["head"] >= enough else ("torso", "")
+        for whose in ("left", "right"):
+            rows = [PART_NAMES.index(f"{whose} {part}") for part in parts]
+            limbs[limb, whose] = np.isin(patches.parts, rows)
+    for (limb, whose), where in limbs.items():
+        yield limb, whose, ALL_AROUND, MIN_UNSEEN_OF_LIMB if whose else MIN_UNSEEN_OF_BODY, where
+        if not whose:
+            up = where & (patches.normals[:, 1] > MIN_TOP_NORMAL_Y)
+            yield limb, whose, "top", MIN_UNSEEN_OF_SIDE, up
+        for k, side in enumerate(SIDE_NAMES):
+            if limb in ("leg", "foot") and side in ("left", "right"):
+                side = "outer side" if side == whose else "inner side"
+            yield limb, whose, side, MIN_UNSEEN_OF_SIDE, where & (patches.sides == k)
+    yield "torso", "", ALL_AROUND, MIN_UNSEEN_OF_BODY, everywhere
+    for side in ("front", "back", "left", "right"):
+        yield "torso", "", side, MIN_UNSEEN_OF_BODY, patches.sides == SIDE_NAMES.index(side)
 
 
-def _merge_symmetric(found: list[UnseenRegion]) -> UnseenRegion:
-    """The largest gap; of both limbs if the other one has a like gap half as large."""
-    first = found[0]
-    other = {"left": "right", "right": "left"}.get(first.laterality)
-    for gap in found[1:]:
-        alike = (gap.limb, gap.laterality, gap.side, gap.stage) == (
-            first.limb, other, first.side, first.stage,
-        )  # fmt: skip
-        if alike and gap.share >= 0.5 * first.share:
-            return replace(first, laterality="both", share=first.share + gap.share)
-    return first
-
-
-def _advice_sentence(gap: UnseenRegion) -> str:
-    limb = PLURALS[gap.limb] if gap.laterality == "both" else f"{gap.laterality} {gap.limb}".strip()
-    side = f"{gap.side} side" if gap.side in ("left", "right") else gap.side
-    if gap.stage is VisibilityStage.OUTSIDE_IMAGE:
+def _advice_sentence(region: UnseenRegion) -> str:
+    limb = (
+        PLURALS[region.limb]
+        if region.laterality == "both"
+        else f"{region.laterality} {region.limb}".strip()
+    )
+    side = f"{region.side} side" if region.side in ("left", "right") else region.side
+    if region.stage is VisibilityStage.OUTSIDE_IMAGE:
         return f"Step back: no picture shows your {limb.replace('torso', 'whole body')}."
-    if gap.stage is VisibilityStage.OUTSIDE_MASK:
+    if region.stage is VisibilityStage.OUTSIDE_MASK:
         return f"Look at the masks: none shows your {limb}, though nothing of you was before it."
-    around = gap.limb == "torso" and gap.side in ("left", "right", "front", "back")
-    if around and gap.stage is VisibilityStage.SELF_OCCLUDED:
+    around = region.limb == "torso" and region.side in ("left", "right", "front", "back")
+    if around and region.stage is VisibilityStage.SELF_OCCLUDED:
         return f"Raise your arms: they hide your {side}."
-    if (gap.limb, gap.side) in ADVICE_BY_SIDE:
-        return ADVICE_BY_SIDE[gap.limb, gap.side].format(limb=limb)
-    if gap.side == "all around":
+    if (region.limb, region.side) in ADVICE_BY_SIDE:
+        return ADVICE_BY_SIDE[region.limb, region.side].format(limb=limb)
+    if region.side == ALL_AROUND:
         return f"Show your {limb} to the camera."
     return f"Turn until the {side} of your {limb} has been seen."

@@ -1,13 +1,10 @@
-"""The skin in small patches: where each lies and looks, and which body part a pixel shows."""
+"""The skin in small patches: where each lies and looks, and how a camera sees it."""
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
-from scipy.spatial import KDTree
 
-from avatar.evaluation.image_metrics import psnr_of_errors, silhouette_of
 from avatar.rig import PART_OF_JOINT
 from preprocess.body.body_surface import vertex_areas, vertex_normals, visible_points
 from preprocess.body.parametric_body import ShapedBody
@@ -23,8 +20,6 @@ SIDE_NAMES = ("front", "back", "left", "right", "top", "under")
 """Where a patch looks while the person stands in the T-pose; `under` is the underside."""
 ARM_PARTS, FOOT_PARTS = slice(8, 14), slice(5, 7)
 PATCH_M = 0.022
-ADJACENT_M = 0.045
-"""Patches whose centres are this close, and that look the same way, touch."""
 OCCLUSION_TOLERANCE_M = 0.01
 MAX_SOLE_NORMAL_Y = -0.5
 """Upward component of a foot's normal below which it is a sole and left out."""
@@ -87,13 +82,6 @@ class SkinPatches:
             parts=parts[shown],
             sides=sides[shown],
         )
-
-    @cached_property
-    def adjacent_pairs(self) -> Int[np.ndarray, "links 2"]:
-        """Pairs of patches that touch; the two faces of a hand do not."""
-        pairs = KDTree(self.points).query_pairs(ADJACENT_M, output_type="ndarray")
-        along = np.einsum("na,na->n", *self.normals[pairs.T])
-        return pairs[along > 0.0]
 
 
 def _side_of_vertex(
@@ -178,45 +166,3 @@ def pose_patches(
     points = np.einsum("pab,pb->pa", blended[:, :, :3], patches.points) + blended[:, :, 3]
     normals = np.einsum("pab,pb->pa", blended[:, :, :3], patches.normals)
     return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
-
-
-SCORED_PARTS = ("head", "hands", "arms", "trunk", "legs")
-"""Parts that are scored on their own."""
-PART_BY_WORD = {"torso": "trunk", "head": "head", "hand": "hands", "arm": "arms", "forearm": "arms"}
-"""Scored part by the last word of a name of `PART_NAMES`; the others are legs."""
-SCORED_PART_OF = np.array(
-    [SCORED_PARTS.index(PART_BY_WORD.get(name.split()[-1], "legs")) for name in PART_NAMES]
-)
-
-
-def label_parts(
-    patches: SkinPatches, shaped: ShapedBody, observation: Observation
-) -> Int[np.ndarray, "pixels"] | None:
-    """Index into `SCORED_PARTS` of each pixel of the mask, by the nearest patch in view.
-
-    None if the body is behind the camera, or no patch is in view.
-    """
-    view = view_patches(patches, shaped, observation)
-    if view is None or not view.unoccluded.any():
-        return None
-    rows, columns = np.nonzero(silhouette_of(observation))
-    _, nearest = KDTree(view.pixels[view.unoccluded]).query(
-        np.column_stack([columns, rows]) + 0.5, workers=1
-    )
-    return SCORED_PART_OF[patches.parts[view.unoccluded]][nearest]
-
-
-def psnr_by_part(
-    errors: Float[np.ndarray, "height width 3"],
-    observation: Observation,
-    labels: Int[np.ndarray, "pixels"] | None,
-) -> dict[str, float]:
-    """PSNR of each part that the frame shows, dB, from squared errors."""
-    if labels is None:
-        return {}
-    of_person = errors[silhouette_of(observation)]
-    return {
-        f"psnr_{name}": psnr_of_errors(of_person[labels == part])
-        for part, name in enumerate(SCORED_PARTS)
-        if (labels == part).any()
-    }
