@@ -5,17 +5,15 @@ import pytest
 import torch
 
 from avatar.training.frame_stream import prepare_frame
-from baselines.systems.anim_nerf import PRESETS, AnimNerf
+from baselines.systems.anim_nerf import AnimNerf
 from baselines.systems.baseline_training import BaselineSystem
 from baselines.systems.method_settings import MethodSettings
 from baselines.systems.posed_person import (
     OccupiedCells,
     SkinnedPerson,
     apply_affine,
-    rotation_matrices,
 )
 from baselines.systems.ray_rendering import BodyRays, render_rays
-from preprocess.body.kinematics import rotation_matrices as rotation_matrices_numpy
 
 TINY = MethodSettings(
     frames=2,
@@ -38,27 +36,9 @@ def posed(person, joints):
     return person.pose(torch.from_numpy(np.asarray(joints)).float()[None], torch.tensor([-1]))
 
 
-def test_rotations_are_those_of_the_product_and_smooth_at_rest():
-    vectors = torch.tensor([[0.3, -1.2, 0.5], [0.0, 0.0, 0.0], [2.0, 1.0, 0.1]], requires_grad=True)
-    found = rotation_matrices(vectors)
-    wanted = rotation_matrices_numpy(vectors.detach().numpy())
-    np.testing.assert_allclose(found.detach().numpy(), wanted, atol=1e-5)
-    found.sum().backward()
-    assert torch.isfinite(vectors.grad).all()
-
-
 def test_bones_are_those_of_the_rig(person, rig, bent_pose):
     found = posed(person, bent_pose).bones[0]
     np.testing.assert_allclose(found.numpy(), rig.body_from_canonical(bent_pose), atol=1e-5)
-
-
-def test_the_canonical_pose_is_not_warped(person, rig):
-    method = AnimNerf(person, TINY)
-    method.pose(posed(person, rig.canonical_rotations))
-    points = person.vertices[::50] + 0.01
-    canonical, away = method.warp(points, torch.zeros(len(points), dtype=torch.int64))
-    torch.testing.assert_close(canonical, points, atol=1e-4, rtol=0.0)
-    assert float(away.max()) < 0.08
 
 
 def test_a_vertex_moves_as_its_own_weights_say(person, bent_pose):
@@ -73,28 +53,6 @@ def test_a_vertex_moves_as_its_own_weights_say(person, bent_pose):
     bone = person.weights[rigid].argmax(dim=1)
     back = apply_affine(bodies.bones[0, bone, :3], canonical)
     assert float((back - points).norm(dim=1).median()) < 1e-4
-
-
-def test_unlike_neighbors_do_not_count(person, bent_pose):
-    """At the lifted thigh's contact with the belly, each side keeps to its own bone."""
-    method = AnimNerf(person, TINY)
-    bodies = posed(person, bent_pose)
-    method.pose(bodies)
-    points = bodies.vertices[0]
-    canonical, _ = method.warp(points, torch.zeros(len(points), dtype=torch.int64))
-    away = (canonical - person.vertices).norm(dim=1)
-    assert float(away.quantile(0.95)) < 0.02
-
-
-def test_cells_hold_what_is_near_the_skin(person, bent_pose):
-    skin = posed(person, bent_pose).vertices
-    cells = OccupiedCells.around(skin, 0.08)
-    zeros = torch.zeros(skin.shape[1], dtype=torch.int64)
-    outward = torch.tensor([0.0, 0.0, 0.04])
-    assert cells.holds(skin[0], zeros).all()
-    assert cells.holds(skin[0] + outward, zeros).float().mean() > 0.99
-    far = skin[0] + torch.tensor([0.0, 0.0, 0.9])
-    assert not cells.holds(far, zeros).any()
 
 
 class Fog:
@@ -150,8 +108,3 @@ def test_training_moves_field_and_poses_and_repeats_exactly(person, rig, clip):
     picture = system.render(clip.novel)
     assert picture.shape == (*clip.novel.alpha.shape, 4)
     assert 0.0 < picture[..., 3].mean() < 1.0
-
-
-def test_both_presets_say_their_sizes():
-    assert PRESETS["paper"].width == 256
-    assert PRESETS["paper"].rays > PRESETS["small"].rays

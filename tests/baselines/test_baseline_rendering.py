@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from avatar.evaluation.held_out import HeldOutFrame, score_rendering
 from baselines.instant_avatar.samplers import BaselineScheme
 from baselines.instant_avatar.scheme_rendering import render_sampler, render_samples
 
@@ -35,28 +34,3 @@ def test_every_scheme_renders_the_same_image(avatar, novel, choices, least_db):
     theirs = draw(avatar, seen, cells, **choices)
     assert theirs[..., 3].max() > 0.99
     assert psnr_between(ours, theirs) > least_db
-
-
-@pytest.mark.slow
-def test_broydens_images_do_not_depend_on_the_grid(avatar, novel):
-    """Both show a haze that ours lacks: roots far from the skin, where the field is untrained."""
-    _, seen, cells = novel
-    images = [draw(avatar, seen, cells, skipping=s, roots="broyden") for s in ("frame", "none")]
-    assert psnr_between(*images) > 35.0
-
-
-def test_the_papers_rendering_scores_as_ours_does(avatar, novel):
-    ours, seen, cells = novel
-    held = HeldOutFrame(observation=seen)
-    assert score_rendering(draw(avatar, seen, cells, skipping="frame"), held).psnr == pytest.approx(
-        score_rendering(ours, held).psnr, abs=0.3
-    )
-
-
-@pytest.mark.parametrize(
-    ("choices", "advice"), [({"skipping": "union"}, "skipping='frame'"), ({}, "avatar.render")]
-)
-def test_schemes_that_cannot_render_a_new_pose_are_refused(avatar, novel, choices, advice):
-    _, seen, cells = novel
-    with pytest.raises(ValueError, match=advice):
-        render_sampler(avatar, seen.pose, cells, BaselineScheme(**choices))

@@ -30,19 +30,3 @@ def test_it_learns_a_frame_and_shows_the_same_in_every_pose(rig, shaped, clip):
         zero = torch.zeros(1, dtype=torch.int64)
         shown.append(method.radiance(point, point, zero, fine=False))
     torch.testing.assert_close(shown[0], shown[1])
-
-
-def test_its_gradient_is_that_of_finite_differences(rig, shaped):
-    person = SkinnedPerson(rig, shaped)
-    method = InstantNgp(person.vertices[None], TINY, CONFIG)
-    points = person.vertices[:64].contiguous()
-    zeros = torch.zeros(64, dtype=torch.int64)
-    method.radiance(points, points, zeros, fine=False)[:, 3].sum().backward()
-    bias = method.field.layers[3]
-    torch.testing.assert_close(bias.grad, torch.tensor([0.0, 0.0, 0.0, 64.0]))
-    weight = method.field.layers[2]
-    before, slope = method.field.raw_outputs_at(points)[:, 3].sum(), weight.grad[5, 3].clone()
-    with torch.no_grad():
-        weight[5, 3] += 1e-2
-    after = method.field.raw_outputs_at(points)[:, 3].sum()
-    torch.testing.assert_close((after - before) / 1e-2, slope, rtol=2e-2, atol=1e-3)

@@ -9,7 +9,7 @@ from baselines.systems.baseline_training import BaselineSystem
 from baselines.systems.method_settings import MethodSettings
 from baselines.systems.neural_body import NeuralBody
 from baselines.systems.posed_person import SkinnedPerson
-from baselines.systems.voxel_convolution import ActiveVoxels, VoxelConvolution, read_volumes
+from baselines.systems.voxel_convolution import ActiveVoxels, VoxelConvolution
 
 TINY = MethodSettings(
     frames=1,
@@ -51,29 +51,6 @@ def test_a_sparse_convolution_is_the_dense_one_where_it_is_active(stride):
     if stride == 2:  # and nothing is active but what sees an active voxel
         seen = nn.functional.max_pool3d(occupied[None, None].float(), 3, 2, 1)[0, 0] > 0
         assert set(map(tuple, to.places.tolist())) == set(map(tuple, seen.nonzero().tolist()))
-
-
-def test_volumes_are_read_where_their_voxels_lie():
-    volumes = []
-    for stride, size in ((2, 9), (4, 5)):
-        axis = torch.arange(size) * float(stride)
-        volumes.append(axis.view(1, 1, size, 1, 1).expand(1, 1, size, 4, 3).contiguous())
-    places = torch.tensor([[3.0, 1.0, 2.0], [7.5, 2.0, 1.0]])
-    torch.testing.assert_close(read_volumes(volumes, places), places[:, :1].expand(2, 2))
-
-
-def test_codes_diffuse_alike_wherever_the_body_stands(person):
-    torch.manual_seed(0)
-    method = NeuralBody(person, 2, TINY)
-    places = ((person.vertices - person.vertices.amin(dim=0)) / 0.05).floor() + 4.5  # no rounding
-    shift = torch.tensor([16.0, 0.0, 16.0])
-    with torch.no_grad():
-        here, there = method.diffuse(places), method.diffuse(places + shift)
-        points = places[::37] + 0.3
-        read = read_volumes(here, points)
-        torch.testing.assert_close(read_volumes(there, points + shift), read, atol=1e-4, rtol=1e-3)
-        assert float(read.std(dim=0).mean()) > 0.01  # and they differ from place to place
-        assert not torch.allclose(read_volumes(there, points), read, atol=1e-2)
 
 
 def test_it_learns(person, rig, clip):

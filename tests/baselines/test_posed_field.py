@@ -2,13 +2,9 @@
 
 import torch
 
-from avatar.kernels import operations
-from avatar.kernels.operands import MarchSettings
 from avatar.render import correspondence_tables
 from baselines.instant_avatar.broyden_kernels import find_all_roots
 from baselines.instant_avatar.posed_field import BroydenWarp, CorrespondenceWarp
-from baselines.instant_avatar.posed_occupancy import NoSkipping
-from baselines.instant_avatar.samplers import PosedSampler
 
 
 def test_of_several_roots_the_densest_counts(rig, avatar, novel, generator, bones_of):
@@ -47,47 +43,3 @@ def test_both_warps_agree_on_the_person(rig, avatar, novel, bones_of, solid_in):
     places[0][exact.has_root], places[1][ours.has_root] = exact.points, ours.points
     gap = (places[0] - places[1])[both].norm(dim=1)
     assert float((gap < 2e-3).float().mean()) > 0.97
-
-
-def test_samples_know_which_root_warped_them(avatar, learnt, generator):
-    """Through its row each sample leads back into its cell: x = x* + J⁻¹ (p - center)."""
-    replay = learnt.trainer.replay
-    rays = replay.sample_rays(200, generator).rays
-    sampler = PosedSampler(
-        NoSkipping(),
-        CorrespondenceWarp(avatar.occupancy),
-        avatar.sample_step_m,
-    )
-    samples = sampler.sample_rays(rays, replay.correspondences)
-    slot = rays.slots.long().repeat_interleave(samples.counts)
-    root = replay.correspondences.roots[slot, samples.root_rows.long()]
-    inverse = root[:, 3:].unflatten(1, (3, 3))
-    offset = torch.linalg.solve(inverse, samples.points - root[:, :3])
-    assert (
-        float(
-            (offset.abs().amax(dim=1) < 0.5 * replay.correspondences.cell_m + 1e-3).float().mean()
-        )
-        > 0.99
-    )
-
-
-def test_ours_asks_no_point_that_no_skipping_leaves_out(avatar, learnt, generator):
-    replay = learnt.trainer.replay
-    rays = replay.sample_rays(300, generator).rays
-    everything = PosedSampler(
-        NoSkipping(),
-        CorrespondenceWarp(avatar.occupancy),
-        avatar.sample_step_m,
-    ).sample_rays(rays, replay.correspondences)
-    how = MarchSettings(avatar.sample_step_m, torch.inf, 512)
-    ours = operations.march(rays, replay.correspondences, avatar.occupancy.density_grid, how)
-    assert (everything.counts >= ours.counts).all()
-    assert int(everything.counts.sum()) > 1.5 * int(ours.counts.sum())
-    for ray in range(0, 300, 10):
-        mine, all_of_them = (
-            s.points[int(s.offsets[ray]) : int(s.offsets[ray]) + int(s.counts[ray])]
-            for s in (ours, everything)
-        )
-        if len(mine):
-            gap = torch.cdist(mine.double(), all_of_them.double()).amin(dim=1)
-            assert float((gap < 1e-4).float().mean()) > 0.9

@@ -1,7 +1,7 @@
 """The table of what each mechanism buys."""
 
 import avatar.training.trainer
-from benchmarks.ablation_page import mechanism_lines, written
+from benchmarks.ablation_page import mechanism_lines
 from benchmarks.mechanisms import (
     FEW_FRAME_MECHANISMS,
     FULL,
@@ -33,14 +33,6 @@ def test_a_loss_is_positive_and_the_time_of_a_mechanism_is_compared_with_more_st
     assert "| alpha loss | 2.0 | -0.10 / +0.50 | - | +0.20 | +0.20 | few |" in lines
     assert "| hard surface | 0.0 | - | -0.10 | -0.10 | +0.00 | few |" in lines
     assert not any("Few-frame" in line for line in lines)
-
-
-def test_the_page_keeps_what_stands_around_its_tables(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text("before\n<!-- a: begin -->\nold\n<!-- a: end -->\nafter\n")
-    assert written("a", ["new"], page) == (
-        "before\n<!-- a: begin -->\nnew\n<!-- a: end -->\nafter\n"
-    )
 
 
 def test_every_mechanism_can_be_left_out_and_its_lines_counted():

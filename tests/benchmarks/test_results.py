@@ -1,18 +1,12 @@
 """docs/results.md: its plan, its tables, and that the text around them stays."""
 
 import json
-import os
-import signal
-import sys
-import threading
-import time
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
-from apps.cli.command_line import run_command
 from benchmarks import results
 from benchmarks.results import ResultsJob, plan, write_page
 from benchmarks.results_page import ComparedSample, results_lines
@@ -60,23 +54,6 @@ def test_each_sample_is_a_column_and_the_gain_is_stated():
     assert "24.48 / .9353" in text
 
 
-def test_what_another_commit_trained_is_named():
-    sample = ComparedSample(subject=1, kind="exact", seconds=60.0)
-    newer = result("ours", 30.0, commit="def5678")
-    newer["made_on"]["date"] = "2026-11-23 09:00 UTC"
-    text = "\n".join(results_lines({sample: [result("anim-nerf", 25.0), newer]}, []))
-    assert "of another commit, abc1234: anim-nerf on S1 exact, 60 s" in text
-
-
-def test_the_most_important_comparisons_come_first():
-    short = plan("short")
-    assert [each.sample.subject for each in short[:6]] == [1, 1, 2, 2, 3, 3]
-    assert all(each.methods == ("anim-nerf", "ours") for each in short[:6])
-    assert {each.sample.seconds for each in short[:6]} == {60.0}
-    cells = {(each.sample, method) for each in plan("whole") for method in each.methods}
-    assert len(cells) == 3 * 2 * 2 * 5
-
-
 def test_an_interrupted_run_goes_on_and_other_films_are_refused(tmp_path, monkeypatch):
     filmed, compared = [], []
 
@@ -94,28 +71,6 @@ def test_an_interrupted_run_goes_on_and_other_films_are_refused(tmp_path, monkey
     assert compared[len(plan("short")) :] == plan("short")
     with pytest.raises(InputError, match="filmed with"):
         results.run(replace(job, size=128))
-
-
-def test_sigterm_ends_the_comparison_that_runs(tmp_path, monkeypatch):
-    started, ended = tmp_path / "started", []
-    program = "import pathlib, sys, time; pathlib.Path(sys.argv[1]).touch(); time.sleep(60)"
-
-    def compare(_, __, comparisons):
-        ended.append(comparisons.run([sys.executable, "-c", program, str(started)]))
-        return ended[-1]
-
-    def terminate_once_it_runs():
-        while not started.exists():
-            time.sleep(0.01)
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    monkeypatch.setattr(results, "film_capture", lambda place, _: place.mkdir())
-    monkeypatch.setattr(results, "compare", compare)
-    job = ResultsJob(out=tmp_path / "out", jobs=1)
-    threading.Thread(target=terminate_once_it_runs, daemon=True).start()
-    assert run_command("results", lambda: results.run(job)) == 130
-    assert ended[0] == 128 + signal.SIGTERM
-    assert set(ended[1:]) <= {130}  # nothing was started after it
 
 
 def test_text_around_the_tables_is_kept(tmp_path):
