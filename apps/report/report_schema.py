@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -272,32 +271,6 @@ class ForgettingStats:
     psnr_before: float | None
     psnr_after: float | None
     largest_drop: float | None
-
-    @classmethod
-    def of(
-        cls,
-        before: tuple[HeldOutScore, ...],
-        after: tuple[HeldOutScore, ...],
-        *,
-        videos: tuple[str, ...],
-        video_of_frame: Sequence[int],
-        frames_trained: int,
-        wall_seconds: float,
-        replayed_key_frames: int,
-    ) -> "ForgettingStats":
-        """Compare scores of the same frames before and after."""
-        drops = [b.psnr - a.psnr for b, a in zip(before, after, strict=True)]
-        return cls(
-            videos=videos,
-            frames_trained=frames_trained,
-            wall_seconds=wall_seconds,
-            replayed_key_frames=replayed_key_frames,
-            frames=tuple(score.frame for score in before),
-            video_of_frame=tuple(video_of_frame),
-            psnr_before=finite_mean([score.psnr for score in before]),
-            psnr_after=finite_mean([score.psnr for score in after]),
-            largest_drop=max(0.0, *drops) if drops else None,
-        )
 
 
 @dataclass(frozen=True, kw_only=True)

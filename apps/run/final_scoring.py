@@ -301,14 +301,22 @@ class EarlierVideos:
         if "before" not in self._notes:
             return None
         history = self._notes["before"]
-        before = tuple(HeldOutScore(**each) for each in history["scores"])
+        before = [each["psnr"] for each in history["scores"]]
         after, videos = self._score_earlier_videos(trainer), earlier_video_names(self._notes)
-        places = [len(videos) + 1 - video_age(h.observation.frame.index) for h in self.held_out]
-        note = ForgettingStats.of(
-            before, after, videos=videos, video_of_frame=places,
-            frames_trained=history["frames"], wall_seconds=history["seconds"],
+        drops = [was - now.psnr for was, now in zip(before, after, strict=True)]
+        note = ForgettingStats(
+            videos=videos,
+            frames_trained=history["frames"],
+            wall_seconds=history["seconds"],
             replayed_key_frames=len(self._kept.replay_frames),
-        )  # fmt: skip
+            frames=tuple(score.frame for score in after),
+            video_of_frame=tuple(
+                len(videos) + 1 - video_age(held.observation.frame.index) for held in self.held_out
+            ),
+            psnr_before=finite_mean(before),
+            psnr_after=finite_mean([score.psnr for score in after]),
+            largest_drop=max([0.0, *drops]) if drops else None,
+        )
         if note.psnr_after is not None:
             console.info(
                 f"Held-out frames of the earlier video: {format_psnr(note.psnr_before, None)} "

@@ -127,10 +127,10 @@ def test_the_page_reports_forgetting():
         replace(point(40.0, 20.0), video=2),
         replace(point(50.0, 21.0), video=2),
     )
-    before, after = scores((20.0, 18.0), (22.0, 19.0)), scores((21.0, 18.0), (21.5, 19.0))
-    earlier = ForgettingStats.of(
-        before, after, videos=("first <1>.mp4",), video_of_frame=(1, 1), frames_trained=54,
-        wall_seconds=30.0, replayed_key_frames=40,
+    earlier = ForgettingStats(
+        videos=("first <1>.mp4",), video_of_frame=(1, 1), frames_trained=54, wall_seconds=30.0,
+        replayed_key_frames=40, frames=(9, 19), psnr_before=21.0, psnr_after=21.25,
+        largest_drop=0.5,
     )  # fmt: skip
     page = report_page(report(earlier_videos=earlier, curve=marks), name="second.mp4")
     lead = "17 frames of this video, and 54 of first &lt;1&gt;.mp4"
