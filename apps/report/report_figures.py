@@ -118,7 +118,7 @@ class CoverageMap:
             right[axis] = sign
             to_eye = np.cross(right, [0.0, 1.0, 0.0])
             plane, facing = np.column_stack([points @ right, points[:, 1]]), normals @ to_eye
-            free = visible_points(plane, -(points @ to_eye), facing, cell_m=0.03, tolerance_m=0.03)
+            free = visible_points(plane, -(points @ to_eye), facing)
             shown = np.flatnonzero(free & (facing > 0.0))
             top_left = np.array([plane[shown, 0].min(), points[:, 1].max()])
             places = 100.0 * (plane[shown] - top_left) * [1.0, -1.0]

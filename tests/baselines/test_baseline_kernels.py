@@ -8,7 +8,7 @@ from avatar.config import TrainConfig
 from avatar.kernels.operands import RayBatch
 from avatar.training.trainer import Trainer
 from baselines.instant_avatar.broyden_kernels import find_all_roots
-from baselines.instant_avatar.occupied_samples import PosedOccupancy
+from baselines.instant_avatar.occupied_samples import PosedOccupancy, sample_occupied_cells
 from baselines.instant_avatar.posed_field import BroydenWarp
 
 STEP_M = 0.05
@@ -41,6 +41,32 @@ def boxes(generator):
         ray_box_low=low,
         ray_box_high=low + shape / cells_per_m,
     )
+
+
+def test_samples_lie_a_step_apart_and_fill_a_box_that_is_full(boxes, generator):
+    full = boxes._replace(occupied=torch.ones_like(boxes.occupied))
+    rays = rays_at(full, 100, generator)
+    points, counts = sample_occupied_cells(rays, full, STEP_M)
+    size = (full.shape / full.cells_per_m)[rays.slots.long()]
+    low = full.low[rays.slots.long()]
+    near = (low - rays.origins) / rays.directions
+    far = (low + size - rays.origins) / rays.directions
+    length = torch.maximum(near, far).amin(1) - torch.minimum(near, far).amax(1)
+    lattice = torch.ceil(length / STEP_M - rays.jitter)
+    assert (counts - lattice).abs().max() <= 1
+    ray = torch.repeat_interleave(torch.arange(100), counts)
+    apart = (points[1:] - points[:-1]).norm(dim=1)[ray[1:] == ray[:-1]]
+    torch.testing.assert_close(apart, torch.full_like(apart, STEP_M), atol=1e-5, rtol=0)
+
+
+def test_an_empty_cell_has_no_samples(boxes, generator):
+    rays = rays_at(boxes, 300, generator)
+    points, counts = sample_occupied_cells(rays, boxes, STEP_M)
+    slot = rays.slots.long().repeat_interleave(counts)
+    cell = ((points - boxes.low[slot]) * boxes.cells_per_m[slot]).long()
+    cell = torch.minimum(cell.clamp(min=0), boxes.shape[slot] - 1)
+    flat = (cell[:, 0] * boxes.shape[slot, 1] + cell[:, 1]) * boxes.shape[slot, 2] + cell[:, 2]
+    assert (boxes.occupied[slot, flat] > 0).float().mean() > 0.999
 
 
 # --- roots ------------------------------------------------------------------------------------
