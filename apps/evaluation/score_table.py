@@ -145,7 +145,7 @@ def table_cells(evaluations: Sequence[AvatarEvaluation]) -> list[list[str]]:
         if len(alike) == len(evaluations):  # all avatars have such a row
             means = [means_of(row) for row in alike]
             overall = {
-                metric: finite_mean([math.nan if m[metric] is None else m[metric] for m in means])
+                metric: finite_mean([mean for each in means if (mean := each[metric]) is not None])
                 for metric in columns
             }
             add("mean", str(sum(len(row.scores) for row in alike)), first.way, overall)

@@ -147,8 +147,8 @@ HEAD_WEIGHT = 2.0
 """Weight of the head's skin relative to other skin, since viewers look at the face."""
 MIN_UNSEEN_OF_SIDE, MIN_UNSEEN_OF_LIMB = 0.5, 0.75
 """Unseen share from which a limb's side, and a whole limb, are called unseen."""
-MIN_UNSEEN_OF_BODY = 0.9
-"""Unseen share from which torso and head, the whole body, and one side of it are."""
+TURN_SIDES = ("front", "back", "left", "right")
+"""Sides of the whole body, which turning shows."""
 MIN_TOP_NORMAL_Y = 0.6
 """Upward component of the normals on top of head and shoulders."""
 NEARLY_COMPLETE = 0.95
@@ -218,12 +218,23 @@ def coverage_advice(coverage: Coverage) -> str:
 def largest_unseen_region(coverage: Coverage) -> UnseenRegion | None:
     """Return the unseen region with the most skin; None if none is worth mentioning.
 
-    A region of one limb grows by the same region of the other one if that is unseen as well.
+    A side of the whole body comes first, as turning shows much more than that side. A region of one
+    limb grows by the same region of the other one if that is unseen as well.
     """
     patches, unseen = coverage.patches, coverage.stages < VisibilityStage.SEEN
+    sides = {side: patches.sides == SIDE_NAMES.index(side) for side in TURN_SIDES}
+    shares = {side: _area_share(patches.areas[at], unseen[at]) for side, at in sides.items()}
+    worst = max(TURN_SIDES, key=shares.__getitem__)
+    everything = min(shares.values()) >= MIN_UNSEEN_OF_LIMB
+    where = unseen if everything else unseen & sides[worst]
+    if shares[worst] >= MIN_UNSEEN_OF_SIDE:
+        stage, side = _main_stage(coverage, where), ALL_AROUND if everything else worst
+        if stage in (VisibilityStage.FACING_AWAY, VisibilityStage.SELF_OCCLUDED):
+            return UnseenRegion(limb="torso", laterality="", side=side, stage=stage)
     weights = patches.areas * np.where(patches.parts == PART_NAMES.index("head"), HEAD_WEIGHT, 1.0)
     regions: dict[tuple[str, str], dict[str, np.ndarray]] = {}
-    for limb, whose, side, least, where in _limb_sides(patches):
+    for limb, whose, side, where in _limb_sides(patches):
+        least = MIN_UNSEEN_OF_LIMB if side == ALL_AROUND else MIN_UNSEEN_OF_SIDE
         if _area_share(patches.areas[where], unseen[where]) >= least:
             regions.setdefault((limb, side), {})[whose] = where & unseen
     sizes = {
@@ -234,41 +245,37 @@ def largest_unseen_region(coverage: Coverage) -> UnseenRegion | None:
     if largest is None or sizes[largest] < MIN_REGION_SHARE * float(patches.areas.sum()):
         return None
     halves = regions[largest]
-    where = np.logical_or.reduce(list(halves.values()))
-    stages = np.bincount(coverage.stages[where], weights=patches.areas[where])
     return UnseenRegion(
         limb=largest[0],
-        side=largest[1],
         laterality="both" if len(halves) == 2 else next(iter(halves)),
-        stage=VisibilityStage(int(stages.argmax())),
+        side=largest[1],
+        stage=_main_stage(coverage, np.logical_or.reduce(list(halves.values()))),
     )
+
+
+def _main_stage(coverage: Coverage, where: Bool[np.ndarray, "patches"]) -> VisibilityStage:
+    """Return the stage at which most of the skin of some patches stopped being seen."""
+    stages = np.bincount(coverage.stages[where], weights=coverage.patches.areas[where])
+    return VisibilityStage(int(stages.argmax()))
 
 
 def _limb_sides(
     patches: SkinPatches,
-) -> Iterator[tuple[str, str, str, float, Bool[np.ndarray, "patches"]]]:
-    """Yield limb, whose it is, side, bound and patches of all regions, those of the body last.
-
-    The bound is the unseen share from which a region counts as unseen.
-    """
-    everywhere = np.ones(len(patches.parts), dtype=bool)
+) -> Iterator[tuple[str, str, str, Bool[np.ndarray, "patches"]]]:
+    """Yield limb, whose it is, side, and patches of all regions of limbs, torso and head."""
     limbs = {(limb, ""): patches.parts == PART_NAMES.index(limb) for limb in ("torso", "head")}
     for limb, parts in PARTS_OF_LIMB.items():
         for whose in ("left", "right"):
             rows = [PART_NAMES.index(f"{whose} {part}") for part in parts]
             limbs[limb, whose] = np.isin(patches.parts, rows)
     for (limb, whose), where in limbs.items():
-        yield limb, whose, ALL_AROUND, MIN_UNSEEN_OF_LIMB if whose else MIN_UNSEEN_OF_BODY, where
+        yield limb, whose, ALL_AROUND, where
         if not whose:
-            up = where & (patches.normals[:, 1] > MIN_TOP_NORMAL_Y)
-            yield limb, whose, "top", MIN_UNSEEN_OF_SIDE, up
+            yield limb, whose, "top", where & (patches.normals[:, 1] > MIN_TOP_NORMAL_Y)
         for k, side in enumerate(SIDE_NAMES):
             if limb in ("leg", "foot") and side in ("left", "right"):
                 side = "outer side" if side == whose else "inner side"
-            yield limb, whose, side, MIN_UNSEEN_OF_SIDE, where & (patches.sides == k)
-    yield "torso", "", ALL_AROUND, MIN_UNSEEN_OF_BODY, everywhere
-    for side in ("front", "back", "left", "right"):
-        yield "torso", "", side, MIN_UNSEEN_OF_BODY, patches.sides == SIDE_NAMES.index(side)
+            yield limb, whose, side, where & (patches.sides == k)
 
 
 def _advice_sentence(region: UnseenRegion) -> str:

@@ -94,10 +94,9 @@ class Lpips:
             InputError: If a file holds no such weights.
         """
         folder = Path(torch.hub.get_dir()) / "checkpoints" if folder is None else folder
-        files = {
-            LPIPS_CONVENTIONS[name].network: folder
-            / Path(WEIGHT_URLS[LPIPS_CONVENTIONS[name].network]).name
-            for name in wanted
+        networks = [LPIPS_CONVENTIONS[name].network for name in wanted]
+        files: dict[LpipsNetwork, Path] = {
+            network: folder / Path(WEIGHT_URLS[network]).name for network in networks
         }
         missing = [network for network, file in files.items() if not file.is_file()]
         self._networks: dict[LpipsNetwork, Any] = {}
