@@ -10,8 +10,10 @@ from jaxtyping import Float32
 from apps.report.page_rendering import to_uint8, webp_data_uri
 from avatar.evaluation.held_out import HeldOutFrame, score_rendering
 from avatar.evaluation.image_metrics import (
+    SharpnessVerdict,
     composite_over,
     ground_truth_over,
+    overall_verdict,
     psnr_of_errors,
     silhouette_of,
 )
@@ -108,6 +110,11 @@ class ShownFrame:
     truth: str
     rendering: str
     error: str
+
+    @property
+    def verdict(self) -> SharpnessVerdict | None:
+        """Verdict on this frame; None without a silhouette."""
+        return overall_verdict([self.score])
 
     @classmethod
     def of(
