@@ -4,19 +4,18 @@ import os
 import platform
 import socket
 import subprocess
-import sys
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 
+import psutil
+
 ROOT = Path(__file__).resolve().parents[2]
 LIBRARIES = ("numpy", "numba", "torch", "onnxruntime")
 CGROUP = Path("/sys/fs/cgroup")
-"""Limits of a container (Linux, version 2)."""
-PAGE_MB = 4096 / 1e6 if sys.platform == "win32" else os.sysconf("SC_PAGE_SIZE") / 1e6
-"""Size of a memory page, MB."""
+"""Limits of a container (Linux, version 2), which psutil does not know."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,8 +50,8 @@ class Hardware:
             date=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
             processor=processor_name(),
             cores=usable_cores(),
-            load=round(os.getloadavg()[0], 1),
-            memory_gb=round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1),
+            load=round(psutil.getloadavg()[0], 1),
+            memory_gb=round(psutil.virtual_memory().total / 2**30, 1),
             software=", ".join([f"Python {platform.python_version()}", *libraries]),
         )
 
@@ -96,48 +95,11 @@ def processor_name() -> str:
     return platform.processor() or platform.machine()
 
 
-def total_memory_mb() -> float:
-    """Return the memory of this machine or container, MB."""
-    total = os.sysconf("SC_PHYS_PAGES") * PAGE_MB
-    limit = _cgroup_mb("memory.max")
-    return total if limit is None else min(total, limit)
-
-
-def available_memory_mb() -> float:
-    """Return the memory that processes can still take without swapping, MB."""
-    available = os.sysconf("SC_AVPHYS_PAGES") * PAGE_MB
-    with suppress(OSError, ValueError, StopIteration):
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-        line = next(line for line in lines if line.startswith("MemAvailable:"))
-        available = float(line.split()[1]) * 1024 / 1e6
-    limit, used = _cgroup_mb("memory.max"), _cgroup_mb("memory.current")
-    return available if limit is None or used is None else min(available, limit - used)
-
-
-def _cgroup_mb(name: str) -> float | None:
-    try:
-        return int((CGROUP / name).read_text(encoding="ascii")) / 1e6
-    except (OSError, ValueError):  # no such system, or "max"
-        return None
-
-
-def tree_memory_mb(process: int) -> float:
-    """Return the resident memory of a process and all its descendants, MB; 0 where unknown."""
-    pages, waiting = 0, [str(process)]
-    while waiting:
-        place = Path("/proc", waiting.pop())
-        with suppress(OSError, ValueError, IndexError):  # it may just have ended
-            pages += int((place / "statm").read_text(encoding="ascii").split()[1])
-            for children in (place / "task").glob("*/children"):
-                waiting += children.read_text(encoding="ascii").split()
-    return pages * PAGE_MB
-
-
 def describe_machine() -> dict[str, object]:
     """Return host name, processor, cores and memory of this machine."""
     return {
         "host": socket.gethostname(),
         "processor": processor_name(),
         "cores": usable_cores(),
-        "memory_mb": round(total_memory_mb()),
+        "memory_mb": round(psutil.virtual_memory().total / 1e6),
     }
