@@ -54,6 +54,7 @@ class BatchFolder:
         self.place = place.rstrip("/")
         self.path = None if is_url(place) else Path(place)
         self.records: list[AttemptRecord] = []
+        self._latest: dict[str, AttemptRecord] = {}
         self._packages: frozenset[str] = frozenset()
         self._saved_at = 0.0
 
@@ -93,7 +94,7 @@ class BatchFolder:
         Raises:
             InputError: If files of another program lie where it would be written.
         """
-        latest = next((r for r in reversed(self.records) if r.capture == capture.name), None)
+        latest = self._latest.get(capture.name)
         if latest is not None and latest.key == (capture.input_key, capture.options_key):
             is_there = capture.name in self._packages
             if is_there if latest.status == "done" else not again:
@@ -117,9 +118,11 @@ class BatchFolder:
         else:
             for file in sorted(attempt.files, key=PACKAGE_NAME.__eq__):  # the package is the last
                 self._send(f"{folder}/{file}", attempt.files[file])
-        same = sum(r.capture == name and r.key == record.key for r in self.records)
-        record = replace(record, attempt=1 + same)
+        latest = self._latest.get(name)
+        if latest is not None and latest.key == record.key:
+            record = replace(record, attempt=latest.attempt + 1)
         self.records.append(record)
+        self._latest[name] = record
         if self.path is not None:
             with (self.path / RESULTS_NAME).open("a", encoding="utf-8") as results:
                 results.write(_line(record))
@@ -142,6 +145,7 @@ class BatchFolder:
             return
         text = read_text(results)
         self.records = list(_read_records(text))
+        self._latest = {record.capture: record for record in self.records}
         if text.strip() and not self.records:
             raise InputError(
                 f"{results} is not what ia-batch wrote, so it is not replaced. Move it elsewhere, "

@@ -10,7 +10,13 @@ from typing import Any
 
 from apps.batching.batch_arguments import RAY_LOCAL, BatchArguments
 from apps.batching.capture_discovery import BatchCapture
-from apps.batching.ingest_attempt import Attempt, AttemptFailure, learn_capture, record_of
+from apps.batching.ingest_attempt import (
+    LOG_NAME,
+    Attempt,
+    AttemptFailure,
+    learn_capture,
+    record_of,
+)
 from apps.cli.hardware import usable_cores
 from capture.input_error import InputError
 
@@ -43,14 +49,14 @@ def run_attempts(
         try:
             needs = {capture.name: _resources(capture, arguments) for capture in captures}
             _check_room(ray, needs.values())
-            own_process: dict[str, Any] = {"max_calls": 1}
-            retrying = {"max_retries": arguments.retries, "retry_exceptions": [AttemptFailure]}
-            task = ray.remote(**own_process, **retrying)(learn_capture)
+            once: dict[str, Any] = {"max_calls": 1}  # each attempt has a process of its own
+            retries = {"max_retries": arguments.retries, "retry_exceptions": [AttemptFailure]}
+            task = ray.remote(**once, **retries)(learn_capture)
             waiting, running = iter(captures), {}
             while True:
                 for capture in islice(waiting, MAX_SUBMITTED - len(running)):
-                    one = task.options(name=capture.name, **needs[capture.name])
-                    running[one.remote(capture, arguments, scratch)] = capture
+                    named = task.options(name=capture.name, **needs[capture.name])
+                    running[named.remote(capture, arguments, scratch)] = capture
                 if not running:
                     return
                 (ended,), _ = ray.wait(list(running), num_returns=1)
@@ -108,4 +114,4 @@ def _attempt(ray: Any, task: Any, capture: BatchCapture) -> Attempt:
         cause = "its node ran out of memory, and Ray ended the attempt"
     except ray.exceptions.RayError as error:
         cause = f"its process or its node was lost ({type(error).__name__})"
-    return Attempt(record=record_of(capture, None, cause))
+    return Attempt(record=record_of(capture, None, cause), files={LOG_NAME: cause.encode()})
