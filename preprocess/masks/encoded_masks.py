@@ -28,11 +28,7 @@ RawMaskReader = Callable[[int], Shaped[np.ndarray, "height width"]]
 
 
 def open_mask_video(path: Path) -> tuple[int, RawMaskReader]:
-    """Number of frames of a mask video, and the function that reads one.
-
-    Raises:
-        InputError: If it cannot be opened.
-    """
+    """Number of frames of a mask video, and the function that reads one."""
     source = VideoFile(path, FrameSelection())
     return source.frames_in_file, _MaskVideo(path).read
 
@@ -47,11 +43,7 @@ class _MaskVideo:
         self._last: Float32[np.ndarray, "height width"] | None = None
 
     def read(self, row: int) -> Float32[np.ndarray, "height width"]:
-        """Read the mask of one frame.
-
-        Raises:
-            InputError: If it cannot be decoded.
-        """
+        """Read the mask of one frame."""
         if row == self._at and self._last is not None:
             return self._last
         if self._capture is None or row <= self._at:

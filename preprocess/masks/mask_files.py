@@ -36,11 +36,7 @@ SOFT_MIN, SOFT_MAX = 0.1, 0.9
 
 
 def shows_background(samples: list[Float32[np.ndarray, "_ _"]], path: Path) -> bool:
-    """Whether masks are 1 on the background: on most of the image and of its rim.
-
-    Raises:
-        InputError: If they are empty, or neither side can be the person.
-    """
+    """Whether masks are 1 on the background: on most of the image and of its rim."""
     shares = np.array([_coverage(mask) for mask in samples])
     usable = shares[(shares[:, 0] > 0.0) & (shares[:, 0] < 1.0)]
     if not len(usable):
@@ -75,12 +71,6 @@ def are_object_ids(samples: list[Float32[np.ndarray, "_ _"]]) -> bool:
     found = np.unique(np.concatenate([np.unique(mask) for mask in samples]))
     area = float(np.median([float((mask > 0.0).mean()) for mask in samples]))
     return len(found) <= MAX_OBJECTS and area > MIN_OBJECT_AREA
-
-
-def is_inverted(alpha: Float32[np.ndarray, "height width"]) -> bool:
-    """Whether one mask shows the background although the others show the person."""
-    area, rim = _coverage(alpha)
-    return bool(area > MAX_PERSON_FRACTION and rim > MAX_PERSON_FRACTION)
 
 
 def _coverage(alpha: Float32[np.ndarray, "height width"]) -> Float[np.ndarray, "2"]:
@@ -124,12 +114,7 @@ class Masks:
         invert: bool | None,
         names: tuple[str, ...] | None = None,
     ) -> None:
-        """Detect kind and polarity from a few of the masks that `read` returns.
-
-        Raises:
-            InputError: If none of them can be read, they are not masks or, with `invert` None, it
-                is unclear which side is the person.
-        """
+        """Detect kind and polarity from a few of the masks that `read` returns."""
         self.path = path
         self.count = count
         self.names = names
@@ -169,7 +154,7 @@ class Masks:
                 stored, size_px, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
             )
         alpha = np.float32(1.0) - stored if self.inverted else stored
-        if self._doubts and is_inverted(alpha):
+        if self._doubts and (_coverage(alpha) > MAX_PERSON_FRACTION).all():
             raise InputError(
                 f"mask {row} in {self.path} covers most of the image and of its rim, unlike the "
                 "others; is it inverted?"
@@ -238,11 +223,7 @@ def open_tracker_masks(
 
 
 def _open_rle(path: Path, person: str | None) -> tuple[int, MaskReader] | None:
-    """Open run-length encoded masks; None if a file holds none.
-
-    Raises:
-        InputError: If the file is malformed.
-    """
+    """Open run-length encoded masks; None if a file holds none."""
     try:
         return open_rle_masks(read_untrusted_file(path), path, person)
     except MALFORMED_TRACK_ERRORS as cause:

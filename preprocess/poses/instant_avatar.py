@@ -61,11 +61,7 @@ SCALE_TOLERANCE = 0.01
 
 
 def parse_instant_avatar(content: Any, path: Path, default_model: str) -> MotionByPerson | None:
-    """The person of the file; None if it has other keys.
-
-    Raises:
-        InputError: If it has the keys, and what they hold is no motion.
-    """
+    """The person of the file; None if it has other keys."""
     if not isinstance(content, dict):
         return None
     held = content.get("smpl", content)
@@ -121,11 +117,7 @@ def _intrinsic_matrix(focal: Any, center: Any) -> Any:
 
 
 def collect_arrays(named: Mapping[str, Any], path: Path) -> dict[str, Shaped[np.ndarray, "..."]]:
-    """The arrays that `motion_of` takes.
-
-    Raises:
-        InputError: If they are no arrays, or the world that they speak of is not metric.
-    """
+    """The arrays that `motion_of` takes."""
     try:
         arrays = {key: np.asarray(named[key]) for key in RECOGNIZED_KEYS if key in named}
     except ValueError as cause:
@@ -164,12 +156,7 @@ ROW_KEYS = (*ROTATION_KEYS, *ROW_SHAPES, "frame", "time", "valid")
 
 
 def parse_per_frame(content: Any, path: Path, default_model: str) -> MotionByPerson | None:
-    """The people of the folder or file; None if it does not hold a pose an item.
-
-    Raises:
-        InputError: If it does, and they are no motion.
-        ValueError: If they do not fit together.
-    """
+    """The people of the folder or file; None if it does not hold a pose an item."""
     if isinstance(content, list):
         content = {str(row): item for row, item in enumerate(content)}
     if not isinstance(content, dict) or not content:

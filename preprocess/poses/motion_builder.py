@@ -85,11 +85,7 @@ def build_motion(
 
 
 def stack_rows(rows: list[Any]) -> Float[np.ndarray, "poses *rest"]:
-    """One array of a list of arrays of one shape.
-
-    Raises:
-        ValueError: If their shapes differ.
-    """
+    """One array of a list of arrays of one shape."""
     return np.stack([np.asarray(row, dtype=np.float64) for row in rows])
 
 

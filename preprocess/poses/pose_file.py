@@ -62,11 +62,7 @@ def read_motion(path: Path, *, default_model: str = "body24") -> Motion:
 
 
 def motion_from_arrays(arrays: Arrays, path: Path, *, default_model: str = "body24") -> Motion:
-    """The poses in the arrays of a file (see `read_motion`).
-
-    Raises:
-        InputError: If they are no such poses; `path` is for the message.
-    """
+    """The poses in the arrays of a file (see `read_motion`)."""
     layout = next((keys for keys in POSE_KEY_LAYOUTS if set(keys) <= arrays.keys()), None)
     if layout is None:
         expected = "; or ".join(" and ".join(keys) for keys in POSE_KEY_LAYOUTS)
@@ -108,11 +104,7 @@ def motion_from_arrays(arrays: Arrays, path: Path, *, default_model: str = "body
 
 
 def _read_lines(path: Path) -> Arrays:
-    """One array for each key that every line has; of words, what the first line says.
-
-    Raises:
-        InputError: If there is no such file, or a line before the last holds no JSON object.
-    """
+    """One array for each key that every line has; of words, what the first line says."""
     try:
         text = path.read_text(encoding="utf-8")
         whole = text[: text.rfind("\n") + 1]
