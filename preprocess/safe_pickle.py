@@ -77,8 +77,9 @@ def array_of(thing: Any) -> Shaped[np.ndarray, "..."]:
         case ChumpyExpression(state={"a": a, **others}):
             return np.transpose(array_of(a), others.get("axes"))
         case SparseColumns(state={"data": data, "indices": rows, "indptr": starts, **others}):
-            dense = np.zeros(others.get("_shape", others.get("shape")), data.dtype)
-            columns = np.repeat(np.arange(dense.shape[1]), np.diff(starts))
+            height, width = others["_shape" if "_shape" in others else "shape"]
+            dense = np.zeros((height, width), data.dtype)
+            columns = np.repeat(np.arange(width), np.diff(starts))
             np.add.at(dense, (rows, columns), data)
             return dense
         case bool() | int() | float() | np.generic() | list() | tuple():
@@ -103,7 +104,8 @@ def _fill_array(array: Shaped[np.ndarray, "..."], state: Any) -> None:
     _, shape, kind, by_columns, raw = state
     if min(shape, default=0) < 0 or (kind.dtype.hasobject and math.prod(shape) != len(raw)):
         raise ValueError(f"an array of {shape}")  # which numpy would not check
-    array.__setstate__((1, shape, kind.dtype, bool(by_columns), _as_bytes(raw)))
+    own: Any = 1, shape, kind.dtype, bool(by_columns), _as_bytes(raw)
+    array.__setstate__(own)
 
 
 def _dict(*arguments: Any) -> dict[Any, Any]:
