@@ -129,57 +129,11 @@ def find_stream_cameras(video: Path, named: str | None) -> Path | None:
     return find_own_cameras(video) if named is None else Path(named)
 
 
-def find_live_poses(folder: Path) -> Path | None:
-    """The poses in a folder to which a live source is written; None if there are none yet."""
-    inside = folder.parent if folder.name == "images" else folder
-    return _first_existing([inside], ["poses.npz", "poses.jsonl"])
-
-
 def _places_of_parts(video: Path, poses: Path | None) -> list[Path]:
     inside = video.is_dir() and video.name != "images"
     place = video if inside else video.parent
     beside = [] if camera_address(video) is not None else [place]
     return beside if poses is None else [*beside, poses.parent]
-
-
-def find_live_capture_paths(
-    video: Path,
-    poses: Path | None = None,
-    masks: Path | None = None,
-    cameras: Path | str | None = None,
-) -> CapturePaths:
-    """Where the parts of a live source lie or will lie; poses and masks need not be there yet.
-
-    Args:
-        video: `camera:…`, or a folder that grows.
-        poses: Pose file; needed unless `video` is a folder, which will hold poses.npz.
-        masks: Folder of masks.
-        cameras: Camera file, or "static".
-
-    Raises:
-        InputError: If it is unknown where the poses will be, or a camera file is not there.
-    """
-    inside = video.parent if video.name == "images" else video
-    is_folder = video.is_dir()
-    if poses is None and is_folder:
-        poses = find_live_poses(video) or inside / "poses.npz"
-    if poses is None:
-        raise InputError(
-            f"No poses for {video}: give --poses FILE, which a tracker writes meanwhile (an .npz, "
-            "rewritten whenever there are more, or a .jsonl, one line per frame)."
-        )
-    if masks is None:
-        masks = (inside if is_folder else poses.parent) / "masks"
-    if cameras is None:
-        cameras = _first_existing([inside, poses.parent], ["cameras.npz"])
-    elif str(cameras) != "static" and not Path(cameras).exists():
-        raise InputError(f"{cameras} does not exist; check the path.")
-    return CapturePaths(
-        video=video,
-        poses=poses,
-        masks=masks,
-        cameras=None if cameras is None or str(cameras) == "static" else Path(cameras),
-    )
 
 
 def _first_existing(places: list[Path], names: list[str]) -> Path | None:

@@ -12,13 +12,12 @@ from capture.input_error import InputError
 from capture.live_sources import IDLE_TIMEOUT_S, camera_address
 from capture.source import Frame, FrameSource, PacingClock, RealtimePlayback
 from preprocess.alignment.capture_geometry import CaptureGeometry
-from preprocess.alignment.mask_alignment import BodyPlacement, LiveAlignment
+from preprocess.alignment.mask_alignment import BodyPlacement
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.capture_paths import CapturePaths, find_parts
 from preprocess.fitting.capture_fit import CaptureFit
-from preprocess.live_inputs import LiveInputs
 from preprocess.masks.mask_files import Masks
 from preprocess.masks.mask_refinement import GivenMaskRefiner
 from preprocess.observation import DroppedFrame, Observation, observation_builder
@@ -40,7 +39,7 @@ class CaptureInputs:
         invert_masks: Whether the person is dark in the masks; None finds out.
         live: Whether `video` is a folder that grows; a camera is live without it.
         person: Whose poses, where the file holds several people's; None for the longest track.
-        idle_s: Of a live source: how long nothing new may come.
+        idle_s: Of a live source: how long nothing new may come, seconds.
         height_m: How tall the person is; None if only the poses tell.
         tracker: Name of the tracker that finds poses where none are given; None for the built-in
             one.
@@ -63,6 +62,11 @@ class CaptureInputs:
     tracker: str | None = None
     refine_masks: bool = True
     transposed: bool = False
+
+    @property
+    def is_live(self) -> bool:
+        """Whether frames come from a camera, or from a folder that still grows."""
+        return self.live or camera_address(self.video) is not None
 
     def input_paths(self) -> list[Path]:
         """What no output may touch: files and folders that were named, and that may be found."""
@@ -87,19 +91,17 @@ class Capture:
         source: The frames.
         motion: The poses.
         masks: The masks; None if the pictures' alpha channel is the mask, `segment` estimates them,
-            or they come with a live source.
+            or `live` makes them.
         cameras: The cameras, of the frames' size.
         shaped: The person's body.
         size_px: Longer side that training sees; None for the frames' own.
         notes: What a user should know about how the parts were read.
-        live: Poses and masks of a live source, which come while it runs, or what tracks them;
-            `motion` is what had come when it was opened.
+        live: What tracks the person while the frames come; `motion` is that of the first frames.
         segment: What estimates the masks, if nothing holds them.
         mask_refiner: What refines given masks; None if they stay as they are.
         camera_report: Entry of the report about solved cameras.
         tracking_report: Entry of the report about poses that were tracked in the video.
         refit: How the poses were fitted to the masks, if they were made for another body.
-        live_fit: Fit of a live source's poses to the masks, repeated while frames arrive.
         fit: What was fitted to the masks before training (`preprocess.fitting`).
     """
 
@@ -111,13 +113,12 @@ class Capture:
     shaped: ShapedBody
     size_px: int | None
     notes: tuple[str, ...]
-    live: LiveInputs | LiveTracking | None = None
+    live: LiveTracking | None = None
     segment: Segmenter | None = None
     mask_refiner: GivenMaskRefiner | None = None
     camera_report: dict[str, Any] | None = None
     tracking_report: dict[str, Any] | None = None
     refit: BodyPlacement | None = None
-    live_fit: LiveAlignment | None = None
     fit: CaptureFit | None = None
 
     @property
@@ -134,7 +135,7 @@ class Capture:
 
         Given poses are as uncertain as the fit to the masks had to change them beyond its noise.
         """
-        if isinstance(self.live, LiveTracking) or self.motion.proportions is not None:
+        if self.live is not None or self.motion.proportions is not None:
             return 1.0
         return 0.0 if self.fit is None else self.fit.share
 
@@ -156,7 +157,7 @@ class Capture:
         if self.live is not None:
             return self.live.observation_builder(
                 self.source, self.cameras, self.size_px, segment=self.segment,
-                refine=self.mask_refiner, fit=self.live_fit,
+                refine=self.mask_refiner,
             )  # fmt: skip
         return observation_builder(
             self.source, self.motion, self.masks, self.cameras, size_px=self.size_px,
@@ -165,7 +166,7 @@ class Capture:
 
     def take_revised_poses(self) -> dict[int, BodyPose]:
         """Poses of a stream's earlier frames that later ones have improved since the last call."""
-        return self.live.take_revised_poses() if isinstance(self.live, LiveTracking) else {}
+        return {} if self.live is None else self.live.take_revised_poses()
 
     def mask_report(self) -> dict[str, str | float | None]:
         """Where the masks come from, and how well estimated ones agree with the posed body."""
@@ -173,7 +174,7 @@ class Capture:
             agreement = getattr(self.segment, "agreement", None)
             name = getattr(self.segment, "name", type(self.segment).__name__)
             return {"masks": f"estimated by {name}", "mask_agreement": agreement}
-        if isinstance(self.live, LiveTracking) and self.live.given_masks is None:
+        if self.live is not None and self.live.given_masks is None:
             return {"masks": "tracked", "mask_agreement": None}
         source = "alpha channel" if self.paths.masks is None else self.paths.masks.name
         refined = self.mask_refiner is not None and self.mask_refiner.is_needed
@@ -181,22 +182,14 @@ class Capture:
 
     def final_notes(self) -> Iterator[str]:
         """What could not be said before the frames came."""
-        if isinstance(self.live, LiveTracking):
+        if self.live is not None:
             yield from self.live.final_notes()
         if self.mask_refiner is not None and self.mask_refiner.note is not None:
             yield self.mask_refiner.note
-        growing = self.live_fit
-        if growing is not None and growing.placement is not None:
-            yield f"{growing.placement.describe()} (By the first {growing.frame_count} frames.)"
 
     def body_fit_report(self) -> dict[str, float | bool] | None:
         """How the poses were fitted to the body that is used; None if that was not needed."""
-        growing = self.live_fit
-        refit = self.refit if growing is None else growing.placement
-        if refit is None:
-            return None
-        told = refit.as_json()
-        return told if growing is None else {**told, "frames": growing.frame_count}
+        return None if self.refit is None else self.refit.as_json()
 
     def geometry(self) -> CaptureGeometry:
         """Poses and cameras, as they are."""

@@ -16,14 +16,12 @@ from capture.video import VideoFile
 from preprocess.alignment.capture_alignment import (
     BodyAlignment,
     estimate_focal_length,
-    fit_live_person,
     fit_person,
     place_motion,
 )
 from preprocess.alignment.capture_evidence import CaptureEvidence
 from preprocess.body.body_pose import Motion
 from preprocess.body.parametric_body import ShapedBody, load_body_model, read_shaped_body
-from preprocess.body.proportion_space import shape_for_motion
 from preprocess.cameras.camera_file import CameraTrack, assume_static_camera
 from preprocess.cameras.camera_orientation import assume_camera, read_upright_cameras
 from preprocess.capture_paths import (
@@ -31,17 +29,15 @@ from preprocess.capture_paths import (
     MaskOrigin,
     choose_mask_origin,
     find_capture_paths,
-    find_live_capture_paths,
     find_own_masks,
+    find_own_poses,
     find_stream_cameras,
 )
 from preprocess.capture_session import Capture, CaptureInputs
-from preprocess.live_inputs import LiveInputs, LiveMasks, check_mask_folder
 from preprocess.masks.mask_files import Masks, open_masks, open_tracker_masks
 from preprocess.masks.mask_refinement import GivenMaskRefiner
 from preprocess.observation import alpha_channel_mask, associate_masks
 from preprocess.plugins import PersonTracker, Segmenter, make_segmenter, segmenter_name
-from preprocess.poses.motion_builder import place_in_camera_world
 from preprocess.poses.plausibility import (
     lost_pose_warnings,
     plausibility_warnings,
@@ -59,7 +55,6 @@ def describe_capture(
     choice: MaskOrigin,
     *,
     unread_alpha_video: Path | None = None,
-    expected_masks: Path | None = None,
 ) -> Iterator[str]:
     """Sentences, one after the other.
 
@@ -69,7 +64,6 @@ def describe_capture(
         cameras: The cameras.
         choice: Which masks are used.
         unread_alpha_video: The video, if it has an alpha channel that is not read.
-        expected_masks: Where a segmenter was expected to write the masks of a live source.
     """
     motion, family = fit.motion, fit.shaped.body.family
     if motion.note is not None:
@@ -81,8 +75,6 @@ def describe_capture(
             f"Masks are estimated from the pictures and the poses (segmenter:{choice.segmenter}); "
             "a segmenter's own masks (--masks) are sharper around hair and hands."
         )
-    if choice.is_fallback and expected_masks is not None:
-        yield f"There was no folder of masks {expected_masks} when the first pose came."
     if choice.is_fallback and unread_alpha_video is not None:
         folder = unread_alpha_video.with_name(f"{unread_alpha_video.stem}_frames")
         video, made, pictures = (
@@ -114,7 +106,7 @@ def open_capture(
     skip_checks: bool = False,
     avatar_body: Path | None = None,
 ) -> Capture:
-    """A recording, or a live source whose first picture and first pose are waited for.
+    """Open a recording: its frames, poses, masks and cameras, aligned with each other.
 
     Args:
         inputs: What the user named.
@@ -125,9 +117,6 @@ def open_capture(
     Raises:
         InputError: If a part is missing or unreadable, or they do not fit together.
     """
-    camera = camera_address(inputs.video)
-    if inputs.live or camera is not None:
-        return _open_live(inputs, camera, size_px, avatar_body)
     recording = _open_recorded(inputs, size_px, avatar_body, skip_checks=skip_checks)
     if not skip_checks:
         recording.check()
@@ -174,54 +163,6 @@ def _open_recorded(
         mask_refiner=make_mask_refiner(wanted),
         refit=fit.placement,
     )
-
-
-def _open_live(
-    wanted: CaptureInputs, camera: str | None, size_px: int | None, avatars: Path | None
-) -> Capture:
-    if wanted.cameras == "solve" or wanted.height_m is not None:
-        raise InputError(
-            "--cameras solve and --height-cm need a recording; of a live source the camera "
-            "stands still (--cameras static), and its poses are yet to come."
-        )
-    paths = find_live_capture_paths(
-        wanted.video, wanted.poses, _mask_file(wanted.masks), wanted.cameras
-    )
-    body, pace = load_body_model(wanted.body), PacingClock()
-    source = open_live_source(paths.video, camera, wanted.frames, pace, idle_s=wanted.idle_s)
-    live = LiveInputs.open(
-        paths, source, pace, family=body.family, invert=wanted.invert_masks,
-        first_within_s=wanted.idle_s, given_masks=wanted.masks,
-    )  # fmt: skip
-    choice, looked_for = live.choice, paths.masks
-    paths = replace(paths, masks=choice.path)
-    source.has_alpha = choice.uses_alpha_channel
-    motion = live.poses.motion
-    doubts = tuple(plausibility_warnings(motion))
-    cameras, given = _read_or_assume_cameras(paths, motion, source), paths.cameras is not None
-    shaped = shape_for_motion(body, motion)
-    live.poses.set_placement(
-        lambda read: place_in_camera_world(read, shaped, cameras, cameras_given=given)
-    )
-    fit, growing_fit = fit_live_person(
-        live.poses.motion, shaped, avatar_body=avatars, has_masks=choice.segmenter is None
-    )
-    recording = Capture(
-        paths=paths,
-        source=source,
-        motion=fit.motion,
-        masks=None,
-        cameras=cameras,
-        shaped=fit.shaped,
-        size_px=size_px,
-        notes=(*describe_capture(fit, None, cameras, choice, expected_masks=looked_for), *doubts),
-        live=live,
-        segment=_make_segmenter(choice, fit.shaped),
-        mask_refiner=make_mask_refiner(wanted),
-        live_fit=growing_fit,
-    )
-    recording.check()
-    return recording
 
 
 def _mask_file(masks: Path | None) -> Path | None:
@@ -276,8 +217,8 @@ def open_tracked_stream(
 ) -> Capture:
     """Open a live source, or a recording that is played at its own speed, and find the person.
 
-    Masks that are named, lie beside the video or are the pictures' alpha channel are learnt from;
-    only without any are the tracker's.
+    Masks of a recording that are named or lie beside it, an installed segmenter's, and the images'
+    alpha channel are learnt from; only without any are the tracker's.
 
     Args:
         wanted: What the user named; without poses.
@@ -296,7 +237,7 @@ def open_tracked_stream(
         )
     pace = PacingClock()
     source = _open_stream_source(wanted, pace)
-    choice, given = _open_stream_masks(wanted, source, pace)
+    choice, given = _open_stream_masks(wanted, source)
     stream = TrackedStream(source)
     tracking = LiveTracking(stream, tracker, make_refinement(stream.size_px), given)
     shaped = load_body_model(wanted.body).with_shape()
@@ -308,10 +249,10 @@ def open_tracked_stream(
         fixed_body=avatar_body is not None,
         stated_focal=find_stream_cameras(wanted.video, wanted.cameras) is not None,
     )
-    segment, notes = None, ()
+    segment, notes = None, [*_unread_live_parts(wanted)]
     if not choice.is_fallback:
         fit = BodyAlignment(shaped=found.shaped, motion=found.motion)
-        notes = tuple(describe_capture(fit, None, found.cameras, choice))
+        notes += describe_capture(fit, None, found.cameras, choice)
         if choice.segmenter is not None:
             segment = make_segmenter(choice.segmenter, found.shaped)
     return Capture(
@@ -322,36 +263,39 @@ def open_tracked_stream(
         cameras=found.cameras,
         shaped=found.shaped,
         size_px=None,
-        notes=notes,
+        notes=tuple(notes),
         live=tracking, segment=segment, mask_refiner=make_mask_refiner(wanted),
     )  # fmt: skip
 
 
 def _open_stream_masks(
-    wanted: CaptureInputs, source: FrameSource, pace: PacingClock
+    wanted: CaptureInputs, source: FrameSource
 ) -> tuple[MaskOrigin, MaskReader | None]:
     """Which masks are used, and what reads them; a fallback means the tracker's.
 
     Raises:
         InputError: If masks that were named cannot be used.
     """
-    camera = camera_address(wanted.video)
-    choice = choose_mask_origin(
-        wanted.masks, find_own_masks(wanted.video), has_alpha=source.has_alpha
-    )
+    own = None if wanted.is_live else find_own_masks(wanted.video)
+    choice = choose_mask_origin(wanted.masks, own, has_alpha=source.has_alpha)
     source.has_alpha = choice.uses_alpha_channel
     if choice.path is None:
         return choice, alpha_channel_mask if choice.uses_alpha_channel else None
-    if wanted.live or camera is not None:
-        check_mask_folder(wanted.masks)
-        return choice, LiveMasks(choice.path, pace, invert=wanted.invert_masks).wait_for_mask
     stored = open_masks(choice.path, invert=wanted.invert_masks)
     row = associate_masks(stored, source)
     return choice, lambda frame, size_px: stored.alpha(row(frame.index), size_px)
 
 
+def _unread_live_parts(wanted: CaptureInputs) -> Iterator[str]:
+    """Name poses and masks that lie in a live source's folder, where nobody reads them."""
+    if wanted.is_live and wanted.video.is_dir():
+        own = (find_own_poses(wanted.video), find_own_masks(wanted.video))
+        for path in filter(None, own):
+            yield f"{path} is not read: poses and masks of a live source are tracked."
+
+
 def _open_stream_source(wanted: CaptureInputs, pace: PacingClock) -> FrameSource:
-    camera = camera_address(wanted.video)
-    if wanted.live or camera is not None:
+    if wanted.is_live:
+        camera = camera_address(wanted.video)
         return open_live_source(wanted.video, camera, wanted.frames, pace, idle_s=wanted.idle_s)
     return RealtimePlayback(open_source(wanted.video, frames=wanted.frames), pace)

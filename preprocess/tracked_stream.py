@@ -19,7 +19,6 @@ from jaxtyping import Float32
 from capture.camera import Camera
 from capture.input_error import InputError
 from capture.source import Frame, FrameSource
-from preprocess.alignment.mask_alignment import LiveAlignment
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.cameras.camera_file import CameraTrack
@@ -159,7 +158,7 @@ class StreamStart:
 
 @final
 class LiveTracking:
-    """Poses and masks of a stream's frames, tracked as they come; takes the place of `LiveInputs`.
+    """Poses and masks of a stream's frames, tracked as they come.
 
     Attributes:
         stream: The frames.
@@ -243,7 +242,6 @@ class LiveTracking:
         *,
         segment: Segmenter | None = None,
         refine: GivenMaskRefiner | None = None,
-        fit: LiveAlignment | None = None,
     ) -> Callable[[Frame], Observation | DroppedFrame]:
         """What makes an observation of a frame, which was tracked when it was taken.
 
@@ -253,9 +251,7 @@ class LiveTracking:
             size_px: Longer side of the observations.
             segment: What estimates masks, where the user asked for that.
             refine: What refines given masks; the tracker's are refined already.
-            fit: Not used: poses are tracked.
         """
-        assert fit is None
         target_px = shrink_to_longer_side(source.size_px, size_px)
         found = deque[SeenPerson](maxlen=1)  # in the frame whose pose was asked for
 

@@ -88,14 +88,12 @@ class IngestArguments(CaptureArguments):
     """Simulate a live camera: deliver frames at their timestamps. The avatar is ready when the
     video ends; extra --seconds continue training after the last frame."""
     live: Flag = False
-    """VIDEO is a folder to which another program is still writing images. A tracker may write the
-    poses meanwhile to --poses (the .npz repeatedly, or a .jsonl, one line per frame), and masks
-    named like the images to --masks; without --poses the person is tracked here. The run ends
-    with a file named DONE in the folder, after --idle-seconds without new data, after --seconds,
-    or by Ctrl-C. A camera is live without this flag."""
+    """VIDEO is a folder to which another program is still writing images; the person is tracked
+    while they come. The run ends with a file named DONE in the folder, after --idle-seconds without
+    a new image, after --seconds, or by Ctrl-C. A camera is live without this flag."""
     idle_seconds: float = IDLE_TIMEOUT_S
-    """Stop a live source after this many seconds without new data; also the limit for the first
-    frame and pose."""
+    """Stop a live source after this many seconds without a new image; also the limit for the first
+    one."""
     size: Annotated[int | None, arg(metavar="PX", help_behavior_hint="")] = None
     """Longer side of training images in pixels; never upscaled (default: 540 for 60 s, proportional
     to the square root of --seconds). The head is learnt in the video's own resolution."""
@@ -140,10 +138,8 @@ class IngestArguments(CaptureArguments):
             raise InputError(f"--threads is {self.threads}, but must be at least 1.")
         if not 0.0 < self.idle_seconds < float("inf"):
             raise InputError(f"--idle-seconds is {self.idle_seconds}, but must be positive.")
-        if self.realtime and (self.live or camera_address(self.video) is not None):
-            raise InputError(
-                "--realtime simulates a live camera with a recording; this source is live. Drop it."
-            )
+        if self.capture_inputs().is_live:
+            self._check_live_options()
         if self.height_cm is not None and not MIN_HEIGHT_CM <= self.height_cm <= MAX_HEIGHT_CM:
             raise InputError(
                 f"--height-cm is {self.height_cm}, but must lie between {MIN_HEIGHT_CM:.0f} and "
@@ -163,6 +159,25 @@ class IngestArguments(CaptureArguments):
                 "--view requires viser, which is not installed. Install it with: pip install "
                 "'instant-avatar-stream[viewer]' (or: pip install viser). Without --view, "
                 "report.html shows the result afterwards."
+            )
+
+    def _check_live_options(self) -> None:
+        """Refuse what only a recording can have."""
+        if self.realtime:
+            raise InputError(
+                "--realtime simulates a live camera with a recording; this source is live. Drop it."
+            )
+        if self.poses is not None:
+            raise InputError(
+                f"--poses {self.poses}: poses of a live source are tracked while its frames come, "
+                "by the built-in tracker or another installed one (--tracker NAME). Leave --poses "
+                "out, or record the frames and give them with their poses as a recording."
+            )
+        if self.masks is not None and segmenter_name(self.masks) is None:
+            raise InputError(
+                f"--masks {self.masks}: masks of a live source are tracked with its poses, or come "
+                "from an installed segmenter (segmenter:NAME) or the images' alpha channel. Leave "
+                "--masks out."
             )
 
     @property

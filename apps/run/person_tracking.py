@@ -14,7 +14,6 @@ import numpy as np
 from apps.cli.console import Console
 from capture.atomic_files import OutputFileList, atomic_file, atomic_folder
 from capture.input_error import InputError
-from capture.live_sources import camera_address
 from capture.source import FrameSource
 from capture.source_opening import open_source
 from preprocess.alignment.capture_geometry import CaptureGeometry
@@ -23,7 +22,7 @@ from preprocess.body.body_pose import Motion
 from preprocess.body.body_surface import SkinPoints
 from preprocess.body.parametric_body import load_body_model
 from preprocess.cameras.camera_orientation import assume_camera
-from preprocess.capture_paths import find_live_poses, find_own_masks, find_own_poses
+from preprocess.capture_paths import find_own_masks, find_own_poses
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.fitting.capture_fitting import fit_capture, fitted_motion
 from preprocess.masks.mask_files import open_masks
@@ -67,7 +66,7 @@ class PersonTracking:
 
 def needs_tracking(inputs: CaptureInputs) -> bool:
     """Whether a recording comes without poses, so that its person must be tracked."""
-    if inputs.live or camera_address(inputs.video) is not None or inputs.poses is not None:
+    if inputs.is_live or inputs.poses is not None:
         return False
     return inputs.video.exists() and find_own_poses(inputs.video) is None
 
@@ -79,11 +78,7 @@ def needs_stream_tracking(inputs: CaptureInputs, *, realtime: bool) -> bool:
         inputs: What the user named.
         realtime: Whether a recording is played at its own speed.
     """
-    if camera_address(inputs.video) is not None:
-        return inputs.poses is None
-    if inputs.live:
-        return inputs.poses is None and not find_live_poses(inputs.video)
-    return realtime and needs_tracking(inputs)
+    return inputs.is_live or (realtime and needs_tracking(inputs))
 
 
 def open_stream(inputs: CaptureInputs, poses: Path, avatar_body: Path | None = None) -> Capture:

@@ -19,7 +19,6 @@ from preprocess.alignment.corrections import fit_factor, scale_focal_length
 from preprocess.alignment.mask_alignment import (
     ALIGNMENT_SAMPLES,
     BodyPlacement,
-    LiveAlignment,
     body_height_m,
     place_body_on_masks,
     rescale_motion,
@@ -39,8 +38,6 @@ MIN_FOCAL_IOU = 0.6
 """Mean IoU of body and masks from which a fitted focal length is taken."""
 HEIGHT_TOLERANCE_CM = 1.5
 """Largest difference between a stated height and the avatar's own, centimetres."""
-LIVE_FIT_NOTE = "Distance and place are fitted to the {} as they come."
-"""Note about a live source whose poses are fitted to masks or images."""
 
 
 def estimate_focal_length(
@@ -307,29 +304,6 @@ def fit_person(
     taller = scale_to_height(fit.shaped, height_m)
     moved = rescale_motion(evidence.geometry(fit.motion), fit.shaped, taller)
     return replace(fit, shaped=taller, motion=moved)
-
-
-def fit_live_person(
-    motion: Motion, shaped: ShapedBody, *, avatar_body: Path | None, has_masks: bool
-) -> tuple[BodyAlignment, LiveAlignment | None]:
-    """Choose the body of a live source, whose masks are yet to come.
-
-    Args:
-        motion: What has come of the poses.
-        shaped: As their tracker had it in mind.
-        avatar_body: See `fit_person`.
-        has_masks: Whether there will be masks that are not estimated.
-
-    Returns:
-        The body, and what fits the poses to it while they come, if that is needed.
-    """
-    person = shaped if avatar_body is None else read_shaped_body(avatar_body, shaped.body)
-    foreign = needs_placement(motion, shaped)
-    if not foreign and is_same_person(person, shaped):
-        return BodyAlignment(shaped=person, motion=motion), None
-    words = LIVE_FIT_NOTE.format("masks" if has_masks else "pictures")
-    fit = BodyAlignment(shaped=person, motion=motion, description=words)
-    return fit, LiveAlignment(person, motion.body_model, masked=has_masks)
 
 
 def _check_height(person: ShapedBody, height_m: float | None) -> None:

@@ -1,8 +1,6 @@
-"""Which masks are used, recorded and live: one table for both."""
+"""Which masks are used of those that could be."""
 
 import shutil
-import threading
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +10,6 @@ from PIL import Image
 from capture.source_opening import open_source
 from capture.video_decoder import OpenCvDecoder
 from preprocess.capture_session import CaptureInputs
-from preprocess.live_inputs import LATE_ALPHA_WARNING
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
 
@@ -51,7 +48,6 @@ def folder(film, shots, tmp_path):
             Image.fromarray(lower(mask)).save(tmp_path / "mine" / name)
             if beside:
                 Image.fromarray(mask).save(tmp_path / "masks" / name)
-        (tmp_path / "images" / "DONE").touch()
         return tmp_path
 
     return write
@@ -71,9 +67,9 @@ def lower(mask):
     return half
 
 
-def wanted(folder, given, *, live):
+def wanted(folder, given):
     masks = {"given": folder / "mine", "segmenter": Path("segmenter:blazepose")}.get(given)
-    return CaptureInputs(video=folder, masks=masks, live=live, idle_s=1.0)
+    return CaptureInputs(video=folder, masks=masks)
 
 
 def parts_shown(recording):
@@ -86,10 +82,9 @@ def parts_shown(recording):
     ]
 
 
-@pytest.mark.parametrize("live", [False, True], ids=["recorded", "live"])
 @pytest.mark.parametrize("masks", ["none", "beside", "given", "given, beside", "segmenter"])
 @pytest.mark.parametrize("alpha", ["none", "opaque", "informative"])
-def test_recorded_and_live_use_the_masks_of_one_table(folder, alpha, masks, live):
+def test_the_masks_that_are_used(folder, alpha, masks):
     expected, shown = {
         "none": (ALPHA, (True, False)) if alpha == "informative" else (ESTIMATED, (True, True)),
         "beside": ("masks", (True, True)),
@@ -98,9 +93,7 @@ def test_recorded_and_live_use_the_masks_of_one_table(folder, alpha, masks, live
         "segmenter": (ESTIMATED, (True, True)),
     }[masks]
     there = folder([alpha] * FRAMES, beside="beside" in masks)
-    recording = open_capture(
-        wanted(there, masks.split(",", maxsplit=1)[0], live=live), skip_checks=True
-    )
+    recording = open_capture(wanted(there, masks.split(",", maxsplit=1)[0]), skip_checks=True)
     found = parts_shown(recording)
     assert found == [shown] * FRAMES
     assert recording.mask_report()["masks"] == expected  # after the frames, as the report does
@@ -109,41 +102,11 @@ def test_recorded_and_live_use_the_masks_of_one_table(folder, alpha, masks, live
     assert not recording.source.warnings
 
 
-@pytest.mark.parametrize("live", [False, True], ids=["recorded", "live"])
-def test_one_opaque_picture_at_the_start_does_not_decide(folder, live):
+def test_one_opaque_picture_at_the_start_does_not_decide(folder):
     there = folder(["opaque", "informative", "none", "informative"], beside=False)
-    recording = open_capture(wanted(there, "none", live=live))
+    recording = open_capture(wanted(there, "none"))
     assert parts_shown(recording) == [None, (True, False), None, (True, False)]
     assert recording.mask_report()["masks"] == ALPHA
-
-
-def test_an_alpha_channel_that_begins_later_is_reported(folder, shots):
-    """What was there at the start decided; the finished folder is read otherwise."""
-    there = folder(["opaque"] * FRAMES, beside=False)
-    recording = open_capture(wanted(there, "none", live=True))
-    rgb, mask = shots[2]
-    Image.fromarray(np.dstack([rgb, mask])).save(there / "images" / "0002.png")
-    assert parts_shown(recording) == [(True, True)] * FRAMES
-    assert recording.source.warnings == [LATE_ALPHA_WARNING]
-    assert recording.mask_report()["masks"] == ESTIMATED
-    finished = open_capture(wanted(there, "none", live=False))
-    assert finished.mask_report()["masks"] == ALPHA
-
-
-def test_a_live_sources_masks_may_begin_while_the_first_pose_is_waited_for(folder, film):
-    there = folder(["none"] * FRAMES, beside=False)
-    (there / "poses.npz").unlink()
-
-    def begin():
-        shutil.copytree(film / "masks", there / "masks")
-        shutil.copy(film / "poses.npz", there / "coming.npz")
-        (there / "coming.npz").rename(there / "poses.npz")
-
-    thread = threading.Timer(0.2, begin)
-    thread.start()
-    paths = replace(wanted(there, "none", live=True), idle_s=60.0)
-    assert open_capture(paths).mask_report()["masks"] == "masks"
-    thread.join()
 
 
 @pytest.mark.parametrize("masked", [False, True])

@@ -3,18 +3,16 @@
 import pickle
 import re
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from benchmarks import capture_corruptions
 from capture.input_error import InputError
 from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.open_capture import open_capture
-from preprocess.poses.motion_builder import SMPLX_PELVIS, place_in_camera_world
+from preprocess.poses.motion_builder import place_in_camera_world
 from preprocess.poses.pose_format_registry import read_poses
 
 
@@ -99,24 +97,6 @@ def test_a_strangers_poses_are_fitted_to_the_masks_of_this_clip(film, own, tmp_p
     assert after > 0.7
 
 
-def test_masks_of_a_live_source_are_estimated_on_demand(film, own, tmp_path):
-    folder = tmp_path / "live"
-    folder.mkdir()
-    frames = list(own.source.frames())[:4]
-    for frame in frames:
-        Image.fromarray(frame.rgb).save(folder / f"{frame.index:04d}.png")
-    (folder / "DONE").touch()
-    paths = {"video": folder, "poses": film / "poses.npz", "cameras": f"{film}/cameras.npz"}
-    with pytest.raises(InputError, match="segmenter:blazepose"):
-        open_capture(CaptureInputs(**paths, live=True, masks=tmp_path / "none", idle_s=1.0))
-    named = Path("segmenter:blazepose")
-    live = open_capture(CaptureInputs(**paths, live=True, masks=named, idle_s=1.0))
-    assert any("estimated" in note for note in live.notes)
-    found = list(live.observations())
-    assert [observation.frame.index for observation in found] == [0, 1, 2, 3]
-    assert all((observation.alpha > 0.5).any() for observation in found)
-
-
 def test_an_unknown_focal_length_is_found_from_the_masks(capture, own):
     capture_corruptions.convert_to_camera_space(capture)
     (capture / "cameras.npz").unlink()
@@ -133,42 +113,3 @@ def test_a_focal_length_that_the_poses_state_is_believed(capture, own, changed):
     changed(capture / "poses.npz", K=intrinsic)
     found = open_capture(CaptureInputs(video=capture))
     assert found.cameras[0].focal_px[0] == pytest.approx(intrinsic[0, 0])
-
-
-def test_a_live_strangers_poses_are_fitted_while_they_come(film, own, tmp_path):
-    folder = tmp_path / "live"
-    (folder / "images").mkdir(parents=True)
-    shutil.copytree(film / "masks", folder / "masks")
-    for frame in own.source.frames():
-        Image.fromarray(frame.rgb).save(folder / "images" / f"{frame.index:04d}.png")
-    (folder / "images" / "DONE").touch()
-    rows = {"global_orient": own.motion.root_rotations, "model": np.array("smpl")}
-    rows |= {"body_pose": own.motion.joint_rotations.reshape(24, 69)}
-    far = own.motion.root_translations.copy()
-    far[:, 2] -= 0.4
-    np.savez(folder / "poses.npz", **rows, transl=far)
-    cameras = f"{film}/cameras.npz"
-    live = open_capture(CaptureInputs(video=folder, cameras=cameras, live=True, idle_s=1.0))
-    assert any("fitted to the masks as they come" in note for note in live.notes)
-    assert live.body_fit_report() is None
-    assert len(list(live.observations())) == 24
-    (said,) = live.final_notes()
-    assert "By the first 16 frames" in said
-    told = live.body_fit_report()
-    assert told["taken"]
-    assert told["agreement_after"] > max(0.7, told["agreement_before"] + 0.05)
-
-
-def test_smplx_poses_of_a_live_source_turn_about_smpls_pelvis(film, own, tmp_path):
-    folder = tmp_path / "live"
-    folder.mkdir()
-    for frame in list(own.source.frames())[:2]:
-        Image.fromarray(frame.rgb).save(folder / f"{frame.index:04d}.png")
-    (folder / "DONE").touch()
-    rows = {"global_orient": own.motion.root_rotations, "model": np.array("smplx")}
-    rows |= {"body_pose": own.motion.joint_rotations.reshape(24, 69)}
-    np.savez(folder / "poses.npz", **rows, transl=own.motion.root_translations)
-    named = {"video": folder, "cameras": f"{film}/cameras.npz", "masks": film / "masks"}
-    live = open_capture(CaptureInputs(**named, live=True, idle_s=1.0))
-    pelves = live.shaped.joints[0] + live.motion.root_translations
-    np.testing.assert_allclose(pelves, SMPLX_PELVIS + own.motion.root_translations)

@@ -3,21 +3,17 @@
 import json
 import signal
 from concurrent.futures import Future
-from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from apps import ingest
 from apps.cli.console import Console
 from apps.evaluation.evaluation_frames import held_out_frames
 from apps.run import missing_inputs, person_tracking
-from apps.run.person_tracking import open_stream
 from apps.run.run_folder import RunFolder
 from avatar.training import train
 from avatar.training.trainer import Trainer
-from capture.input_error import InputError
 from preprocess import tracked_stream
 from preprocess.capture_session import CaptureInputs
 from preprocess.fitting import tracked_frames
@@ -154,17 +150,6 @@ def test_a_stream_learns_from_given_masks_and_brings_poses_along(ingest_video, f
     assert done.code == 0, done.err
     assert json.loads((out / "report.json").read_text())["recipe"]["masks"] == "masks"
     assert {0, 2, 4, 6} <= set(revised)  # every second frame is taken
-
-
-def test_masks_of_a_live_folder_must_be_one(tmp_path):
-    frames = tmp_path / "frames"
-    frames.mkdir()
-    Image.new("RGB", (96, 128)).save(frames / "0000.png")
-    out = str(tmp_path / "run")
-    with pytest.raises(InputError, match="There is no folder of masks"):
-        open_stream(
-            CaptureInputs(video=frames, live=True, masks=tmp_path / "none"), Path(out) / "poses.npz"
-        )
 
 
 def test_person_must_be_a_number(ingest_video):

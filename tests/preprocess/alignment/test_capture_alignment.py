@@ -7,11 +7,10 @@ import pytest
 from PIL import Image
 
 from capture.camera import Camera
-from capture.source import Frame
 from capture.source_opening import open_source
 from preprocess.alignment.capture_alignment import BodyAlignment, align_body, align_to_person
 from preprocess.alignment.capture_evidence import CaptureEvidence
-from preprocess.alignment.mask_alignment import LiveAlignment, body_height_m, scale_to_height
+from preprocess.alignment.mask_alignment import body_height_m, scale_to_height
 from preprocess.body.body_pose import Motion
 from preprocess.body.body_surface import SkinPoints, splat_silhouette
 from preprocess.body.parametric_body import (
@@ -24,7 +23,6 @@ from preprocess.body.parametric_body import (
 from preprocess.body.proportion_space import shape_for_motion
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.masks.mask_files import open_masks
-from preprocess.observation import Observation
 
 SIZE = (96, 128)
 FRAMES = 8
@@ -196,38 +194,3 @@ def test_the_same_person_again_changes_nothing(tmp_path, body):
     )
     assert fit.motion is motion
     assert not fit.description
-
-
-# --- live ----------------------------------------------------------------------------------------
-
-
-def observations(person: ShapedBody, motion: Motion):
-    skin = SkinPoints.of(person)
-    for row in range(len(motion)):
-        alpha = splat_silhouette(skin.posed(motion[row]), CAMERA).astype(np.float32)
-        rgb = np.zeros((*alpha.shape, 3), np.uint8)
-        frame = Frame(index=row, time_s=row / 30.0, rgb=rgb)
-        yield Observation(frame=frame, alpha=alpha, pose=motion[row], camera=CAMERA)
-
-
-def test_live_alignment_converges_to_that_of_all_frames(own):
-    factor = 1.1
-    motion, person = motion_of("smpl", 40), taller(own, factor)
-    fit, agreed = LiveAlignment(own, "smpl"), []
-    for seen in observations(person, motion):
-        fitted = fit.align(seen)
-        np.testing.assert_array_equal(fitted.pose.joint_rotations, seen.pose.joint_rotations)
-        true = CAMERA.project(person.with_pose(seen.pose).joints())
-        found = CAMERA.project(own.with_pose(fitted.pose).joints())
-        agreed.append(float(np.abs(true - found).max()))
-    assert agreed[0] < 4.0  # one picture: 12 px without
-    assert max(agreed[16:]) < 1.2
-    assert fit.placement is not None
-    assert fit.placement.distance_divisor == pytest.approx(factor, rel=0.02)
-    assert fit.frame_count == 32  # of 40: it is made again when there are twice as many
-
-
-def test_live_poses_that_fit_already_stay(own):
-    fit = LiveAlignment(own, "smpl")
-    for seen in observations(own, motion_of("smpl", 10)):
-        assert fit.align(seen).pose is seen.pose

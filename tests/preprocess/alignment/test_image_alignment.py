@@ -9,7 +9,6 @@ import pytest
 from PIL import Image
 
 from capture.camera import Camera
-from capture.source import Frame
 from capture.source_opening import open_source
 from preprocess.alignment.capture_alignment import NO_PERSON_FOUND, align_body
 from preprocess.alignment.capture_evidence import (
@@ -19,7 +18,7 @@ from preprocess.alignment.capture_evidence import (
     estimate_silhouettes,
 )
 from preprocess.alignment.capture_geometry import CaptureGeometry
-from preprocess.alignment.mask_alignment import LiveAlignment, move_pelvis, place_body_on_masks
+from preprocess.alignment.mask_alignment import move_pelvis, place_body_on_masks
 from preprocess.body.body_pose import Motion
 from preprocess.body.body_surface import MeshSilhouette, SkinPoints
 from preprocess.body.kinematics import rotation_matrices
@@ -145,26 +144,3 @@ def test_a_video_without_masks_is_aligned_by_its_images(tmp_path: Path, own):
     assert fit.placement.distance_divisor == pytest.approx(1.12, rel=0.03)
     assert pixels_off(own, fit.motion, person, motion) < 2.0
     assert fit.description == fit.placement.describe()
-
-
-def test_live_poses_are_aligned_before_masks_are_estimated(own):
-    motion, person = turning(), scaled(own, 1.12)
-    fit = LiveAlignment(own, "smpl", masked=False)
-    pose_of = fit.align_poses(
-        lambda frame: motion[frame.index] if frame.index else "no pose", CAMERA
-    )
-    off, unfitted = [], []
-    for row, rgb in enumerate(filmed(person, motion)):
-        pose = pose_of(Frame(index=row, time_s=row / 30.0, rgb=rgb))
-        if row == 0:
-            assert pose == "no pose"
-            continue
-        assert not isinstance(pose, str)
-        np.testing.assert_array_equal(pose.joint_rotations, motion[row].joint_rotations)
-        true = CAMERA.project(person.with_pose(motion[row]).joints())
-        for poses, found in ((motion[row], unfitted), (pose, off)):
-            found.append(float(np.abs(CAMERA.project(own.with_pose(poses).joints()) - true).max()))
-    assert off[0] < 0.5 * unfitted[0]  # from one picture
-    assert max(off[1:]) < 1.5 < 5.0 < min(unfitted)
-    assert fit.placement is not None
-    assert fit.frame_count == 2  # of 3: it is made again when there are twice as many

@@ -202,3 +202,10 @@ def test_a_capture_folder_stands_for_the_poses_in_it(tmp_path, motion):
     for name, wanted in (("poses.npz", motion), ("dance.npz", motion.select_rows(np.arange(2)))):
         write_motion(folder / name, wanted)
     assert_same(read_poses(folder), read_poses(folder / "poses.npz"))
+
+
+@pytest.mark.parametrize("text", ["", "[1, 2]\n", '{"transl": [0, 0, 0]}\n', "no json\n"])
+def test_lines_that_hold_no_poses_are_refused(tmp_path, text):
+    (tmp_path / "poses.jsonl").write_text(text)
+    with pytest.raises(InputError, match=r"poses\.jsonl"):
+        read_motion(tmp_path / "poses.jsonl")
