@@ -8,9 +8,6 @@ from importlib.util import find_spec
 
 from apps.capture_validation import correction_hint, preflight_check
 from apps.cli.command_line import (
-    BAD_INPUT,
-    DONE,
-    CommandExit,
     exit_on_interrupt,
     fill_optional_port,
     parse_arguments,
@@ -18,7 +15,12 @@ from apps.cli.command_line import (
 )
 from apps.cli.console import Console
 from apps.run.ingest_arguments import PROGRAM, VIEW_PORT, IngestArguments
-from apps.run.missing_inputs import read_tracking_report, start_camera_solving, track_missing_poses
+from apps.run.missing_inputs import (
+    read_tracking_report,
+    solve_missing_cameras,
+    track_missing_poses,
+    write_solved_cameras,
+)
 from apps.run.run_folder import RunFolder
 from capture.atomic_files import write_text_atomically
 from capture.input_error import InputError
@@ -35,7 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def ingest(arguments: IngestArguments, console: Console) -> int:
-    """Open, track, align, stream, train, bake, report.
+    """Open, track, solve cameras, align, stream, train, bake, report.
 
     Raises:
         InputError: If the input cannot be used; nothing was written then.
@@ -54,35 +56,24 @@ def ingest(arguments: IngestArguments, console: Console) -> int:
         if arguments.tracks_stream:  # its frames come as soon as it is open
             threads = _load_trainer_code(arguments, run, console)
         capture = _open_checked(arguments, run, console)
-        capture = _fit_to_masks(arguments, capture, run, console)
-        with start_camera_solving(arguments.solve_job(capture), capture, run) as solving:
-            threads = threads or _load_trainer_code(arguments, run, console)
-            from apps.report.report_writer import print_results, write_report
-            from apps.run.session_start import start_session
+        placed = solve_missing_cameras(arguments, capture, console)
+        capture = _fit_to_masks(arguments, placed, run, console)
+        threads = threads or _load_trainer_code(arguments, run, console)
+        from apps.report.report_writer import print_results, write_report
+        from apps.run.session_start import start_session
 
-            capture = solving.wait_before_training(capture, console)
-            with (
-                start_session(arguments, capture, run, console) as session,
-                solving.save_on_exit(capture, run, console),
-            ):
-                result = session.bake(session.train())
-                capture = solving.wait_after_training(capture, run, console, session.stop)
-                report = write_report(
-                    result, capture, run, console, command=command, threads=threads,
-                    startup_seconds=(result.meter.first_frame_at or started_at) - started_at,
-                )  # fmt: skip
-                if arguments.json is not None:
-                    write_text_atomically(
-                        arguments.json, report.to_json(), replace=arguments.may_replace_json
-                    )
-                code = print_results(
-                    report, result, run, console, interrupted=session.stop_requested
+        with start_session(arguments, capture, run, console) as session:
+            write_solved_cameras(placed, run, console)
+            result = session.bake(session.train())
+            report = write_report(
+                result, capture, run, console, command=command, threads=threads,
+                startup_seconds=(result.meter.first_frame_at or started_at) - started_at,
+            )  # fmt: skip
+            if arguments.json is not None:
+                write_text_atomically(
+                    arguments.json, report.to_json(), replace=arguments.may_replace_json
                 )
-            if code == DONE and solving.refused is not None:
-                raise CommandExit(
-                    f"{solving.refused} The avatar was trained without solved cameras.", BAD_INPUT
-                )
-            return code
+            return print_results(report, result, run, console, interrupted=session.stop_requested)
 
 
 def _load_trainer_code(arguments: IngestArguments, run: RunFolder, console: Console) -> int:

@@ -13,16 +13,13 @@ import argparse
 import sys
 import tempfile
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from rich.console import Console as RichConsole
 from scipy.spatial.transform import Rotation
 
-from apps.cli.console import Console
-from apps.run.missing_inputs import apply_camera_solution
-from apps.run.solver_process import SolveJob, SolverProcess
 from benchmarks.hardware import Hardware
 from capture.camera import Camera
 from capture.input_error import InputError
@@ -32,7 +29,8 @@ from preprocess.cameras.camera_file import CameraTrack, read_cameras
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.open_capture import open_capture
 from preprocess.poses.pose_file import read_motion
-from preprocess.sfm.camera_solution import CameraSolution, fit_similarity
+from preprocess.sfm.camera_solution import CameraSolution
+from preprocess.sfm.capture_solving import apply_camera_solution, solve_capture_cameras
 from studio.shoot import ShootConfig, film_capture
 
 MOST_CENTER_CM, MOST_ROTATION_DEG, MOST_SCALE, MOST_SCALE_STATED = 1.0, 0.2, 0.03, 0.01
@@ -108,36 +106,45 @@ def film_or_reuse(folder: Path, background: Room, seed: int, given: argparse.Nam
     return capture
 
 
-def job_of(capture: Path) -> SolveJob:
+def open_unsolved(capture: Path) -> Capture:
     """As `ia-ingest CAPTURE/video.mp4 --poses CAPTURE/poses.npz --cameras solve`."""
     named = CaptureInputs(
         video=capture / "video.mp4", poses=capture / "poses.npz", masks=capture / "masks",
         cameras="solve",
     )  # fmt: skip
-    return SolveJob(paths=named, seed=0, threads=1)
+    return open_capture(named)
+
+
+def fit_similarity(source: np.ndarray, target: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Scale, rotation and shift that carry points nearest to others (Umeyama 1991, eq. 40-42)."""
+    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
+    left, stretch, right = np.linalg.svd(b.T @ a)
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+    turn = left @ np.diag(sign) @ right
+    scale = float((stretch * sign).sum() / max((a**2).sum(), 1e-300))
+    return scale, turn, target.mean(axis=0) - scale * turn @ source.mean(axis=0)
 
 
 def truth(capture: Path, recording: Capture) -> CameraTrack:
     return read_cameras(capture / "truth" / "cameras.npz", recording.source.size_px)
 
 
-def solve_film(capture: Path, runs: Path) -> tuple[CameraSolution, Capture]:
-    """By the process that ia-ingest starts.
+@cache
+def solve_film(capture: Path) -> tuple[CameraSolution, Capture]:
+    """As ia-ingest does.
 
     Raises:
         InputError: If it refuses.
     """
-    job = job_of(capture)
-    with SolverProcess(job, runs / capture.name) as solving:
-        solved = solving.wait(Console(RichConsole(stderr=True, quiet=True)))
-    assert solved is not None
-    return solved, apply_camera_solution(open_capture(job.paths), solved)
+    plain = open_unsolved(capture)
+    solved = solve_capture_cameras(plain, seed=0, threads=1, report_progress=lambda share: None)
+    return solved, apply_camera_solution(plain, solved)
 
 
-def measure_film(capture: Path, runs: Path) -> tuple[str, bool | None]:
+def measure_film(capture: Path) -> tuple[str, bool | None]:
     """A line for one film, and whether it is good; None if the cameras were refused."""
     try:
-        solved, recording = solve_film(capture, runs)
+        solved, recording = solve_film(capture)
     except InputError as refusal:
         return f"refused: {str(refusal).split(';')[0]}", None
     errors = CameraErrors.of(recording.cameras.cameras, truth(capture, recording).cameras)
@@ -152,10 +159,10 @@ def measure_film(capture: Path, runs: Path) -> tuple[str, bool | None]:
     )
 
 
-def scale_errors_by_height(capture: Path, runs: Path) -> tuple[float, float]:
+def scale_errors_by_height(capture: Path) -> tuple[float, float]:
     """Errors of the scale if the tracker's body is too tall: without, and with the height."""
-    solved, _ = solve_film(capture, runs)
-    plain = open_capture(job_of(capture).paths)
+    solved, _ = solve_film(capture)
+    plain = open_unsolved(capture)
     tall = body_height_m(plain.shaped)
 
     def sized(recording: Capture, height_m: float) -> Capture:
@@ -170,7 +177,7 @@ def scale_errors_by_height(capture: Path, runs: Path) -> tuple[float, float]:
     return CameraErrors.of(found[0], true).scale, CameraErrors.of(found[1], true).scale
 
 
-def psnr_by_cameras(capture: Path, runs: Path) -> dict[str, float]:
+def psnr_by_cameras(capture: Path) -> dict[str, float]:
     """Held-out PSNR, dB, of short runs that differ in their cameras alone."""
 
     from avatar.rig import Rig
@@ -179,7 +186,7 @@ def psnr_by_cameras(capture: Path, runs: Path) -> dict[str, float]:
     from benchmarks.stopwatch import limit_threads
     from benchmarks.training_quality import mean_psnr
 
-    _, recording = solve_film(capture, runs)
+    _, recording = solve_film(capture)
     paths, true = recording.paths, truth(capture, recording)
     exact = read_motion(capture / "truth" / "poses.npz")
     # Stricter than what anybody does, and not asked: exact poses of the true world, seen by solved
@@ -222,7 +229,7 @@ def main() -> None:
     arguments.add_argument("--seeds", type=int, default=3)
     arguments.add_argument("--size", type=int, default=640, help="width of the pictures")
     arguments.add_argument("--frames", type=int, default=90)
-    arguments.add_argument("--keep", type=Path, help="folder for films and runs, used again")
+    arguments.add_argument("--keep", type=Path, help="folder for films, used again")
     arguments.add_argument("--no-psnr", action="store_true", help="leave out the avatars")
     given = arguments.parse_args()
     print("\n".join(Hardware.here().lines()))
@@ -230,15 +237,14 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         folder = given.keep or Path(scratch)
         folder.mkdir(parents=True, exist_ok=True)
-        runs = folder / "runs"
         for background in ROOMS:
             for seed in range(given.seeds):
-                said, good = measure_film(film_or_reuse(folder, background, seed, given), runs)
+                said, good = measure_film(film_or_reuse(folder, background, seed, given))
                 fine &= good is True or (good is None and background == "tiles")
                 mark = "✓" if good else "✗" if good is False else "·"
                 print(f"{mark} {background:<5} seed {seed}: {said}", flush=True)
         first = film_or_reuse(folder, "room", 0, given)
-        without, stated = scale_errors_by_height(first, runs)
+        without, stated = scale_errors_by_height(first)
         fine &= abs(stated) < MOST_SCALE_STATED
         tall = f"{100.0 * (TOO_TALL - 1.0):.0f} % too tall"
         print(
@@ -246,7 +252,7 @@ def main() -> None:
             f"with the stated height {100.0 * stated:+.2f} % (asked: under 1 %)"
         )
         if not given.no_psnr:
-            scores = psnr_by_cameras(first, runs)
+            scores = psnr_by_cameras(first)
             for name, psnr in scores.items():
                 lost = scores["true cameras"] - psnr
                 fine &= name != "solved" or lost < MOST_PSNR_LOSS

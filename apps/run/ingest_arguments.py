@@ -1,7 +1,6 @@
 """Arguments of ia-ingest; the text under each field is its --help."""
 
 import importlib.util
-import os
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,7 +11,6 @@ from tyro.conf import Positional, arg
 from apps.cli.shared_options import CaptureArguments, Flag, capture_name, check_output_file
 from apps.run.person_tracking import needs_stream_tracking, open_stream
 from apps.run.run_folder import RunFolder, is_run_report
-from apps.run.solver_process import SolveJob
 from avatar.config import HELD_OUT_STRIDE, NOMINAL_STEPS_PER_S
 from capture.input_error import InputError
 from capture.live_sources import IDLE_TIMEOUT_S, camera_address
@@ -202,17 +200,6 @@ class IngestArguments(CaptureArguments):
             refine_masks=self.refine_masks,
             height_m=None if self.height_cm is None else self.height_cm / 100.0,
         )
-
-    def solve_job(self, recording: Capture) -> SolveJob | None:
-        """Return the job of solving the cameras, by the parts that were found; None without one."""
-        if self.cameras != "solve":
-            return None
-        found = recording.paths
-        named = self.capture_inputs()
-        if segmenter_name(named.masks) is None:
-            named = replace(named, masks=found.masks)
-        named = replace(named, video=found.video, poses=found.poses)
-        return SolveJob(paths=named, seed=self.seed, threads=self.threads or os.cpu_count() or 1)
 
     def open_capture(self) -> Capture:
         """Open the capture that the arguments name."""

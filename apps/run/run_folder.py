@@ -131,7 +131,7 @@ class RunFolder:
 
     @property
     def cameras(self) -> Path:
-        """Solved cameras; the folder cameras/ holds the stages of solving."""
+        """Solved cameras."""
         return self.path / "cameras.npz"
 
     @property
@@ -156,7 +156,7 @@ class RunFolder:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """All files that a run may write, except for the stages of camera solving."""
+        """All files that a run may write."""
         top = (self.package, self.report_json, self.report_html, self.animation)
         top += (self.cameras, self.poses)
         return (*top, *(self.checkpoint / name for name in CHECKPOINT_FILES))
@@ -286,7 +286,7 @@ class RunFolder:
         for path in (*self.files, self.tracked_poses, self.tracking_grade):
             if os.path.lexists(path) and not OutputFileList(path.parent).owns(path.name):
                 return path
-        folders = (self.checkpoint, self.path / "cameras", self.tracking)
+        folders = (self.checkpoint, self.tracking)
         return next((f for f in folders if os.path.lexists(f) and not f.is_dir()), None)
 
 

@@ -1,21 +1,18 @@
-"""A solution: a camera for every frame, the model that each rests on, its files, and its gates.
+"""A solution: a camera for every frame, the model that each rests on, and its gates.
 
 Structure from motion can fail silently: a mapper also reports success when repeating texture has
 led it to a wrong world with every frame in it. Wrong solutions fail one of the gates below, or
-contradict the other mapper or the points that are tracked from frame to frame.
+contradict the points that are tracked from frame to frame.
 """
 
-import json
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
-from capture.atomic_files import write_text_atomically
 from capture.camera import Camera
+from capture.source import FrameSource
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -87,20 +84,6 @@ class SparseModel:
             pixels=self.pixels[kept],
         )
 
-    def save(self, path: Path) -> None:
-        """As an .npz without objects."""
-        np.savez(path, allow_pickle=False, **vars(self))
-
-    @classmethod
-    def load(cls, path: Path) -> "SparseModel":
-        """What `save` wrote."""
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {key: file[key] for key in file.files if key != "allow_pickle"}
-        x, y = (float(value) for value in arrays.pop("center_px"))
-        width, height = (int(value) for value in arrays.pop("size_px"))
-        numbers = {key: float(arrays.pop(key)) for key in ("focal_px", "radial_distortion")}
-        return cls(center_px=(x, y), size_px=(width, height), **numbers, **arrays)
-
 
 @dataclass(frozen=True, kw_only=True)
 class QualityGate:
@@ -138,7 +121,7 @@ class CameraSolution:
         camera_from_solved: One for every frame of the file.
         frame_status: What each of them is: MISSING, INTERPOLATED, PLACED or KEY.
         keyframe_count: Number of key frames.
-        costs: Time and memory of all stages together.
+        costs: Wall and core seconds, and the peak of memory in MB.
     """
 
     is_static: bool
@@ -148,42 +131,24 @@ class CameraSolution:
     camera_from_solved: Float[np.ndarray, "frames 4 4"]
     frame_status: Int[np.ndarray, "frames"]
     keyframe_count: int
-    costs: dict[str, Any]
+    costs: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def static(
+        cls, source: FrameSource, background_motion: float, keyframe_count: int
+    ) -> "CameraSolution":
+        """The finding that the camera of some frames stood still."""
+        frames = source.frames_in_file
+        return cls(
+            is_static=True, background_motion=background_motion, gates=(), model=None,
+            camera_from_solved=np.zeros((frames, 4, 4)),
+            frame_status=np.full(frames, MISSING, dtype=np.int64), keyframe_count=keyframe_count,
+        )  # fmt: skip
 
     def lens(self, size_px: tuple[int, int]) -> Camera:
         """The lens, for pictures of the frames' size."""
         assert self.model is not None
         return self.model.camera(np.eye(4)).resize(size_px)
-
-    def save(self, folder: Path) -> None:
-        """Writes it as `solved.json`, `solved.npz` and `model.npz`."""
-        if self.model is not None:
-            self.model.save(folder / "model.npz")
-        np.savez(
-            folder / "solved.npz",
-            camera_from_solved=self.camera_from_solved,
-            marks=self.frame_status,
-        )
-        content = {
-            "is_static": self.is_static, "background_motion": self.background_motion,
-            "keyframe_count": self.keyframe_count, "costs": self.costs,
-            "gates": [asdict(gate) for gate in self.gates],
-        }  # fmt: skip
-        write_text_atomically(
-            folder / "solved.json", json.dumps(content, indent=1)
-        )  # last: the rest is there
-
-    @classmethod
-    def load(cls, folder: Path) -> "CameraSolution":
-        """What `save` wrote."""
-        content = json.loads((folder / "solved.json").read_text(encoding="utf-8"))
-        with np.load(folder / "solved.npz", allow_pickle=False) as file:
-            cameras, marks = file["camera_from_solved"], file["marks"]
-        gates = tuple(QualityGate(**gate) for gate in content.pop("gates"))
-        model = None if content["is_static"] else SparseModel.load(folder / "model.npz")
-        return cls(
-            gates=gates, model=model, camera_from_solved=cameras, frame_status=marks, **content
-        )
 
 
 MIN_REGISTERED_FRACTION = 0.9
@@ -210,12 +175,6 @@ JUMP_SIGMAS = 6.0
 
 JUMP_DEG = 1.0
 """Deviation of a rotation from its neighbors' mean that counts as a jump; degrees."""
-
-MAX_MODEL_DISTANCE = 0.01
-"""Largest distance between two mappers' cameras, as a fraction of the path's length."""
-
-MAX_MODEL_ROTATION_DEG = 1.0
-"""Largest rotation between two mappers' cameras, degrees."""
 
 
 def find_outlier_cameras(model: SparseModel) -> Bool[np.ndarray, "cameras"]:
@@ -267,54 +226,6 @@ def evaluate_gates(model: SparseModel, keys: int) -> list[QualityGate]:
     ]  # fmt: skip
 
 
-def compare_models(one: SparseModel, other: SparseModel) -> QualityGate:
-    """Whether two models are the same but for size and place.
-
-    Their common cameras' centres, aligned by a similarity, in lengths of the camera's path; and the
-    largest angle between their rotations.
-    """
-    common, here, there = np.intersect1d(one.frames, other.frames, return_indices=True)
-    words = "the two ways of solving contradict each other"
-    if len(common) < 3:
-        return QualityGate(
-            name="agreement",
-            value=np.inf,
-            bound=MAX_MODEL_DISTANCE,
-            passed=False,
-            failure_reason=words,
-        )
-    a, b = one.camera_centers()[here], other.camera_centers()[there]
-    scale, turn, shift = fit_similarity(b, a)
-    path = float(np.linalg.norm(np.diff(a, axis=0), axis=1).sum())
-    apart = float(np.sqrt(((scale * b @ turn.T + shift - a) ** 2).sum(axis=1).mean()))
-    apart = apart / max(path, 1e-12)
-    views = one.camera_from_world[here, :3, :3] @ turn
-    angles = _rotation_angles_deg(views, other.camera_from_world[there, :3, :3])
-    share = len(common) / max(len(one.frames), len(other.frames))
-    passed = (
-        apart < MAX_MODEL_DISTANCE
-        and angles.max() < MAX_MODEL_ROTATION_DEG
-        and share >= MIN_REGISTERED_FRACTION
-    )
-    return QualityGate(
-        name="agreement", value=apart, bound=MAX_MODEL_DISTANCE, passed=bool(passed),
-        failure_reason=f"{words} by {100.0 * apart:.1f} % of the path and {angles.max():.1f} "
-        "degrees",
-    )  # fmt: skip
-
-
-def fit_similarity(
-    source: Float[np.ndarray, "points 3"], target: Float[np.ndarray, "points 3"]
-) -> tuple[float, Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]:
-    """Scale, rotation and shift that carry points nearest to others (Umeyama 1991, eq. 40-42)."""
-    a, b = source - source.mean(axis=0), target - target.mean(axis=0)
-    left, stretch, right = np.linalg.svd(b.T @ a)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    turn = left @ np.diag(sign) @ right
-    scale = float((stretch * sign).sum() / max((a**2).sum(), 1e-300))
-    return scale, turn, target.mean(axis=0) - scale * turn @ source.mean(axis=0)
-
-
 def _rotation_jumps(model: SparseModel) -> Bool[np.ndarray, "cameras"]:
     """Cameras whose rotation is far off what their neighbours' would be in between."""
     count = len(model.frames)
@@ -351,10 +262,3 @@ def _median_angle(model: SparseModel) -> float:
     np.minimum.at(least, model.observation_point, cosine)
     seen = first >= 0
     return float(np.degrees(np.arccos(np.clip(np.median(least[seen]), -1.0, 1.0))))
-
-
-def _rotation_angles_deg(
-    a: Float[np.ndarray, "cameras 3 3"], b: Float[np.ndarray, "cameras 3 3"]
-) -> Float[np.ndarray, "cameras"]:
-    """Angles between rotations, in degrees."""
-    return np.degrees(Rotation.from_matrix(a @ b.transpose(0, 2, 1)).magnitude())

@@ -1,9 +1,10 @@
-"""Structure from motion on key frames: pycolmap's features, matches and both of its mappers.
+"""Structure from motion on key frames: pycolmap's features, matches and mapper.
 
-A key frame is the sharpest picture of a stretch of the video. Schönberger & Frahm 2016
-(incremental), Pan et al. 2024 (global, GLOMAP). One thread from the matches on, pictures registered
-in order, and fixed seeds: the same pictures give the same cameras, bit by bit, however many threads
-look for features.
+A key frame is the sharpest image of a stretch of the video. The mapper is the incremental one
+(Schönberger & Frahm 2016): between repeating tiles it places few frames, where the global one (Pan
+et al. 2024) places all of them wrongly. One thread from the matches on, images registered in order,
+and fixed seeds: the same images give the same cameras, bit by bit, however many threads look for
+features.
 
 The database is COLMAP's alone while it works: it brings a SQLite of its own, and Python's in the
 same process would break its locks (seen: SIGBUS in the write-ahead log).
@@ -19,7 +20,6 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from capture.image_folder import list_images
 from capture.input_error import InputError
 from capture.source import Frame, FrameSource
 from preprocess.sfm.camera_solution import SparseModel
@@ -150,16 +150,6 @@ def write_keyframes(keys: Iterator[SfmKeyframe], images: Path, masks: Path) -> l
     return kept
 
 
-def read_keyframes(images: Path, masks: Path) -> list[SfmKeyframe]:
-    """What `write_keyframes` wrote."""
-    keys = []
-    for path in list_images(images):
-        grey = np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
-        free = np.asarray(cv2.imread(str(masks / f"{path.name}.png"), cv2.IMREAD_GRAYSCALE))
-        keys.append(SfmKeyframe(index=int(path.stem), gray=grey, person_mask=free == 0))
-    return keys
-
-
 MAX_FEATURES = 2048
 """Most features per key frame."""
 
@@ -178,7 +168,7 @@ MAX_INITIAL_PAIRS = 50
 MIN_MATCHES = 15
 """Fewest matches of an image pair that is used."""
 
-STATED_FOCAL_TOLERANCE = 0.01
+STATED_FOCAL_TOLERANCE = 0.02
 """Relative difference to the solved focal length within which the stated one is used."""
 
 IMAGES_PER_THREAD = 4
@@ -220,50 +210,52 @@ def require_pycolmap() -> None:
         )
 
 
-def extract_features(bench: ColmapWorkspace, told: ProgressFn) -> None:
+def extract_features(workspace: ColmapWorkspace, report_progress: ProgressFn) -> None:
     """Finds SIFT features (Lowe 2004) outside the masked parts."""
     colmap = _colmap()
-    width, height = _size(bench)
+    width, height = _size(workspace)
     reader, options = colmap.ImageReaderOptions(), colmap.FeatureExtractionOptions()
-    reader.mask_path = str(bench.masks)
+    reader.mask_path = str(workspace.masks)
     reader.camera_model = "SIMPLE_RADIAL"
-    if bench.focal_px is not None:
-        reader.camera_params = f"{bench.focal_px},{width / 2.0},{height / 2.0},0"
+    if workspace.focal_px is not None:
+        reader.camera_params = f"{workspace.focal_px},{width / 2.0},{height / 2.0},0"
     else:
         reader.default_focal_length_factor = 0.85
-    options.num_threads, options.use_gpu = bench.threads, False
+    options.num_threads, options.use_gpu = workspace.threads, False
     options.max_image_size = max(width, height)
     options.sift.max_num_features = MAX_FEATURES
-    names, step = _names(bench), IMAGES_PER_THREAD * bench.threads
-    with colmap.Database.open(bench.database):  # makes it
+    names, step = _names(workspace), IMAGES_PER_THREAD * workspace.threads
+    with colmap.Database.open(workspace.database):  # makes it
         pass
     colmap.import_images(
-        bench.database, bench.images, camera_mode=colmap.CameraMode.SINGLE, image_names=names,
-        options=reader,
+        workspace.database, workspace.images, camera_mode=colmap.CameraMode.SINGLE,
+        image_names=names, options=reader,
     )  # fmt: skip
     for first in range(0, len(names), step):
-        told(first / len(names))
+        report_progress(first / len(names))
         colmap.extract_features(
-            bench.database, bench.images, image_names=names[first : first + step],
+            workspace.database, workspace.images, image_names=names[first : first + step],
             camera_mode=colmap.CameraMode.SINGLE, reader_options=reader,
             extraction_options=options, device=colmap.Device.cpu,
         )  # fmt: skip
 
 
-def match_features(bench: ColmapWorkspace, told: ProgressFn) -> None:
+def match_features(workspace: ColmapWorkspace, report_progress: ProgressFn) -> None:
     """Matches features between pictures that were taken one soon after the other."""
     colmap = _colmap()
     options = colmap.FeatureMatchingOptions()
     options.num_threads, options.use_gpu = 1, False
-    count = len(_names(bench))
-    told(0.0)
+    count = len(_names(workspace))
+    report_progress(0.0)
     if count <= MAX_EXHAUSTIVE_IMAGES:
-        colmap.match_exhaustive(bench.database, matching_options=options, device=colmap.Device.cpu)
+        colmap.match_exhaustive(
+            workspace.database, matching_options=options, device=colmap.Device.cpu
+        )
         return
     pairing = colmap.SequentialPairingOptions()
     pairing.overlap, pairing.num_threads = SEQUENTIAL_OVERLAP, 1
     colmap.match_sequential(
-        bench.database, matching_options=options, pairing_options=pairing,
+        workspace.database, matching_options=options, pairing_options=pairing,
         device=colmap.Device.cpu,
     )  # fmt: skip
 
@@ -282,23 +274,8 @@ def parallax_fraction(database: Path) -> tuple[int, float]:
     return len(kinds), sum(kind not in plain for kind in kinds) / max(len(kinds), 1)
 
 
-def map_global(
-    bench: ColmapWorkspace, out: Path, seed: int, told: ProgressFn
-) -> SparseModel | None:
-    """All cameras at once; None if it fails."""
-    colmap = _colmap()
-    options = colmap.GlobalPipelineOptions()
-    options.num_threads = options.mapper.num_threads = 1
-    options.random_seed = options.mapper.random_seed = seed
-    options.mapper.global_positioning.use_gpu = False
-    options.mapper.bundle_adjustment.ceres.use_gpu = False
-    told(0.0)
-    found = colmap.global_mapping(bench.database, bench.images, out, options=options)
-    return _largest_model(found, bench.focal_px)
-
-
-def map_incremental(
-    bench: ColmapWorkspace, out: Path, seed: int, told: ProgressFn
+def map_incrementally(
+    workspace: ColmapWorkspace, out: Path, seed: int, report_progress: ProgressFn
 ) -> SparseModel | None:
     """One camera after the other; None if it fails."""
     colmap = _colmap()
@@ -306,18 +283,18 @@ def map_incremental(
     options.num_threads, options.random_seed = 1, seed
     options.min_model_size, options.max_num_models = 3, MAX_MODELS
     options.init_num_trials, options.extract_colors = MAX_INITIAL_PAIRS, False
-    total, done = len(_names(bench)), 0
+    total, done = len(_names(workspace)), 0
 
     def next_image() -> None:
         nonlocal done
         done += 1
-        told(min(done / total, 1.0))
+        report_progress(min(done / total, 1.0))
 
-    told(0.0)
+    report_progress(0.0)
     found = colmap.incremental_mapping(
-        bench.database, bench.images, out, options=options, next_image_callback=next_image
+        workspace.database, workspace.images, out, options=options, next_image_callback=next_image
     )
-    return _largest_model(found, bench.focal_px)
+    return _largest_model(found, workspace.focal_px)
 
 
 def _colmap() -> Any:
@@ -328,14 +305,14 @@ def _colmap() -> Any:
     return pycolmap
 
 
-def _names(bench: ColmapWorkspace) -> list[str]:
-    return sorted(path.name for path in bench.images.iterdir())
+def _names(workspace: ColmapWorkspace) -> list[str]:
+    return sorted(path.name for path in workspace.images.iterdir())
 
 
-def _size(bench: ColmapWorkspace) -> tuple[int, int]:
+def _size(workspace: ColmapWorkspace) -> tuple[int, int]:
     from PIL import Image
 
-    with Image.open(bench.images / _names(bench)[0]) as picture:
+    with Image.open(workspace.images / _names(workspace)[0]) as picture:
         return picture.size
 
 
@@ -355,10 +332,14 @@ def _adjust_to_focal(found: Any, focal_px: float) -> None:
     colmap = _colmap()
     for lens in found.cameras.values():
         lens.params = [focal_px, *lens.params[1:]]
-    options = colmap.BundleAdjustmentOptions()
+    options, config = colmap.BundleAdjustmentOptions(), colmap.BundleAdjustmentConfig()
     options.refine_focal_length, options.print_summary = False, False
     options.ceres.use_gpu, options.ceres.solver_options.num_threads = False, 1
-    colmap.bundle_adjustment(found, options)
+    for number in found.reg_image_ids():
+        config.add_image(number)
+    config.fix_gauge(colmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    # colmap.bundle_adjustment does the same, and writes to stderr whatever the level of its log
+    colmap.create_default_bundle_adjuster(options, config, found).solve()
 
 
 def _to_sparse_model(found: Any) -> SparseModel:
@@ -379,13 +360,13 @@ def _to_sparse_model(found: Any) -> SparseModel:
     for row, frame in enumerate(frames):
         transforms[row, :3] = images[frame].cam_from_world().matrix()
     lens = found.camera(images[frames[0]].camera_id)
-    focal, x, y, bend = (float(value) for value in lens.params)
+    focal, x, y, radial = (float(value) for value in lens.params)
     return SparseModel(
         frames=np.array(frames),
         camera_from_world=transforms,
         focal_px=focal,
         center_px=(x, y),
-        radial_distortion=bend,
+        radial_distortion=radial,
         size_px=(int(lens.width), int(lens.height)),
         points=np.array([found.points3D[number].xyz for number in ids]).reshape(-1, 3),
         observation_camera=np.array(seen_by, dtype=np.int64),

@@ -170,7 +170,10 @@ class ResectionResult:
 
 
 def resect_intermediate_frames(
-    source: FrameSource, model: SparseModel, keys: list[SfmKeyframe], told: Callable[[float], None]
+    source: FrameSource,
+    model: SparseModel,
+    keys: list[SfmKeyframe],
+    report_progress: Callable[[float], None],
 ) -> ResectionResult:
     """Cameras for all frames that have none.
 
@@ -178,7 +181,7 @@ def resect_intermediate_frames(
         source: The frames.
         model: The key frames' cameras, for pictures of the key frames' size.
         keys: The key frames; those without a camera in the model are placed like any other frame.
-        told: Called with how much of the video is done.
+        report_progress: Called with how much of the video is done.
     """
     own = {key.index: key for key in keys}
     anchors = [
@@ -190,7 +193,7 @@ def resect_intermediate_frames(
     total = max(source.frame_count or source.frames_in_file, 1)
     for before, after, stretch in _frames_between_keyframes(source, anchors, model.size_px):
         if stretch:
-            told(min(source.selection.position(stretch[-1][0]) / total, 1.0))
+            report_progress(min(source.selection.position(stretch[-1][0]) / total, 1.0))
         seen = _PointTracks()
         if before is not None:
             ends = stretch if after is None else [*stretch, (after.frame, after.grey)]
@@ -218,20 +221,20 @@ def resect_camera(
     """
     if len(points) < MIN_PNP_POINTS:
         return None
-    bend = np.array(lens.distortion or (0.0, 0.0, 0.0, 0.0))
+    distortion = np.array(lens.distortion or (0.0, 0.0, 0.0, 0.0))
     cv2.setRNGSeed(0)
     ok, turn, shift, kept = cv2.solvePnPRansac(
-        points, pixels, lens.intrinsic, bend, iterationsCount=200, reprojectionError=INLIER_PX,
-        confidence=0.9999, flags=cv2.SOLVEPNP_AP3P,
+        points, pixels, lens.intrinsic, distortion, iterationsCount=200,
+        reprojectionError=INLIER_PX, confidence=0.9999, flags=cv2.SOLVEPNP_AP3P,
     )  # fmt: skip
     inliers = np.zeros(0, np.int64) if kept is None else np.asarray(kept)[:, 0].astype(np.int64)
     if not ok or len(inliers) < max(MIN_PNP_POINTS, MIN_INLIER_FRACTION * len(points)):
         return None
     for reach in (INLIER_PX, 0.5 * INLIER_PX, 0.0):  # the last round leaves out what is half right
         turn, shift = cv2.solvePnPRefineLM(
-            points[inliers], pixels[inliers], lens.intrinsic, bend, turn, shift
+            points[inliers], pixels[inliers], lens.intrinsic, distortion, turn, shift
         )
-        drawn = np.asarray(cv2.projectPoints(points, turn, shift, lens.intrinsic, bend)[0])
+        drawn = np.asarray(cv2.projectPoints(points, turn, shift, lens.intrinsic, distortion)[0])
         near = np.flatnonzero(np.linalg.norm(drawn[:, 0] - pixels, axis=1) < reach)
         inliers = near if len(near) >= MIN_PNP_POINTS else inliers
     return rigid_transform(np.asarray(cv2.Rodrigues(turn)[0]), np.asarray(shift)[:, 0])

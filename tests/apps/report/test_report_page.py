@@ -269,8 +269,6 @@ SOLVED = {
     [
         (None, None),
         ({"verdict": "still"}, "did not move"),
-        ({"verdict": "stopped"}, "--resume"),
-        ({"verdict": "refused", "reason": "tiles < tiles"}, "tiles &lt; tiles"),
         (SOLVED, "434 px; metric scale from: ground"),
     ],
 )  # fmt: skip

@@ -6,12 +6,7 @@ import pytest
 
 from capture.input_error import InputError
 from capture.source_opening import open_source
-from preprocess.sfm.colmap_mapping import (
-    dilate_person,
-    read_keyframes,
-    select_keyframes,
-    write_keyframes,
-)
+from preprocess.sfm.colmap_mapping import dilate_person, select_keyframes, write_keyframes
 
 COUNT, SHARP = 36, (1, 5, 6, 11, 13, 17, 18, 22, 25, 29, 32, 35)
 
@@ -65,21 +60,16 @@ def test_the_person_is_left_out_with_a_margin():
     assert (rows.min(), rows.max(), columns.min(), columns.max()) == (46, 153, 96, 143)
 
 
-def test_key_frames_are_read_as_they_were_written(film, tmp_path):
+def test_colmap_does_not_look_at_the_person(film, tmp_path):
     def left_half(frame, size_px):
         person = no_person(frame, size_px)
         person[:, : size_px[0] // 2] = True
         return person
 
     chosen = select_keyframes(film, left_half, lambda share: None, 12)
-    written = write_keyframes(chosen, tmp_path / "images", tmp_path / "masks")
-    again = read_keyframes(tmp_path / "images", tmp_path / "masks")
-    for one, other in zip(written, again, strict=True):
-        assert one.index == other.index
-        np.testing.assert_array_equal(one.gray, other.gray)
-        np.testing.assert_array_equal(one.person_mask, other.person_mask)
+    assert len(write_keyframes(chosen, tmp_path / "images", tmp_path / "masks")) == 12
     mask = cv2.imread(str(tmp_path / "masks" / "000001.png.png"), cv2.IMREAD_GRAYSCALE)
-    assert not mask[:, :32].any()  # COLMAP looks where a mask is not 0
+    assert not mask[:, :32].any()  # it looks where a mask is not 0
     assert (mask[:, 40:] == 255).all()
 
 
