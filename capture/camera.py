@@ -106,22 +106,6 @@ class Camera:
             )
         return camera
 
-    def mirror(self) -> "Camera":
-        """The camera of the same pictures, left and right exchanged, in a world mirrored like them.
-
-        A camera of mirrored pictures stands in a mirror's world, x' = F x with F = diag(-1, 1, 1).
-        Mirrored back, camera and world are real: F (camera from world) F is rigid again.
-        """
-        flip, distortion = np.diag([-1.0, 1.0, 1.0, 1.0]), list(self.distortion)
-        if len(distortion) >= 4:  # tangential p2 goes with x (OpenCV)
-            distortion[3] = -distortion[3]
-        return replace(
-            self,
-            center_px=(self.size_px[0] - self.center_px[0], self.center_px[1]),
-            camera_from_world=flip @ self.camera_from_world @ flip,
-            distortion=tuple(distortion),
-        )
-
     def pixel_centers(self) -> Float[np.ndarray, "height width 2"]:
         """The centre (x, y) of every pixel."""
         width, height = self.size_px

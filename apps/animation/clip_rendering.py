@@ -160,45 +160,15 @@ def load_cameras(
     Raises:
         InputError: If the file cannot be read, or does not match poses or size.
     """
-    from preprocess.cameras.camera_file import read_cameras, resolve_camera_path
+    from preprocess.cameras.camera_file import read_cameras
 
-    path = resolve_camera_path(path)
-    track = read_cameras(path, _camera_image_size(path))
+    track = read_cameras(path, None)
     if track.is_moving and len(track.cameras) != poses:
         raise InputError(
             f"{path} holds {len(track.cameras)} cameras for {poses} poses, but must hold one, or "
             "one per pose."
         )
     return tuple(_resize_camera(track[row], size) for row in rows)
-
-
-def _camera_image_size(path: Path) -> tuple[int, int]:
-    """Return the image size of a camera file; twice its principal point if it names none."""
-    from preprocess.cameras.camera_registry import (
-        find_multi_view_cameras,
-        read_multi_view_camera,
-        read_named_cameras,
-    )
-    from preprocess.file_content import read_npz
-
-    rig = find_multi_view_cameras(path)
-    if rig is not None:
-        return read_multi_view_camera(rig, None, None).size_px
-    if path.suffix.lower() != ".npz":
-        return read_named_cameras(path)[0].camera.size_px
-
-    arrays = read_npz(path, ("width", "height", "intrinsic"))
-    if {"width", "height"} <= arrays.keys():
-        width, height = (float(arrays[key].reshape(-1)[0]) for key in ("width", "height"))
-    elif "intrinsic" in arrays and arrays["intrinsic"].shape[-2:] == (3, 3):
-        width, height = (2.0 * float(c) for c in arrays["intrinsic"].reshape(-1, 3, 3)[0, :2, 2])
-    else:
-        raise InputError(f"{path} holds no camera: expected intrinsic (3, 3), height and width.")
-    if not (1.0 <= width <= 16384.0 and 1.0 <= height <= 16384.0):
-        raise InputError(
-            f"{path} is for images of {width:.0f}x{height:.0f} px, but at most 16384 is supported."
-        )
-    return round(width), round(height)
 
 
 def _resize_camera(camera: Camera, size: int | tuple[int, int] | None) -> Camera:

@@ -32,7 +32,7 @@ from capture.image_folder import list_images, write_png
 from capture.input_error import InputError
 from capture.source_opening import open_source
 from preprocess.cameras.camera_file import CameraTrack, write_cameras
-from preprocess.cameras.camera_registry import find_colmap_model, read_colmap_model
+from preprocess.cameras.colmap_model import find_colmap_model, read_colmap_model
 from preprocess.cameras.named_camera import NamedCamera
 from preprocess.file_content import read_npz, read_untrusted_file
 from preprocess.masks.mask_files import Masks, open_masks

@@ -4,18 +4,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Float
 
 from capture.camera import Camera, same_aspect_ratio
 from capture.image_folder import refuse_pipe
 from capture.input_error import InputError
 from capture.source import FrameSource
 from preprocess.body.body_pose import Motion, RelativeFocalLength
-from preprocess.cameras.camera_registry import (
-    find_multi_view_cameras,
-    read_multi_view_camera,
-    read_named_cameras,
-)
+from preprocess.cameras.camera_registry import read_named_cameras
+from preprocess.cameras.multi_view_cameras import find_multi_view_cameras, read_multi_view_camera
+from preprocess.cameras.named_camera import checked_camera, checked_rigid, explain_camera_errors
 from preprocess.file_content import read_npz
 from preprocess.frame_association import cameras_by_frame, interpolate_missing_cameras
 
@@ -63,72 +61,58 @@ def resolve_camera_path(path: Path) -> Path:
 
 
 def read_cameras(
-    path: Path, size_px: tuple[int, int], source: FrameSource | None = None
+    path: Path, size_px: tuple[int, int] | None, source: FrameSource | None = None
 ) -> CameraTrack:
-    """Reads cameras: an .npz of ours, or what COLMAP, nerfstudio, Record3D or Polycam wrote.
+    """Read cameras: an .npz of ours, or what another program wrote (`camera_registry`).
 
     The .npz holds intrinsic (3, 3), extrinsic (4, 4) camera-from-world, or N of each; optional:
-    height and width (of the pictures that the matrices belong to), distortion (OpenCV's
+    height and width (of the images that the matrices belong to), distortion (OpenCV's
     coefficients), valid (N: whether a frame has a camera of its own). Cameras of another size and
     the same shape are scaled to `size_px`.
 
     Args:
         path: File or folder.
-        size_px: Width and height of the frames.
+        size_px: Width and height of the frames; None for those of the file's own images.
         source: The frames, whose names or number tell which camera is whose. Without it cameras
             of other programs are taken in order.
 
     Raises:
-        InputError: If there is no such file, or it holds no such cameras, or their pictures had
+        InputError: If there is no such file, or it holds no such cameras, or their images had
             another aspect ratio.
     """
     path = resolve_camera_path(path)
     refuse_pipe(path)
-    if path.suffix.lower() != ".npz":
-        return _read_external(path, size_px, source)
-    return _read_npz_cameras(path, size_px)
+    if path.suffix.lower() == ".npz":
+        return _read_npz_cameras(path, size_px)
+    return _read_external(path, size_px, source)
 
 
-def _read_npz_cameras(path: Path, size_px: tuple[int, int]) -> CameraTrack:
+def _read_npz_cameras(path: Path, size_px: tuple[int, int] | None) -> CameraTrack:
     arrays = read_npz(path)
-    if "intrinsic" not in arrays:
-        found = ", ".join(sorted(arrays)) or "nothing"
-        raise InputError(f"{path} holds {found}; expected intrinsic, extrinsic, height and width.")
-    intrinsics = _read_matrices(arrays, "intrinsic", 3, path)
-    if (intrinsics[:, [0, 1], [0, 1]] <= 0.0).any():
-        raise InputError(f"`intrinsic` in {path} has no positive focal lengths, in pixels.")
-    extrinsics = np.eye(4)[None]
-    if "extrinsic" in arrays:
-        extrinsics = _require_rigid(_read_matrices(arrays, "extrinsic", 4, path), path)
-    count = max(len(intrinsics), len(extrinsics))
-    if {len(intrinsics), len(extrinsics)} - {1, count}:
-        raise InputError(
-            f"{path} holds {len(intrinsics)} intrinsic and {len(extrinsics)} extrinsic matrices; "
-            "expected one of each, or one of each per frame."
+    with explain_camera_errors(path, "an .npz of intrinsic, extrinsic, height and width"):
+        if arrays["intrinsic"].shape[-2:] != (3, 3):
+            raise ValueError(f"`intrinsic` has the shape {arrays['intrinsic'].shape}, not (3, 3)")
+        intrinsics = arrays["intrinsic"].astype(np.float64).reshape(-1, 3, 3)
+        extrinsics = checked_rigid(arrays.get("extrinsic", np.eye(4))).reshape(-1, 4, 4)
+        count = max(len(intrinsics), len(extrinsics))
+        stored_px = size_px or (2.0 * intrinsics[0, 0, 2], 2.0 * intrinsics[0, 1, 2])
+        if "width" in arrays and "height" in arrays:
+            stored_px = tuple(float(arrays[side].reshape(-1)[0]) for side in ("width", "height"))
+        distortion = np.array(arrays.get("distortion", ()), dtype=np.float64).reshape(-1)
+        if len(distortion) not in (0, 4, 5, 8, 12, 14):
+            raise ValueError("`distortion` is not OpenCV's 4, 5, 8, 12 or 14 numbers")
+        cameras = tuple(
+            checked_camera(k[[0, 1], [0, 1]], k[:2, 2], stored_px, view, distortion)
+            for k, view in zip(
+                np.broadcast_to(intrinsics, (count, 3, 3)),
+                np.broadcast_to(extrinsics, (count, 4, 4)),
+                strict=True,
+            )
         )
-    stored_px = _read_stored_size(arrays, size_px, path)
-    distortion = _read_distortion(arrays, path)
-    cameras = tuple(
-        Camera.from_intrinsic(
-            intrinsics[min(row, len(intrinsics) - 1)],
-            stored_px,
-            extrinsics[min(row, len(extrinsics) - 1)],
-            distortion,
-        ).resize(size_px)
-        for row in range(count)
-    )
-    note = None
-    if stored_px != size_px:
-        note = (
-            f"The cameras in {path.name} belong to {stored_px[0]}x{stored_px[1]} px and were "
-            f"scaled to the video's {size_px[0]}x{size_px[1]}."
-        )
-    return CameraTrack(
-        cameras=cameras,
-        source=path.name,
-        note=note,
-        frames_without_camera=_read_frames_without_camera(arrays, count, path),
-    )
+        missing = np.zeros(count, dtype=bool)
+        if "valid" in arrays and count > 1:
+            missing[:] = arrays["valid"].reshape(-1) == 0
+    return _fit_to_frames(cameras, path, size_px, frozenset(np.flatnonzero(missing).tolist()))
 
 
 def write_cameras(path: Path, track: CameraTrack) -> None:
@@ -146,43 +130,65 @@ def write_cameras(path: Path, track: CameraTrack) -> None:
     )
 
 
-def _read_external(path: Path, size_px: tuple[int, int], source: FrameSource | None) -> CameraTrack:
+def _read_external(
+    path: Path, size_px: tuple[int, int] | None, source: FrameSource | None
+) -> CameraTrack:
     """Cameras of other programs, one for every frame, or one that stands still."""
     rig = find_multi_view_cameras(path)
     if rig is not None:
         camera = read_multi_view_camera(rig, None if source is None else source.path, size_px)
-        if not same_aspect_ratio(camera.size_px, size_px):
-            raise _aspect_ratio_error(path, camera.size_px, size_px)
-        return CameraTrack(cameras=(camera.resize(size_px),), source=rig.name)
-    found = read_named_cameras(path, size_px)
-    stored = {each.camera.size_px for each in found}
-    for size in stored:
-        if not same_aspect_ratio(size, size_px):
-            raise _aspect_ratio_error(path, size, size_px)
-    frames = {number: each.camera for number, each in enumerate(found)}
+        return _fit_to_frames((camera,), rig, size_px)
+    named = read_named_cameras(path, size_px)
+    frames = {number: each.camera for number, each in enumerate(named)}
     if source is not None:
-        frames = cameras_by_frame(found, source, path)
-    total = len(found) if source is None else source.frames_in_file
+        frames = cameras_by_frame(named, source, path)
+    total = len(named) if source is None else source.frames_in_file
     cameras, missing = interpolate_missing_cameras(frames, total)
-    notes = []
-    if stored != {size_px}:
-        sizes = ", ".join(f"{width}x{height}" for width, height in sorted(stored))
-        notes.append(
-            f"The cameras in {path.name} belong to {sizes} px and were scaled to the video's "
-            f"{size_px[0]}x{size_px[1]}."
-        )
+    track = _fit_to_frames(cameras, path, size_px, missing)
     between = total - len(frames) - len(missing)
-    if between > 0 or missing:
-        notes.append(
-            f"Of {total} frames {len(frames)} have a camera in {path.name}; {between} were "
-            f"interpolated, {len(missing)} are left out."
-        )
-    return CameraTrack(
-        cameras=tuple(camera.resize(size_px) for camera in cameras),
-        source=path.name,
-        note=" ".join(notes) or None,
-        frames_without_camera=missing,
+    if between <= 0 and not missing:
+        return track
+    note = (
+        f"Of {total} frames {len(frames)} have a camera in {path.name}; {between} were "
+        f"interpolated, {len(missing)} are left out."
     )
+    return replace(track, note=note if track.note is None else f"{track.note} {note}")
+
+
+def _fit_to_frames(
+    cameras: tuple[Camera, ...],
+    path: Path,
+    size_px: tuple[int, int] | None,
+    missing: frozenset[int] = frozenset(),
+) -> CameraTrack:
+    """Scale cameras to the frames' size.
+
+    Args:
+        cameras: Each of its own image's size.
+        path: Where they come from.
+        size_px: Width and height of the frames; None leaves the cameras as they are.
+        missing: Frames without a camera.
+
+    Raises:
+        InputError: If their images had another aspect ratio.
+    """
+    note = None
+    for stored in sorted({camera.size_px for camera in cameras}):
+        if size_px is not None and not same_aspect_ratio(stored, size_px):
+            raise InputError(
+                f"The cameras in {path} belong to images of {stored[0]}x{stored[1]} px, the video "
+                f"has {size_px[0]}x{size_px[1]}; expected the same shape. If the video was rotated "
+                "or cropped, change the cameras with it; if it was stretched, undo that (ffmpeg "
+                f"-vf scale={stored[0]}:{stored[1]})."
+            )
+        if size_px is not None and stored != size_px:
+            note = (
+                f"The cameras in {path.name} belong to {stored[0]}x{stored[1]} px and were scaled "
+                f"to the video's {size_px[0]}x{size_px[1]}."
+            )
+    if size_px is not None:
+        cameras = tuple(camera.resize(size_px) for camera in cameras)
+    return CameraTrack(cameras=cameras, source=path.name, note=note, frames_without_camera=missing)
 
 
 def assume_static_camera(motion: Motion, size_px: tuple[int, int]) -> CameraTrack:
@@ -228,82 +234,3 @@ def tracker_intrinsic_matrix(
     return (
         np.diag([scale[0], scale[1], 1.0]) @ motion.intrinsic if of_other_size else motion.intrinsic
     )
-
-
-def _read_matrices(
-    arrays: dict[str, Shaped[np.ndarray, "..."]], key: str, size: int, path: Path
-) -> Float[np.ndarray, "cameras rows columns"]:
-    """One or many square matrices, with the last row of (3, 4) ones filled in."""
-    found = arrays[key]
-    if found.dtype.kind not in "iuf" or found.ndim not in (2, 3):
-        raise InputError(f"`{key}` in {path} holds no {size}x{size} matrices.")
-    matrices = found.astype(np.float64).reshape(-1, *found.shape[-2:])
-    if size == 4 and matrices.shape[1:] == (3, 4):
-        last = np.broadcast_to([[[0.0, 0.0, 0.0, 1.0]]], (len(matrices), 1, 4))
-        matrices = np.concatenate([matrices, last], axis=1)
-    if matrices.shape[1:] != (size, size) or not len(matrices) or not np.isfinite(matrices).all():
-        raise InputError(
-            f"`{key}` in {path} has the shape {found.shape}; expected finite {size}x{size} "
-            "matrices, one or one per frame."
-        )
-    return matrices
-
-
-def _require_rigid(
-    transforms: Float[np.ndarray, "cameras 4 4"], path: Path
-) -> Float[np.ndarray, "cameras 4 4"]:
-    rotations = transforms[:, :3, :3]
-    off = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max()
-    if off > 1e-3 or (np.linalg.det(rotations) < 0.0).any():
-        raise InputError(
-            f"`extrinsic` in {path} is no rigid camera-from-world transform: its rotation is off "
-            f"by {off:.2g}. Expected OpenCV axes (x right, y down, z forward) and no scale."
-        )
-    return transforms
-
-
-def _read_frames_without_camera(
-    arrays: dict[str, Shaped[np.ndarray, "..."]], count: int, path: Path
-) -> frozenset[int]:
-    """Frames without a camera of their own, if the file says so."""
-    if "valid" not in arrays or count == 1:
-        return frozenset()
-    valid = arrays["valid"].reshape(-1)
-    if len(valid) != count or valid.dtype.kind not in "biu":
-        raise InputError(f"`valid` in {path} holds {len(valid)} values for {count} cameras.")
-    return frozenset(np.flatnonzero(valid == 0).tolist())
-
-
-def _read_stored_size(
-    arrays: dict[str, Shaped[np.ndarray, "..."]], size_px: tuple[int, int], path: Path
-) -> tuple[int, int]:
-    """Width and height that the matrices belong to; the frames' where the file does not say."""
-    if not {"width", "height"} <= arrays.keys():
-        return size_px
-    try:
-        stored = int(arrays["width"].reshape(-1)[0]), int(arrays["height"].reshape(-1)[0])
-    except (ValueError, TypeError, IndexError) as cause:
-        raise InputError(f"`width` and `height` in {path} are no numbers of pixels.") from cause
-    if min(stored) < 1 or not same_aspect_ratio(stored, size_px):
-        raise _aspect_ratio_error(path, stored, size_px)
-    return stored
-
-
-def _aspect_ratio_error(
-    path: Path, stored: tuple[int, int], size_px: tuple[int, int]
-) -> InputError:
-    return InputError(
-        f"The cameras in {path} belong to pictures of {stored[0]}x{stored[1]} px, the video "
-        f"has {size_px[0]}x{size_px[1]}; expected the same shape. If the video was rotated or "
-        "cropped, change the cameras with it; if it was stretched, undo that (ffmpeg -vf "
-        f"scale={stored[0]}:{stored[1]})."
-    )
-
-
-def _read_distortion(arrays: dict[str, Shaped[np.ndarray, "..."]], path: Path) -> tuple[float, ...]:
-    if "distortion" not in arrays:
-        return ()
-    found = arrays["distortion"].reshape(-1)
-    if found.dtype.kind not in "iuf" or len(found) not in (0, 4, 5, 8, 12, 14):
-        raise InputError(f"`distortion` in {path}: expected OpenCV's 4, 5, 8, 12 or 14 numbers.")
-    return tuple(float(k) for k in found) if found.any() else ()

@@ -30,7 +30,7 @@ def test_an_angle_of_view_alone_is_enough_where_the_pictures_are_known(tmp_path)
         camera = read_cameras(path, (80, 60))[0]
         assert camera.focal_px == pytest.approx((80.0, 80.0))
         assert (camera.center_px, camera.size_px) == ((40.0, 30.0), (80, 60))
-    with pytest.raises(InputError, match="expected w, h"):
+    with pytest.raises(InputError, match=r"transforms_train\.json"):
         read_named_cameras(tmp_path)
 
 

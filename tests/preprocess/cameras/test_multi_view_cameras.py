@@ -14,7 +14,10 @@ from capture.camera import Camera
 from capture.input_error import InputError
 from capture.source_opening import open_source
 from preprocess.cameras.camera_file import read_cameras
-from preprocess.cameras.camera_registry import find_multi_view_cameras, read_multi_view_camera
+from preprocess.cameras.multi_view_cameras import (
+    find_multi_view_cameras,
+    read_multi_view_camera,
+)
 
 NAMES, SIZE = ("01", "02", "B3"), (64, 48)
 BENDS = np.array([[0.1, -0.02, 0.001, 0.002, 0.003]])
@@ -109,20 +112,20 @@ def test_zju_mocap_speaks_in_millimetres_and_names_cameras_by_folders(tmp_path, 
 
 
 @pytest.mark.parametrize(
-    ("file", "old", "new", "words"),
+    ("file", "old", "new"),
     [
-        ("intri.yml", "rows: 3", "rows: 7", "something else than it says"),
-        ("intri.yml", "51", "x51", "something else than it says"),
-        ("extri.yml", "T_", "S_", "holds no cameras"),
+        ("intri.yml", "rows: 3", "rows: 7"),
+        ("intri.yml", "51", "x51"),
+        ("extri.yml", "T_", "S_"),
         ("extri.yml", "Rot_01: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [ ",
-         "Rot_01: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [ 7", "not rigid"),
+         "Rot_01: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [ 7"),
     ],
 )  # fmt: skip
-def test_errors_in_a_camera_file_are_reported(studio, file, old, new, words):
+def test_errors_in_a_camera_file_are_reported(studio, file, old, new):
     text = (studio / file).read_text()
     assert old in text
     (studio / file).write_text(text.replace(old, new))
-    with pytest.raises(InputError, match=words):
+    with pytest.raises(InputError, match="EasyMocap"):
         read_multi_view_camera(studio, studio / "images" / "01", SIZE)
 
 
