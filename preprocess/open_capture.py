@@ -3,7 +3,6 @@
 Of a stream that comes without poses, the person is tracked while its frames come.
 """
 
-import shlex
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -52,7 +51,7 @@ def describe_capture(
     fit: BodyAlignment,
     masks: Masks | None,
     cameras: CameraTrack,
-    choice: MaskOrigin,
+    mask_origin: MaskOrigin,
     *,
     unread_alpha_video: Path | None = None,
 ) -> Iterator[str]:
@@ -62,7 +61,7 @@ def describe_capture(
         fit: Poses and body.
         masks: The masks, if a file holds them.
         cameras: The cameras.
-        choice: Which masks are used.
+        mask_origin: Which masks are used.
         unread_alpha_video: The video, if it has an alpha channel that is not read.
     """
     motion, family = fit.motion, fit.shaped.body.family
@@ -70,22 +69,18 @@ def describe_capture(
         yield motion.note
     if cameras.note is not None:
         yield cameras.note
-    if choice.segmenter is not None:
+    if mask_origin.segmenter is not None:
         yield (
-            f"Masks are estimated from the pictures and the poses (segmenter:{choice.segmenter}); "
-            "a segmenter's own masks (--masks) are sharper around hair and hands."
+            "Masks are estimated from the pictures and the poses "
+            f"(segmenter:{mask_origin.segmenter}); a segmenter's own masks (--masks) are sharper "
+            "around hair and hands."
         )
-    if choice.is_fallback and unread_alpha_video is not None:
-        folder = unread_alpha_video.with_name(f"{unread_alpha_video.stem}_frames")
-        video, made, pictures = (
-            shlex.quote(str(path)) for path in (unread_alpha_video, folder, folder / "%06d.png")
-        )
+    if mask_origin.is_fallback and unread_alpha_video is not None:
         yield (
-            f"{unread_alpha_video.name} has an alpha channel, which is not read from videos. If it "
-            "cuts the person out, write pictures, and learn from their folder: "
-            f"mkdir {made} && ffmpeg -i {video} {pictures}"
+            f"{unread_alpha_video} has an alpha channel, which is not read from videos. If it cuts "
+            "the person out, write its frames as PNG images (ffmpeg), and learn from their folder."
         )
-    if choice.uses_alpha_channel:
+    if mask_origin.uses_alpha_channel:
         yield "The pictures' own alpha channel is used as their masks."
     if masks is not None and masks.inverted:
         yield f"The masks in {masks.path} show the background (white); they were inverted."
@@ -117,35 +112,26 @@ def open_capture(
     Raises:
         InputError: If a part is missing or unreadable, or they do not fit together.
     """
-    recording = _open_recorded(inputs, size_px, avatar_body, skip_checks=skip_checks)
-    if not skip_checks:
-        recording.check()
-    return recording
-
-
-def _open_recorded(
-    wanted: CaptureInputs, size_px: int | None, avatars: Path | None, *, skip_checks: bool
-) -> Capture:
-    paths = find_capture_paths(wanted.video, wanted.poses, _mask_file(wanted.masks), wanted.cameras)
-    source, body = open_source(paths.video, frames=wanted.frames), load_body_model(wanted.body)
-    source = TransposedSource(source) if wanted.transposed else source
-    motion = read_poses(paths.poses, default_model=body.family, person=wanted.person)
-    doubts: tuple[str, ...] = ()
+    paths = find_capture_paths(inputs.video, inputs.poses, _mask_file(inputs.masks), inputs.cameras)
+    source, body = open_source(paths.video, frames=inputs.frames), load_body_model(inputs.body)
+    source = TransposedSource(source) if inputs.transposed else source
+    motion = read_poses(paths.poses, default_model=body.family, person=inputs.person)
+    warnings: tuple[str, ...] = ()
     if not skip_checks:  # ia-check wants the numbers as they are, and says what is odd by itself
-        doubts, motion = (
-            tuple(plausibility_warnings(motion)),
-            require_plausible(motion, paths.poses),
-        )
-    choice, masks = _open_masks(paths, source, wanted)
-    paths = replace(paths, masks=choice.path)
+        warnings = tuple(plausibility_warnings(motion))
+        motion = require_plausible(motion, paths.poses)
+    mask_origin, masks = _open_masks(paths, source, inputs)
+    paths = replace(paths, masks=mask_origin.path)
     cameras, given = _read_or_assume_cameras(paths, motion, source), paths.cameras is not None
     evidence = CaptureEvidence(source, masks, cameras)
     motion, shaped = place_motion(motion, body, evidence, cameras_given=given)
     if not given and motion.intrinsic is None and motion.assumed_focal is None:
         cameras = estimate_focal_length(evidence, motion, shaped)
         evidence = evidence._replace(cameras=cameras)
-    fit = fit_person(motion, shaped, evidence, avatar_body=avatars, height_m=wanted.height_m)
-    return Capture(
+    fit = fit_person(motion, shaped, evidence, avatar_body=avatar_body, height_m=inputs.height_m)
+    unread_alpha = _unread_alpha(source)
+    notes = describe_capture(fit, masks, cameras, mask_origin, unread_alpha_video=unread_alpha)
+    capture = Capture(
         paths=paths,
         source=source,
         motion=fit.motion,
@@ -153,16 +139,14 @@ def _open_recorded(
         cameras=cameras,
         shaped=fit.shaped,
         size_px=size_px,
-        notes=(
-            *describe_capture(
-                fit, masks, cameras, choice, unread_alpha_video=_unread_alpha(source)
-            ),
-            *doubts,
-        ),
-        segment=_make_segmenter(choice, fit.shaped),
-        mask_refiner=make_mask_refiner(wanted),
+        notes=(*notes, *warnings),
+        segment=_make_segmenter(mask_origin, fit.shaped),
+        mask_refiner=make_mask_refiner(inputs),
         refit=fit.placement,
     )
+    if not skip_checks:
+        capture.check()
+    return capture
 
 
 def _mask_file(masks: Path | None) -> Path | None:
@@ -170,13 +154,13 @@ def _mask_file(masks: Path | None) -> Path | None:
     return masks if segmenter_name(masks) is None else None
 
 
-def _make_segmenter(choice: MaskOrigin, shaped: ShapedBody) -> Segmenter | None:
-    return None if choice.segmenter is None else make_segmenter(choice.segmenter, shaped)
+def _make_segmenter(mask_origin: MaskOrigin, shaped: ShapedBody) -> Segmenter | None:
+    return None if mask_origin.segmenter is None else make_segmenter(mask_origin.segmenter, shaped)
 
 
-def make_mask_refiner(wanted: CaptureInputs) -> GivenMaskRefiner | None:
-    """What refines given masks, if that is wanted."""
-    return GivenMaskRefiner() if wanted.refine_masks else None
+def make_mask_refiner(inputs: CaptureInputs) -> GivenMaskRefiner | None:
+    """What refines given masks; None if they stay as they are."""
+    return GivenMaskRefiner() if inputs.refine_masks else None
 
 
 def _unread_alpha(source: FrameSource) -> Path | None:
@@ -185,17 +169,19 @@ def _unread_alpha(source: FrameSource) -> Path | None:
 
 
 def _open_masks(
-    paths: CapturePaths, source: FrameSource, wanted: CaptureInputs
+    paths: CapturePaths, source: FrameSource, inputs: CaptureInputs
 ) -> tuple[MaskOrigin, Masks | None]:
     """Which masks are used; and those, if a file holds them, which may be that of the poses."""
-    choice = choose_mask_origin(wanted.masks, paths.masks, has_alpha=source.has_alpha)
-    source.has_alpha = choice.uses_alpha_channel
-    if choice.is_fallback:
-        masks = open_tracker_masks(paths.poses, source, person=wanted.person)
-        return (choice, None) if masks is None else (MaskOrigin(path=masks.path), masks)
-    if choice.path is None:
-        return choice, None
-    return choice, open_masks(choice.path, invert=wanted.invert_masks, person=wanted.person)
+    mask_origin = choose_mask_origin(inputs.masks, paths.masks, has_alpha=source.has_alpha)
+    source.has_alpha = mask_origin.uses_alpha_channel
+    if mask_origin.is_fallback:
+        masks = open_tracker_masks(paths.poses, source, person=inputs.person)
+        return (mask_origin, None) if masks is None else (MaskOrigin(path=masks.path), masks)
+    if mask_origin.path is None:
+        return mask_origin, None
+    return mask_origin, open_masks(
+        mask_origin.path, invert=inputs.invert_masks, person=inputs.person
+    )
 
 
 def _read_or_assume_cameras(
@@ -208,7 +194,7 @@ def _read_or_assume_cameras(
 
 
 def open_tracked_stream(
-    wanted: CaptureInputs,
+    inputs: CaptureInputs,
     tracker: PersonTracker,
     make_refinement: Callable[[tuple[int, int]], MaskRefinement],
     poses: Path,
@@ -221,7 +207,7 @@ def open_tracked_stream(
     alpha channel are learnt from; only without any are the tracker's.
 
     Args:
-        wanted: What the user named; without poses.
+        inputs: What the user named; without poses.
         tracker: Follows the person.
         make_refinement: From the frames' width and height to what makes masks from the tracker's.
         poses: File to which the poses will be written in the end.
@@ -230,33 +216,33 @@ def open_tracked_stream(
     Raises:
         InputError: If it cannot be read, or no person is found in it.
     """
-    if wanted.cameras == "solve" or wanted.height_m is not None:
+    if inputs.cameras == "solve" or inputs.height_m is not None:
         raise InputError(
             "--cameras solve and --height-cm need the poses of the whole recording. Run ia-track "
             "first, and give its poses; or leave out --realtime."
         )
     pace = PacingClock()
-    source = _open_stream_source(wanted, pace)
-    choice, given = _open_stream_masks(wanted, source)
+    source = _open_stream_source(inputs, pace)
+    mask_origin, given = _open_stream_masks(inputs, source)
     stream = TrackedStream(source)
     tracking = LiveTracking(stream, tracker, make_refinement(stream.size_px), given)
-    shaped = load_body_model(wanted.body).with_shape()
+    shaped = load_body_model(inputs.body).with_shape()
     if avatar_body is not None:
         shaped = read_shaped_body(avatar_body, shaped.body)
     found = tracking.start(
         shaped,
-        assume_camera(wanted.video, wanted.cameras, stream),
+        assume_camera(inputs.video, inputs.cameras, stream),
         fixed_body=avatar_body is not None,
-        stated_focal=find_stream_cameras(wanted.video, wanted.cameras) is not None,
+        stated_focal=find_stream_cameras(inputs.video, inputs.cameras) is not None,
     )
-    segment, notes = None, [*_unread_live_parts(wanted)]
-    if not choice.is_fallback:
+    segment, notes = None, [*_unread_live_parts(inputs)]
+    if not mask_origin.is_fallback:
         fit = BodyAlignment(shaped=found.shaped, motion=found.motion)
-        notes += describe_capture(fit, None, found.cameras, choice)
-        if choice.segmenter is not None:
-            segment = make_segmenter(choice.segmenter, found.shaped)
+        notes += describe_capture(fit, None, found.cameras, mask_origin)
+        if mask_origin.segmenter is not None:
+            segment = make_segmenter(mask_origin.segmenter, found.shaped)
     return Capture(
-        paths=CapturePaths(video=wanted.video, poses=poses, masks=choice.path, cameras=None),
+        paths=CapturePaths(video=inputs.video, poses=poses, masks=mask_origin.path, cameras=None),
         source=stream,
         motion=found.motion,
         masks=None,
@@ -264,38 +250,38 @@ def open_tracked_stream(
         shaped=found.shaped,
         size_px=None,
         notes=tuple(notes),
-        live=tracking, segment=segment, mask_refiner=make_mask_refiner(wanted),
+        live=tracking, segment=segment, mask_refiner=make_mask_refiner(inputs),
     )  # fmt: skip
 
 
 def _open_stream_masks(
-    wanted: CaptureInputs, source: FrameSource
+    inputs: CaptureInputs, source: FrameSource
 ) -> tuple[MaskOrigin, MaskReader | None]:
     """Which masks are used, and what reads them; a fallback means the tracker's.
 
     Raises:
         InputError: If masks that were named cannot be used.
     """
-    own = None if wanted.is_live else find_own_masks(wanted.video)
-    choice = choose_mask_origin(wanted.masks, own, has_alpha=source.has_alpha)
-    source.has_alpha = choice.uses_alpha_channel
-    if choice.path is None:
-        return choice, alpha_channel_mask if choice.uses_alpha_channel else None
-    stored = open_masks(choice.path, invert=wanted.invert_masks)
+    own = None if inputs.is_live else find_own_masks(inputs.video)
+    mask_origin = choose_mask_origin(inputs.masks, own, has_alpha=source.has_alpha)
+    source.has_alpha = mask_origin.uses_alpha_channel
+    if mask_origin.path is None:
+        return mask_origin, alpha_channel_mask if mask_origin.uses_alpha_channel else None
+    stored = open_masks(mask_origin.path, invert=inputs.invert_masks)
     row = associate_masks(stored, source)
-    return choice, lambda frame, size_px: stored.alpha(row(frame.index), size_px)
+    return mask_origin, lambda frame, size_px: stored.alpha(row(frame.index), size_px)
 
 
-def _unread_live_parts(wanted: CaptureInputs) -> Iterator[str]:
-    """Name poses and masks that lie in a live source's folder, where nobody reads them."""
-    if wanted.is_live and wanted.video.is_dir():
-        own = (find_own_poses(wanted.video), find_own_masks(wanted.video))
+def _unread_live_parts(inputs: CaptureInputs) -> Iterator[str]:
+    """Name poses and masks that lie in a live source's folder, and are not read."""
+    if inputs.is_live and inputs.video.is_dir():
+        own = (find_own_poses(inputs.video), find_own_masks(inputs.video))
         for path in filter(None, own):
             yield f"{path} is not read: poses and masks of a live source are tracked."
 
 
-def _open_stream_source(wanted: CaptureInputs, pace: PacingClock) -> FrameSource:
-    if wanted.is_live:
-        camera = camera_address(wanted.video)
-        return open_live_source(wanted.video, camera, wanted.frames, pace, idle_s=wanted.idle_s)
-    return RealtimePlayback(open_source(wanted.video, frames=wanted.frames), pace)
+def _open_stream_source(inputs: CaptureInputs, pace: PacingClock) -> FrameSource:
+    if inputs.is_live:
+        camera = camera_address(inputs.video)
+        return open_live_source(inputs.video, camera, inputs.frames, pace, idle_s=inputs.idle_s)
+    return RealtimePlayback(open_source(inputs.video, frames=inputs.frames), pace)
