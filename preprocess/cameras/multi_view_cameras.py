@@ -120,7 +120,7 @@ def _read_easymocap(folder: Path) -> dict[str, StudioCamera]:
             matrices[name] = np.array(numbers).reshape(int(rows), int(columns))
         for name, number in IMAGE_SIZE_PATTERN.findall(text):
             matrices[name] = np.array([[float(number)]])
-    cameras = {}
+    cameras: dict[str, StudioCamera] = {}
     for name in (key.removeprefix("K_") for key in matrices if key.startswith("K_")):
         camera = {
             part: matrices[f"{prefix}_{name}"]
@@ -137,7 +137,8 @@ def _read_easymocap(folder: Path) -> dict[str, StudioCamera]:
 def _read_zju(path: Path) -> dict[str, StudioCamera]:
     """All cameras of an annots.npy, named like the folders of their images."""
     content = read_untrusted_file(path)
-    cams, cameras = content["cams"], {}
+    cams = content["cams"]
+    cameras: dict[str, StudioCamera] = {}
     for row, image in enumerate(content["ims"][0]["ims"]):
         camera = {key: np.array(cams[key][row], dtype=np.float64, ndmin=2) for key in "KDRT"}
         cameras[PurePosixPath(str(image)).parent.name] = {**camera, "T": camera["T"] / MM_PER_M}
