@@ -86,7 +86,10 @@ class RadianceField:
         levels: The grid's levels.
         table: Entries of the grid.
         layers: Weights and biases of both layers.
+        is_frozen: Whether `backward` leaves out the parameters' gradients.
     """
+
+    is_frozen = False
 
     def __init__(self, levels: HashLevels, generator: torch.Generator) -> None:
         """Draws the initial parameters from `generator`."""
@@ -118,6 +121,12 @@ class RadianceField:
             parameter.grad = torch.zeros_like(parameter)
         return other
 
+    def frozen(self) -> "RadianceField":
+        """The same field, without gradients of its parameters."""
+        other = copy.copy(self)
+        other.is_frozen = True
+        return other
+
     def parameters(self) -> list[torch.nn.Parameter]:
         """The table, then weights and biases of both layers."""
         return [self.table, *self.layers]
@@ -141,7 +150,7 @@ class RadianceField:
     def backward(
         self, activations: Activations, grad_raw: Float32[Tensor, "points 4"]
     ) -> Float32[Tensor, "points width"]:
-        """Writes the gradient of every parameter (the table's is added to what is there).
+        """Writes the gradient of every parameter (the table's is added), unless it is frozen.
 
         Returns:
             The gradient of the grid's features.
@@ -149,6 +158,9 @@ class RadianceField:
         first, _, second, _ = self.layers
         padded = _linear(_padded(grad_raw), second.T)
         grad_hidden = padded[: len(grad_raw)].mul_(activations.hidden.sign())
+        grad_features = _linear(padded, first.T)[: len(grad_raw)]
+        if self.is_frozen:
+            return grad_features
         grads = (
             activations.features.T @ grad_hidden, grad_hidden.sum(dim=0),
             (grad_raw.T @ activations.hidden).T, grad_raw.sum(dim=0),
@@ -156,7 +168,6 @@ class RadianceField:
         for parameter, grad in zip(self.layers, grads, strict=True):
             assert parameter.grad is not None, "a gradient is overwritten, never taken away"
             parameter.grad.copy_(grad)
-        grad_features = _linear(padded, first.T)[: len(grad_raw)]
         operations.encode_backward(activations.points, grad_features, self.levels, self.table_grad)
         return grad_features
 

@@ -44,8 +44,6 @@ def fit_test_poses(
     The avatar is frozen; only poses and exposures are optimized, starting from those of neighboring
     frames. Each correction follows some of the frame's rays, so that even an exact pose moves a
     little; the given pose, or exposure, is kept where it scores higher on a sample of the pixels.
-
-    The gradients of the avatar's field are overwritten.
     """
     if not frames:
         return
@@ -76,7 +74,7 @@ def _fit_frames(
     progress: Callable[[float], None],
 ) -> None:
     """Fits poses and exposures to the frames of `replay`."""
-    avatar, field = trainer.avatar, trainer.avatar.field
+    avatar = replace(trainer.avatar, field=trainer.avatar.field.frozen())
     at_once = min(2, len(replay))
     config = dataclasses.replace(
         trainer.config,
@@ -97,7 +95,6 @@ def _fit_frames(
             avatar, sampler, replay.correspondences, exposures.neutralize(batch), config,
             hard_surface_share=1.0, poses=poses, generator=generator,
         )  # fmt: skip
-        field.table_grad.zero_()
         if config.estimate_exposures:
             exposures.observe(batch, result.rendered)
         for _ in range(at_once):
