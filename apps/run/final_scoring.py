@@ -1,9 +1,9 @@
 """Scores after the last step: held-out frames of this video, and of those before it.
 
-Whole images are scored as long as time allows. The scores of the other frames are estimates from
-4,096 of their pixels, without SSIM: they cost a tenth, and all frames in part tell more about the
-mean than a few of them in whole. Scores of earlier videos measure forgetting; key frames of theirs
-are replayed against it.
+A few whole images are scored, as long as time allows. The scores of the other frames are estimates
+from 4,096 of their pixels, without SSIM: they cost a sixth, and all frames in part tell more about
+the mean than a few of them in whole. Scores of earlier videos measure forgetting; key frames of
+theirs are replayed against it.
 """
 
 import math
@@ -53,6 +53,10 @@ WHOLE_IMAGES_SHARE = 0.2
 """Share of that time after which frames in given poses are no longer scored as whole images."""
 MIN_WHOLE_IMAGES = 3
 """Frames that are scored as whole images, whatever it takes."""
+MAX_WHOLE_IMAGES = 12
+"""Frames that are scored as whole images, at most."""
+UNFILMED_REDUCTION = 2
+"""Factor by which pictures of views that were not filmed are reduced."""
 FRAMES_PER_FIT = 6
 """Frames whose poses are fitted together; no more are fitted once the time is up."""
 KEPT_RENDERINGS = 6
@@ -151,8 +155,8 @@ def score_finally(
 ) -> FinalScores:
     """Scores the held-out frames in about `SCORING_LIMIT_S`.
 
-    After a given number of steps all are scored as whole images, whatever the time: the results
-    of such a run do not depend on the machine.
+    After a given number of steps all are scored, whatever the time: the results of such a run do
+    not depend on the machine.
 
     Args:
         trainer: After its last step.
@@ -180,7 +184,9 @@ def score_finally(
         sampled=tuple(scored[i].sampled for i in order),
         fitted=tuple(sorted(fitted, key=lambda score: score.frame)),
         renderings={one.given.frame: one.rendering for one in shown if one.rendering is not None},
-        half_transparent=half_transparent_share(render_unfilmed_views(trainer.avatar)),
+        half_transparent=half_transparent_share(
+            render_unfilmed_views(trainer.avatar, reduction=UNFILMED_REDUCTION)
+        ),
     )
 
 
@@ -189,7 +195,8 @@ def _score_in_given_poses(
 ) -> Iterator[_ScoredFrame]:
     """Scores frames in an order of which every prefix is spread over the video."""
     for count, frame in enumerate(coarse_to_fine_order(held_out)):
-        if count >= MIN_WHOLE_IMAGES and time.perf_counter() > whole_until:
+        late = count >= MIN_WHOLE_IMAGES and time.perf_counter() > whole_until
+        if late or count >= MAX_WHOLE_IMAGES:
             sampled = PixelSample.of(frame).score(avatar)
             yield _ScoredFrame(frame, score_fine_sample(avatar, frame), sampled, None)
             continue
