@@ -1,4 +1,4 @@
-"""What is said of avatars that are surely not sharp from all sides, and of some that are.
+"""Verdicts on avatars that are surely not sharp from all sides, and on some that are.
 
     python -m benchmarks.verdicts [--only WORD]
 
@@ -55,7 +55,7 @@ class Film(NamedTuple):
     Attributes:
         subject: Which actor.
         end: How many frames, from the first.
-        stride: Only every so many of these.
+        stride: Step between these frames.
         tracker_error: Factor of a good tracker's errors in the given poses; None: all is exact.
     """
 
