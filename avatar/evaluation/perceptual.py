@@ -94,11 +94,13 @@ class Lpips:
             InputError: If a file holds no such weights.
         """
         folder = Path(torch.hub.get_dir()) / "checkpoints" if folder is None else folder
-        networks = [LPIPS_CONVENTIONS[name].network for name in wanted]
+        networks: list[LpipsNetwork] = [LPIPS_CONVENTIONS[name].network for name in wanted]
         files: dict[LpipsNetwork, Path] = {
             network: folder / Path(WEIGHT_URLS[network]).name for network in networks
         }
-        missing = [network for network, file in files.items() if not file.is_file()]
+        missing: list[LpipsNetwork] = [
+            network for network, file in files.items() if not file.is_file()
+        ]
         self._networks: dict[LpipsNetwork, Any] = {}
         self.unavailable = None
         if missing:
