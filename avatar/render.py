@@ -46,31 +46,19 @@ EMPTY_LOG_DENSITY = -30.0
 """Log density (log 1/m) of a sample that counts as empty."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class BodyFrameRays:
-    """Rays of one camera in the body frame of one pose.
-
-    Attributes:
-        origin: Common origin, metres.
-        directions: Unit directions.
-    """
-
-    origin: Float32[np.ndarray, "3"]
-    directions: Float32[np.ndarray, "rays 3"]
-
-    @classmethod
-    def through(
-        cls,
-        pixels: Float[np.ndarray, "rays 2"],
-        camera: Camera,
-        world_from_body: Float[np.ndarray, "4 4"],
-    ) -> "BodyFrameRays":
-        """Rays through image points, px, with the camera moved into the body frame."""
-        rotation, translation = world_from_body[:3, :3], world_from_body[:3, 3]
-        return cls(
-            origin=((camera.center_world - translation) @ rotation).astype(np.float32),
-            directions=(camera.ray_directions(pixels) @ rotation).astype(np.float32),
-        )
+def body_frame_rays(
+    pixels: Float[np.ndarray, "rays 2"], camera: Camera, world_from_body: Float[np.ndarray, "4 4"]
+) -> RayBatch:
+    """Rays through image points, px, in the body frame; samples lie in mid-step."""
+    rotation, translation = world_from_body[:3, :3], world_from_body[:3, 3]
+    origin = ((camera.center_world - translation) @ rotation).astype(np.float32)
+    directions = (camera.ray_directions(pixels) @ rotation).astype(np.float32)
+    return RayBatch(
+        origins=torch.from_numpy(origin).expand(len(pixels), 3).contiguous(),
+        directions=torch.from_numpy(directions),
+        slots=torch.zeros(len(pixels), dtype=torch.int32),
+        jitter=torch.full((len(pixels),), 0.5),
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -127,11 +115,11 @@ class PosedAvatar:
     def colors_at(self, pixels: Float[np.ndarray, "pixels 2"]) -> Float32[np.ndarray, "pixels 4"]:
         """Premultiplied RGBA in [0, 1] at image points, px."""
         field = self.avatar.field
-        rays = BodyFrameRays.through(pixels, self.camera, self.world_from_body)
+        rays = body_frame_rays(pixels, self.camera, self.world_from_body)
         shading = self.avatar.shading
         shading = shading if self.shaded and not shading.is_neutral else None
         colors, normals = trace_rays(
-            field, ray_batch(rays), self.tables, grid=self.grid,
+            field, rays, self.tables, grid=self.grid,
             check=self.check, sample_step_m=self.avatar.sample_step_m, shading=shading,
         )  # fmt: skip
         if shading is not None:
@@ -219,18 +207,6 @@ def trace_rays(
         rays = RayBatch(rays.origins[on], rays.directions[on], rays.slots[on], jitter[on])
         alive = alive[on]
     return colors, normals
-
-
-def ray_batch(rays: BodyFrameRays) -> RayBatch:
-    """Rays of one frame with samples in the middle of their steps."""
-    directions = torch.from_numpy(rays.directions)
-    count = len(directions)
-    return RayBatch(
-        torch.from_numpy(rays.origin).expand(count, 3).contiguous(),
-        directions,
-        torch.zeros(count, dtype=torch.int32),
-        torch.full((count,), 0.5),
-    )
 
 
 def correspondence_tables(cells: CorrespondenceGrid) -> CorrespondenceTables:

@@ -99,7 +99,7 @@ def _fit_frames(
             exposures.observe(batch, result.rendered)
         for _ in range(at_once):
             rate = cosine_decay(step / steps)
-            correct_one_pose(avatar.rig, replay, poses, rate=rate)
+            correct_one_pose(replay, poses, rate=rate)
         progress(FITTING_SHARE * (step + 1) / steps)
 
 
@@ -122,5 +122,5 @@ def _with_neighboring_corrections(
         begin = interpolate_correction(prepared.index, trainer.pose_corrections)
         poses.set_pose(slot, prepared.pose, correction=begin)
         if begin.any():
-            resolve_correspondences(rig, replay, poses, slot)
+            resolve_correspondences(replay, poses, slot)
     return replay, poses

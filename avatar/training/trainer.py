@@ -187,7 +187,7 @@ class Trainer:
         step = 0 if is_restored else self.steps
         self.poses.set_pose(slot, frame.pose, correction=known, frame=frame.index, step=step)
         if known is not None:
-            resolve_correspondences(self.avatar.rig, self.replay, self.poses, slot)
+            resolve_correspondences(self.replay, self.poses, slot)
         self.frames_seen += not is_restored
         if not is_restored:
             self._discard_old_corrections()
@@ -204,7 +204,7 @@ class Trainer:
         slot, rig = self.replay.frame_indices.index(frame), self.avatar.rig
         self.replay.set_pose(slot, pose, rig)
         far = self.poses.replace_pose(slot, pose, frame=frame, step=self.steps)
-        move_correspondences(rig, self.replay, self.poses, slot, far=far)
+        move_correspondences(self.replay, self.poses, slot, far=far)
 
     @contextmanager
     def paused(self) -> Iterator[None]:
@@ -283,7 +283,7 @@ class Trainer:
 
     def _correct_poses(self, rate: float) -> None:
         for _ in range(CORRECTIONS_PER_STEP):
-            slot = correct_one_pose(self.avatar.rig, self.replay, self.poses, rate=rate)
+            slot = correct_one_pose(self.replay, self.poses, rate=rate)
             if slot is not None:
                 correction = self.poses.corrections[slot].copy()
                 self.pose_corrections[self.replay.frame_indices[slot]] = correction
@@ -301,18 +301,14 @@ class Trainer:
         )
 
 
-def resolve_correspondences(
-    rig: Rig, replay: ReplayBuffer, poses: PoseOptimizer, slot: int
-) -> None:
+def resolve_correspondences(replay: ReplayBuffer, poses: PoseOptimizer, slot: int) -> None:
     """Solves a frame's correspondence grid again and moves its rays to its corrected pose."""
     joints = poses.pose(slot).joint_rotations
-    replay.set_correspondences(slot, CorrespondenceGrid.solve(rig, joints))
+    replay.set_correspondences(slot, CorrespondenceGrid.solve(poses.rig, joints))
     replay.correct_root(slot, poses.root_correction(slot))
 
 
-def correct_one_pose(
-    rig: Rig, replay: ReplayBuffer, poses: PoseOptimizer, *, rate: float
-) -> int | None:
+def correct_one_pose(replay: ReplayBuffer, poses: PoseOptimizer, *, rate: float) -> int | None:
     """Corrects one pose by a step times `rate`; its frame's correspondences and rays follow.
 
     Returns:
@@ -321,21 +317,16 @@ def correct_one_pose(
     slot = poses.correct_next(rate=rate)
     if slot is not None:
         far = poses.needs_resolve(slot)
-        move_correspondences(rig, replay, poses, slot, far=far)
+        move_correspondences(replay, poses, slot, far=far)
     return slot
 
 
 def move_correspondences(
-    rig: Rig,
-    replay: ReplayBuffer,
-    poses: PoseOptimizer,
-    slot: int,
-    *,
-    far: bool,
+    replay: ReplayBuffer, poses: PoseOptimizer, slot: int, *, far: bool
 ) -> None:
     """Lets a frame's correspondences and rays follow its pose; far poses are solved again."""
     if far:
-        resolve_correspondences(rig, replay, poses, slot)
+        resolve_correspondences(replay, poses, slot)
         return
     operations.update_roots(replay.correspondences, slot, poses.skinning, poses.bones[slot])
     replay.correct_root(slot, poses.root_correction(slot))

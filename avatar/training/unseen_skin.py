@@ -137,6 +137,7 @@ class UnseenSkin:
 
     Attributes:
         evidence: What frames have shown.
+        sources: Sources of all patches, as of the last update.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -157,7 +158,7 @@ class UnseenSkin:
         shape = (len(rig.seeds), len(rig.seeds))
         self._neighbors = coo_array((np.ones(len(links[0])), links), shape=shape).tocsr()
         self._neighbor_counts = self._neighbors.sum(axis=1) + 1.0
-        self._sources: Sources | None = None
+        self.sources: Sources | None = None
         self._is_stale, self._unseen_share = True, 0.0
         self._drawn_from = self._cells[:0]
 
@@ -172,23 +173,18 @@ class UnseenSkin:
             return
         found = find_sources(self._rig, self._frames, self.evidence.seen, self._middle_x)
         around = (self._neighbors @ found.weight + found.weight) / self._neighbor_counts
-        self._sources = found._replace(weight=(found.weight * around).astype(np.float32))
-        weights = self._sources.weight[self._seed_of_cell[self._cells]]
+        self.sources = found._replace(weight=(found.weight * around).astype(np.float32))
+        weights = self.sources.weight[self._seed_of_cell[self._cells]]
         drawn = self._cells[weights > MIN_WEIGHT]
         near = drawn[self._rig.skin_distance.reshape(-1)[drawn] < NEAR_SKIN_M]
         self._drawn_from = np.concatenate([drawn, *[near] * (NEAR_SKIN_FACTOR - 1)])
         self._unseen_share = len(drawn) / len(self._cells)
         self._is_stale = False
 
-    @property
-    def sources(self) -> Sources | None:
-        """Sources of all patches, as of the last update."""
-        return self._sources
-
     def sample(self, count: int, generator: torch.Generator) -> SourcePairs:
         """Random points of unseen skin with their sources: of `count` the share that is unseen."""
         count = round(count * self._unseen_share)
-        if self._sources is None or not count:
+        if self.sources is None or not count:
             return SourcePairs.none()
         drawn = torch.randint(len(self._drawn_from), (count,), generator=generator)
         within = torch.rand(count, 3, generator=generator).numpy()
@@ -197,16 +193,16 @@ class UnseenSkin:
         points = (self._rig.box_low + (corner + within) / self._rig.cells_per_m).astype(np.float32)
         there, found = self._source_points(points, self._seed_of_cell[cells])
         pairs = np.concatenate([points[found], there[found]])
-        weights = self._sources.weight[self._seed_of_cell[cells[found]]]
+        weights = self.sources.weight[self._seed_of_cell[cells[found]]]
         return SourcePairs(torch.from_numpy(pairs), torch.from_numpy(weights))
 
     def _source_points(
         self, points: Float32[np.ndarray, "points 3"], seeds: Int[np.ndarray, "points"]
     ) -> tuple[Float32[np.ndarray, "points 3"], Bool[np.ndarray, "points"]]:
         """The sources of points, and whether they lie near the skin."""
-        assert self._sources is not None
-        rig, target = self._rig, self._sources.patch[seeds]
-        normals, reflection = rig.seed_normals[seeds], self._sources.reflection[seeds]
+        assert self.sources is not None
+        rig, target = self._rig, self.sources.patch[seeds]
+        normals, reflection = rig.seed_normals[seeds], self.sources.reflection[seeds]
         heights = ((points - rig.seeds[seeds]) * normals).sum(axis=1)
         parts = rig.seed_parts[seeds]
         at = reflect(self._frames, points, parts, reflection, self._middle_x)

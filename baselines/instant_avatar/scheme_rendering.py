@@ -22,10 +22,9 @@ from avatar.render import (
     EMPTY_LOG_DENSITY,
     MAX_SAMPLES_PER_PASS,
     MIN_TRANSMITTANCE,
-    BodyFrameRays,
+    body_frame_rays,
     correspondence_tables,
     pixel_chunks,
-    ray_batch,
 )
 from baselines.instant_avatar.posed_field import PosedField
 from baselines.instant_avatar.posed_occupancy import (
@@ -109,7 +108,7 @@ def render_samples(
     width, height = camera.size_px
     picture = np.zeros((height, width, 4), dtype=np.float32)
     for part, pixels in pixel_chunks(picture, 0, 0):
-        rays = ray_batch(BodyFrameRays.through(pixels, camera, world_from_body))
+        rays = body_frame_rays(pixels, camera, world_from_body)
         samples = sample_rays(rays, tables)
         colors = _composite_samples(avatar.field, samples, sample_step_m=avatar.sample_step_m)
         part[:] = colors.numpy().reshape(part.shape)

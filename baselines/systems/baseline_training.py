@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Float32, Int64
 from torch import Tensor, nn
 
-from avatar.render import BodyFrameRays, pixel_chunks
+from avatar.render import body_frame_rays, pixel_chunks
 from avatar.training.frame_stream import TrainingFrame
 from avatar.training.replay_buffer import NEAR_PERSON_RAY_SHARE
 from avatar.training.trainer import UncompiledAdam, cosine_decay
@@ -116,9 +116,11 @@ class BaselineSystem:
         picture = np.zeros((height, width, 4), dtype=np.float32)
         rows, columns = _seen_part(cells, camera, world_from_body)
         for part, pixels in pixel_chunks(picture[rows, columns], rows.start, columns.start):
-            found = BodyFrameRays.through(pixels, camera, world_from_body)
-            directions = torch.from_numpy(found.directions).split(RENDERED_RAYS)
-            colors = [self._render_part(cells, found.origin, some).numpy() for some in directions]
+            rays = body_frame_rays(pixels, camera, world_from_body)
+            parts = zip(
+                rays.origins.split(RENDERED_RAYS), rays.directions.split(RENDERED_RAYS), strict=True
+            )
+            colors = [self._render_part(cells, *some).numpy() for some in parts]
             part[:] = np.concatenate(colors).reshape(part.shape)
         self._set_training(True)
         return picture
@@ -126,12 +128,12 @@ class BaselineSystem:
     def _render_part(
         self,
         cells: OccupiedCells,
-        origin: Float32[np.ndarray, "3"],
+        origins: Float32[Tensor, "rays 3"],
         directions: Float32[Tensor, "rays 3"],
     ) -> Float32[Tensor, "rays 4"]:
         count, settings = len(directions), self._settings
         bodies = torch.zeros(count, dtype=torch.int64)
-        rays = BodyRays(torch.from_numpy(origin).expand(count, 3), directions, bodies)
+        rays = BodyRays(origins, directions, bodies)
         return render_rays(
             self.field, cells, rays, samples=settings.samples, fine_samples=settings.fine_samples,
             jitters=False,

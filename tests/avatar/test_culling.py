@@ -17,20 +17,13 @@ from avatar.correspondence_grid import (
 )
 from avatar.kernels import operations
 from avatar.kernels.operands import MAX_LOG_DENSITY, MarchSettings, RayBatch
-from avatar.render import EMPTY_LOG_DENSITY, BodyFrameRays, correspondence_tables, render
+from avatar.render import EMPTY_LOG_DENSITY, body_frame_rays, correspondence_tables, render
 from baselines import torch_reference
 from capture.camera import Camera
 
 
 def rays_of(camera: Camera, world_from_body: np.ndarray) -> RayBatch:
-    pixels = camera.pixel_centers().reshape(-1, 2)
-    rays = BodyFrameRays.through(pixels, camera, world_from_body)
-    return RayBatch(
-        torch.from_numpy(rays.origin).expand(len(pixels), 3).contiguous(),
-        torch.from_numpy(rays.directions),
-        torch.zeros(len(pixels), dtype=torch.int32),
-        torch.full((len(pixels),), 0.5),
-    )
+    return body_frame_rays(camera.pixel_centers().reshape(-1, 2), camera, world_from_body)
 
 
 def lattice_samples(avatar: Avatar, pose, camera, cells: CorrespondenceGrid):

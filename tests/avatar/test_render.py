@@ -12,8 +12,8 @@ from avatar import render as render_module
 from avatar.config import TrainConfig
 from avatar.correspondence_grid import CorrespondenceCheck
 from avatar.kernels import operations
-from avatar.kernels.operands import MarchSettings, RayBatch
-from avatar.render import MIN_TRANSMITTANCE, BodyFrameRays, correspondence_tables, render
+from avatar.kernels.operands import MarchSettings
+from avatar.render import MIN_TRANSMITTANCE, body_frame_rays, correspondence_tables, render
 from avatar.training.trainer import Trainer
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
@@ -74,13 +74,7 @@ def test_a_fog_is_as_opaque_as_its_length_says(rig, shot):
     got = render(avatar, pose, camera)
     cells = render_module.CorrespondenceGrid.solve(rig, pose.joint_rotations)
     pixels = camera.pixel_centers().reshape(-1, 2)
-    rays = BodyFrameRays.through(pixels, camera, rig.world_from_body(pose))
-    batch = RayBatch(
-        torch.from_numpy(rays.origin).expand(len(pixels), 3).contiguous(),
-        torch.from_numpy(rays.directions),
-        torch.zeros(len(pixels), dtype=torch.int32),
-        torch.full((len(pixels),), 0.5),
-    )
+    batch = body_frame_rays(pixels, camera, rig.world_from_body(pose))
     how = MarchSettings(config.sample_step_m, np.inf, 512)
     tables = correspondence_tables(cells)
     samples = operations.march(batch, tables, avatar.rendering_grid(), how)
