@@ -65,21 +65,16 @@ class CorrespondenceGrid:
         joint_rotations: Float[np.ndarray, "23 3"],
         *,
         band_m: float = CLOTHING_BAND_M,
-        cell_m: float = CORRESPONDENCE_CELL_M,
     ) -> "CorrespondenceGrid":
-        """Solves the correspondences of one pose.
+        """Solves the correspondences of one pose, of which the root plays no part.
 
-        Args:
-            rig: Rig of the person.
-            joint_rotations: Axis-angle rotations of joints 1 to 23; the root plays no part.
-            band_m: Distance from the skin that is covered, metres; at most to the rig's box.
-            cell_m: Edge of a cell, metres.
+        Up to `band_m` metres from the skin are covered, at most up to the rig's box.
         """
         bones = rig.body_from_canonical(joint_rotations)[:, :3].reshape(24, 12)
         low, packed_cells, roots = operations.solve_correspondences(
-            rig, bones.astype(np.float32), band_m, cell_m
+            rig, bones.astype(np.float32), band_m, CORRESPONDENCE_CELL_M
         )
-        return cls(low=low, cell_m=cell_m, packed_cells=packed_cells, roots=roots)
+        return cls(low=low, cell_m=CORRESPONDENCE_CELL_M, packed_cells=packed_cells, roots=roots)
 
 
 MIN_DEPTH_M = 0.05

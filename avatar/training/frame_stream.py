@@ -143,9 +143,9 @@ class KeyframeSelector:
     it teaches, and take the time from training.
     """
 
-    def __init__(self, rig: Rig, *, initial_keyframes: int = INITIAL_KEYFRAMES) -> None:
-        """Starts without keyframes; the first `initial_keyframes` frames are all accepted."""
-        self._rig, self._initial_left = rig, initial_keyframes
+    def __init__(self, rig: Rig) -> None:
+        """Starts without keyframes; the first `INITIAL_KEYFRAMES` frames are all accepted."""
+        self._rig, self._initial_left = rig, INITIAL_KEYFRAMES
         self._last: tuple[float, Float[np.ndarray, " 72"]] | None = None
 
     def accepts(self, observation: Observation) -> bool:
@@ -208,14 +208,9 @@ def separate_held_out(
             yield item
 
 
-def prepare_items(
-    items: Iterable[SplitItem], rig: Rig, *, initial_keyframes: int = INITIAL_KEYFRAMES
-) -> Iterator[StreamItem]:
-    """Prepares the observations to train on, one item for each of `separate_held_out`.
-
-    After `initial_keyframes` frames redundant ones are passed over.
-    """
-    selector = KeyframeSelector(rig, initial_keyframes=initial_keyframes)
+def prepare_items(items: Iterable[SplitItem], rig: Rig) -> Iterator[StreamItem]:
+    """Prepares the keyframes to train on, one item for each of `separate_held_out`."""
+    selector = KeyframeSelector(rig)
     for item in items:
         if not isinstance(item, Observation):
             yield item
@@ -226,13 +221,7 @@ def prepare_items(
 
 
 def prepare_stream(
-    observations: Iterable[Observation | DroppedFrame],
-    rig: Rig,
-    *,
-    stride: int,
-    total: int | None,
-    initial_keyframes: int = INITIAL_KEYFRAMES,
+    observations: Iterable[Observation | DroppedFrame], rig: Rig, *, stride: int, total: int | None
 ) -> Iterator[StreamItem]:
     """Separates held-out frames and prepares the others (`separate_held_out`, `prepare_items`)."""
-    split = separate_held_out(observations, stride=stride, total=total)
-    return prepare_items(split, rig, initial_keyframes=initial_keyframes)
+    return prepare_items(separate_held_out(observations, stride=stride, total=total), rig)

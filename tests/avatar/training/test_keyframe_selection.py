@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from avatar.evaluation.held_out import HeldOutFrame
+from avatar.training import frame_stream
 from avatar.training.frame_stream import (
     JOINT_ANGLE_WEIGHT,
     MAX_KEYFRAME_INTERVAL_S,
@@ -17,6 +18,11 @@ from avatar.training.frame_stream import (
     view_descriptor,
 )
 from preprocess.body.body_pose import BodyPose
+
+
+@pytest.fixture(autouse=True)
+def no_frame_for_free(monkeypatch):
+    monkeypatch.setattr(frame_stream, "INITIAL_KEYFRAMES", 0)
 
 
 def turned(observation, index, *, angle=0.0, bend=0.0, time_s=None):
@@ -49,7 +55,7 @@ def test_distance_is_the_angle_of_the_view_and_a_share_of_the_joints():
 @pytest.mark.parametrize("what", ["angle", "bend"])
 def test_of_a_slow_motion_the_frames_are_taken_that_are_far_enough_apart(rig, clip, what):
     distinct, step = (
-        KeyframeSelector(rig, initial_keyframes=0),
+        KeyframeSelector(rig),
         0.3 * MIN_KEYFRAME_DISTANCE / (1.0 if what == "angle" else JOINT_ANGLE_WEIGHT),
     )
     stream = [turned(clip.observations[0], i, **{what: i * step}) for i in range(13)]
@@ -57,8 +63,9 @@ def test_of_a_slow_motion_the_frames_are_taken_that_are_far_enough_apart(rig, cl
     assert taken == [0, 4, 8, 12]
 
 
-def test_as_long_as_there_is_room_every_frame_is_taken(rig, clip):
-    distinct = KeyframeSelector(rig, initial_keyframes=4)
+def test_as_long_as_there_is_room_every_frame_is_taken(rig, clip, monkeypatch):
+    monkeypatch.setattr(frame_stream, "INITIAL_KEYFRAMES", 4)
+    distinct = KeyframeSelector(rig)
     stream = [
         turned(clip.observations[0], i, angle=1e-3 * MIN_KEYFRAME_DISTANCE * i) for i in range(9)
     ]
@@ -66,7 +73,7 @@ def test_as_long_as_there_is_room_every_frame_is_taken(rig, clip):
 
 
 def test_who_stands_still_is_looked_at_now_and_then(rig, clip):
-    distinct, times = KeyframeSelector(rig, initial_keyframes=0), np.arange(0.0, 2.01, 0.1)
+    distinct, times = KeyframeSelector(rig), np.arange(0.0, 2.01, 0.1)
     stream = [turned(clip.observations[0], i, time_s=t) for i, t in enumerate(times)]
     taken = [
         t for t, observation in zip(times, stream, strict=True) if distinct.accepts(observation)
@@ -83,8 +90,5 @@ def test_frames_that_are_passed_over_go_by_in_their_order(rig, clip):
         2.1 * MIN_KEYFRAME_DISTANCE,
     ]
     stream = [turned(clip.observations[0], i, angle=a) for i, a in enumerate(angles)]
-    kinds = [
-        type(item)
-        for item in prepare_stream(iter(stream), rig, stride=3, total=None, initial_keyframes=0)
-    ]
+    kinds = [type(item) for item in prepare_stream(iter(stream), rig, stride=3, total=None)]
     assert kinds == [TrainingFrame, RedundantFrame, HeldOutFrame, TrainingFrame, RedundantFrame]
