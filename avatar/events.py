@@ -6,12 +6,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, kw_only=True)
 class FrameArrived:
-    """A frame has reached the trainer.
-
-    Attributes:
-        index: Index of the frame in its source.
-        held_out: Whether it is scored instead of trained on.
-    """
+    """A frame has reached the trainer, by its index in the source; held out, it is only scored."""
 
     index: int
     held_out: bool
@@ -65,13 +60,7 @@ class HeldOutScore:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluated:
-    """The held-out frames that have arrived so far have been scored.
-
-    Attributes:
-        wall_seconds, cpu_seconds: Training time so far.
-        frames_seen: Frames trained on so far.
-        scores: Score of each frame.
-    """
+    """The held-out frames that have arrived so far have been scored, after so much training."""
 
     wall_seconds: float
     cpu_seconds: float
@@ -88,12 +77,7 @@ class Warned:
 
 @dataclass(frozen=True, kw_only=True)
 class Finished:
-    """The last step has been made.
-
-    Attributes:
-        wall_seconds, cpu_seconds: Training time.
-        steps, rays, samples: Total numbers of steps, rays and samples.
-    """
+    """The last step has been made; numbers are totals of the training."""
 
     wall_seconds: float
     cpu_seconds: float

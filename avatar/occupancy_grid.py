@@ -59,14 +59,11 @@ class OccupancyGrid:
         )
         self.band_cells: Int64[Tensor, " band"] = band.flatten().nonzero()[:, 0]
         self._in_band = band.to(torch.uint8)
-        self._interior_cells = torch.from_numpy(
-            rig.inside_skin & (rig.skin_distance > INTERIOR_DEPTH_M)
-        )
-        self._interior_cells = self._interior_cells.flatten().nonzero()[:, 0]
-        centers = np.stack(np.unravel_index(self._interior_cells.numpy(), band.shape), axis=1) + 0.5
-        weights = rig.weights_at(rig.box_low + centers / rig.cells_per_m)
-        in_head = torch.from_numpy(weights[:, HEAD_JOINT] > 0.5)
-        self._head_cells = self._interior_cells[in_head]
+        interior = np.argwhere(rig.inside_skin & (rig.skin_distance > INTERIOR_DEPTH_M))
+        weights = rig.weights_at(rig.box_low + (interior + 0.5) / rig.cells_per_m)
+        flat = np.ravel_multi_index(tuple(interior.T), band.shape)
+        self._interior_cells = torch.from_numpy(flat)
+        self._head_cells = torch.from_numpy(flat[weights[:, HEAD_JOINT] > 0.5])
         off_skin = torch.from_numpy(~rig.inside_skin & (rig.skin_distance > OFF_SKIN_M))
         self._off_skin_cells = (band & off_skin).flatten().nonzero()[:, 0]
         self._near_skin = rig.skin_distance <= NEAR_SKIN_M

@@ -1,6 +1,7 @@
 """Online training: compiles the kernels, then trains an avatar while frames arrive."""
 
 import dataclasses
+import itertools
 import time
 from collections.abc import Iterator
 from typing import final
@@ -300,14 +301,8 @@ class _EvaluationSchedule:
 
 
 def _evaluation_times(*, after: float) -> Iterator[float]:
-    for mark in EVALUATION_TIMES_S:
-        if mark > after:
-            yield mark
-    mark = EVALUATION_TIMES_S[-1] + 30.0
-    while True:
-        if mark > after:
-            yield mark
-        mark += 30.0
+    later = itertools.count(EVALUATION_TIMES_S[-1] + 30.0, 30.0)
+    return (mark for mark in itertools.chain(EVALUATION_TIMES_S, later) if mark > after)
 
 
 WARMUP_IMAGE_PX = 16
