@@ -264,7 +264,7 @@ def _to_plain(value: Any) -> Any:
         return torch.from_numpy(np.ascontiguousarray(value))
     name = type(value).__name__
     if name in SAVED_RECORDS:
-        fields = value._asdict() if isinstance(value, tuple) else vars(value)
+        fields = value._asdict() if hasattr(value, "_asdict") else vars(value)
         kept = {k: _to_plain(v) for k, v in fields.items() if not isinstance(v, frozenset)}
         return {"record": name} | kept
     return [_to_plain(part) for part in value] if isinstance(value, tuple | list) else value
