@@ -60,7 +60,7 @@ class HeldOutScore:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluated:
-    """The held-out frames that have arrived so far have been scored, after so much training."""
+    """The held-out frames that have arrived so far have been scored, at a point of the training."""
 
     wall_seconds: float
     cpu_seconds: float
