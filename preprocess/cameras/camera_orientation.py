@@ -34,8 +34,9 @@ def read_upright_cameras(path: Path, source: FrameSource) -> CameraTrack:
         track = _read(path, source, source.size_px)
         upside_down = source.quarter_turns == 2 and source.path.is_dir()
         return _rotate(track, path, source) if upside_down and is_colmap_model(path) else track
+    width, height = source.size_px
     try:
-        stored = _read(path, source, source.size_px[::-1])
+        stored = _read(path, source, (height, width))
     except InputError:
         return _read(path, source, source.size_px)
     try:

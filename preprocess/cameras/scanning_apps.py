@@ -134,7 +134,7 @@ def _read_record3d(content: dict[str, Any]) -> list[NamedCamera]:
         raise ValueError(f"`poses` have the shape {poses.shape}; expected (N, 7)")
     k = np.array(content["K"], dtype=np.float64).reshape(3, 3).T
     lenses = np.tile([k[0, 0], k[1, 1], k[0, 2], k[1, 2]], (len(poses), 1))
-    own = content.get("perFrameIntrinsicCoeffs")
+    own = content.get("perFrameIntrinsicCoeffs", [])
     if np.shape(own) == lenses.shape and np.min(own) > 0.0:
         lenses = np.array(own, dtype=np.float64)
     named = []
