@@ -13,20 +13,18 @@ from apps.cli.shared_options import capture_name, format_frame_range, option_wor
 from capture.camera import same_aspect_ratio
 from capture.input_error import InputError
 from capture.live_sources import camera_address
-from preprocess.alignment.capture_evidence import edge_contrast, sample_video
 from preprocess.alignment.capture_geometry import CaptureGeometry, sanity_warnings
 from preprocess.alignment.correction_search import (
-    MIN_IOU_GAIN,
+    MIN_GAIN,
+    CaptureObjective,
     CorrectionResult,
     find_corrections,
-    needs_video_correction,
 )
 from preprocess.alignment.corrections import undo_pose_delay
-from preprocess.alignment.edge_objective import (
-    MAX_DECODED_FRAMES,
-    SAMPLED_IMAGES,
-    EdgeObjective,
-    sample_images,
+from preprocess.alignment.keypoint_objective import (
+    KeypointObjective,
+    TrackedImage,
+    track_images,
 )
 from preprocess.alignment.silhouette_objective import (
     GOOD_IOU,
@@ -46,10 +44,9 @@ from preprocess.poses.plausibility import implausibility_reason
 
 QUICK_FRAMES = 8
 """Frames checked before a run starts."""
-QUICK_FILM_FRAMES = 96
-"""Frames at the start of the video from which its checked images are taken."""
-GOOD_EDGE_RATIO = 2.0
-"""Least ratio of edge strength across and beside the body's outline where poses match."""
+GOOD_KEYPOINT_SCORE = 0.5
+"""Score of the key points from which poses without masks match the images: half of them are within
+4 % of the person's height."""
 NO_KNOWN_MISTAKE = (
     "No known mistake explains this. Poses or masks may belong to another video or person, or "
     "tracking may have failed. Recompute them from this video."
@@ -61,7 +58,7 @@ MIN_COVERED = 0.85
 """Share of the body that such masks cover."""
 QUICK_OFFSETS = (1, -1, 2, -2)
 """Delays of the poses, in frames, that are tested even if poses and masks match."""
-QUICK_GAIN = 0.75 * MIN_IOU_GAIN
+QUICK_GAIN = 0.75 * MIN_GAIN
 """Gain in mean IoU of such a delay that is looked into: inexact poses gain 0.01 by chance."""
 
 
@@ -72,43 +69,51 @@ class CaptureValidation:
     Attributes:
         recording: The capture.
         hypothesis: Its poses and cameras as stored.
-        sampled_masks: Masks of some frames; None without masks.
-        diagnosis: Corrections tested and found; None without masks.
+        images: Images in which the person was tracked.
+        objective: Masks of some frames and key points of some images.
+        diagnosis: Corrections tested and found.
         refusal: Why ia-ingest would refuse the capture; None if it would not.
         anomalies: Sentences about implausible numbers.
         mask_iou: Mean IoU of body and masks as ia-ingest would read them; None without masks.
-        edge_ratio: Ratio of edge strength across and beside the body's outline; None with masks, or
-            if no image can be decoded.
     """
 
     recording: Capture
     hypothesis: CaptureGeometry
-    sampled_masks: SilhouetteObjective | None
-    diagnosis: CorrectionResult | None
+    images: tuple[TrackedImage, ...]
+    objective: CaptureObjective
+    diagnosis: CorrectionResult
     refusal: str | None
     anomalies: tuple[str, ...]
     mask_iou: float | None
-    edge_ratio: float | None = None
 
     @property
     def causes(self) -> tuple[str, ...]:
         """Names of the mistakes found, most important first."""
-        cures = self.diagnosis.corrections if self.diagnosis else ()
-        return tuple(dict.fromkeys(cure.cause for cure in cures))
+        return tuple(dict.fromkeys(cure.cause for cure in self.diagnosis.corrections))
 
     @property
     def verdict(self) -> str:
         """Verdict: `good`, `warn` or `unusable`."""
         if self.refusal is not None or (self.mask_iou is not None and self.mask_iou < USABLE_IOU):
             return "unusable"
-        well = (self.mask_iou or 0.0) >= GOOD_IOU and (not self.causes or self.is_auto_corrected)
-        well |= (self.edge_ratio or 0.0) >= GOOD_EDGE_RATIO
-        return "good" if well and not self.anomalies else "warn"
+        if self.mask_iou is None:
+            well = (self.keypoint_score(self.hypothesis) or 0.0) >= GOOD_KEYPOINT_SCORE
+        else:
+            well = self.mask_iou >= GOOD_IOU
+        explained = not self.causes or self.is_auto_corrected
+        return "good" if well and explained and not self.anomalies else "warn"
+
+    @property
+    def is_usable_after_fix(self) -> bool:
+        """Whether the corrected capture can be trained on."""
+        if self.objective.masks is None:
+            return (self.keypoint_score(self.diagnosis.corrected) or 0.0) >= GOOD_KEYPOINT_SCORE
+        return self.corrected_iou >= USABLE_IOU
 
     @property
     def unexplained(self) -> str:
         """What may be wrong if no correction helps."""
-        masks = self.sampled_masks
+        masks = self.objective.masks
         if masks is None or masks.are_boxes:
             return NO_KNOWN_MISTAKE
         covered, areas = masks.excess(self.hypothesis)
@@ -127,35 +132,51 @@ class CaptureValidation:
         return self.causes == ("mask_polarity",) and masks is not None and masks.inverted
 
     @property
-    def has_film_errors(self) -> bool:
-        """Whether a mistake was found in the images alone."""
-        return any(cause.startswith("video_") for cause in self.causes)
+    def agreement(self) -> str:
+        """Sentences on how masks, key points and body agree as stored."""
+        score = self.keypoint_score(self.hypothesis)
+        if self.objective.masks is None:
+            return (
+                "There are no masks, and no person was found in the images."
+                if score is None
+                else "There are no masks (ia-ingest estimates them from poses and images). Score "
+                f"of the tracked key points: {score:.2f} (0.7 to 0.9 is usual)."
+            )
+        video = any(each.is_of_video for each in self.diagnosis.corrections)
+        but = " The masks do not match the images." if video else ""
+        return f"IoU of body and masks: {self.stored_iou:.2f}.{but}"
 
     @property
     def expected_improvement(self) -> str:
         """Sentence on the scores after correction; empty without causes."""
-        if self.diagnosis is None or not self.causes:
+        if not self.causes:
             return ""
-        scores = []
-        if not all(cause.startswith("video_") for cause in self.causes):
+        scores, of_video = [], [each.is_of_video for each in self.diagnosis.corrections]
+        if self.objective.masks is not None and not all(of_video):
             scores.append(f"IoU after correction: {self.corrected_iou:.2f}")
-        film = self.diagnosis.video
-        if self.has_film_errors and film is not None:
-            before = f" instead of {film.score_before:.2f}" if film.score_before > 0.0 else ""
-            scores.append(
-                f"Mask outlines on image edges: {film.score_after:.2f}{before} (0.5 is chance)"
-            )
+        now, after = map(self.keypoint_score, (self.hypothesis, self.diagnosis.corrected))
+        if now is not None and (any(of_video) or not scores):
+            scores.append(f"Score of the tracked key points: {after:.2f} instead of {now:.2f}")
         return f"{'. '.join(scores)}."
 
     @property
     def stored_iou(self) -> float:
         """IoU of body and masks as stored; NaN without masks."""
-        return self.diagnosis.iou_before if self.diagnosis else float("nan")
+        return self._iou(self.hypothesis)
 
     @property
     def corrected_iou(self) -> float:
         """IoU of body and masks after all corrections; NaN without masks."""
-        return self.diagnosis.iou_after if self.diagnosis else float("nan")
+        return self._iou(self.diagnosis.corrected)
+
+    def _iou(self, geometry: CaptureGeometry) -> float:
+        masks = self.objective.masks
+        return float("nan") if masks is None else mean_score(masks.frame_scores(geometry))
+
+    def keypoint_score(self, geometry: CaptureGeometry) -> float | None:
+        """How well tracked key points match the body, in [0, 1]; None if no person was found."""
+        keypoints = self.objective.keypoints
+        return None if keypoints is None else mean_score(keypoints.frame_scores(geometry))
 
 
 def check_capture(inputs: CaptureInputs) -> CaptureValidation:
@@ -170,7 +191,7 @@ def check_capture(inputs: CaptureInputs) -> CaptureValidation:
         with suppress(InputError):
             rotated = open_capture(replace(inputs, transposed=True), skip_checks=True)
             found = check_opened_capture(rotated, str(error))
-            if found.has_film_errors:
+            if any(each.is_of_video for each in found.diagnosis.corrections):
                 return found
         raise
 
@@ -188,89 +209,65 @@ def check_opened_capture(
         InputError: If a part is unreadable.
     """
     hypothesis = _stored_hypothesis(recording)
+    source, masks = recording.source, recording.masks
     refused = implausibility_reason(recording.motion) or polarity_error
     try:
         recording.check()
     except InputError as error:
         refused = refused or str(error)
-    masked = recording.masks is not None or recording.source.has_alpha
-    evidence = _sample_masks(recording) if masked else None
-    count = recording.source.frame_count or len(recording.motion)
-    selection = recording.source.selection
-    frames = [selection.start + selection.step * number for number in range(count)]
-    diagnosis = agreed = None
-    if evidence is not None:
-        diagnosis = find_corrections(hypothesis, evidence, count, _sample_film(recording, evidence))
-        agreed = mean_score(evidence.frame_scores(replace(hypothesis, masks_inverted=False)))
-    odd = mask_warnings(evidence, recording.source.size_px[1])
+    sampled = _sample_masks(recording) if masks is not None or source.has_alpha else None
+    images = track_images(source)
+    objective = CaptureObjective(
+        masks=sampled, keypoints=KeypointObjective.of(images, recording.shaped)
+    )
+    count = source.frame_count or len(recording.motion)
+    chosen = source.selection
+    frames = [chosen.start + chosen.step * number for number in range(count)]
+    diagnosis = find_corrections(
+        hypothesis, objective, recording.shaped.joints[0],
+        frames=count, mask_count=0 if masks is None else masks.count,
+    )  # fmt: skip
+    upright = replace(hypothesis, masks_inverted=False)
     return CaptureValidation(
-        recording=recording, hypothesis=hypothesis, sampled_masks=evidence, diagnosis=diagnosis,
-        refusal=refused, mask_iou=agreed, anomalies=(*sanity_warnings(hypothesis, frames), *odd),
-        edge_ratio=None if masked or refused else _edge_ratio(recording, hypothesis),
+        recording=recording, hypothesis=hypothesis, images=images, objective=objective,
+        diagnosis=diagnosis, refusal=refused,
+        mask_iou=None if sampled is None else mean_score(sampled.frame_scores(upright)),
+        anomalies=(
+            *sanity_warnings(hypothesis, frames), *mask_warnings(sampled, source.size_px[1])
+        ),
     )  # fmt: skip
 
 
 def passes_quick_check(recording: Capture) -> bool:
-    """Check a few masks and images within a few hundredths of a second.
+    """Check a few masks within a few hundredths of a second.
 
     Poses that are one or two frames late are detected as well.
     """
     if recording.live is not None or not (recording.masks or recording.source.has_alpha):
         return True  # nothing to compare with
     try:
-        evidence = _sample_masks(recording, QUICK_FRAMES)
+        masks = _sample_masks(recording, QUICK_FRAMES)
     except InputError:  # these masks are empty; reading all of them reports that
         return True
     hypothesis = replace(_stored_hypothesis(recording), masks_inverted=False)
-    now = mean_score(evidence.frame_scores(hypothesis))
+    now = mean_score(masks.frame_scores(hypothesis))
     shifts = [
-        mean_score(evidence.frame_scores(undo_pose_delay(offset).apply(hypothesis)))
+        mean_score(masks.frame_scores(undo_pose_delay(offset).apply(hypothesis)))
         for offset in QUICK_OFFSETS
     ]
-    if now < GOOD_IOU or now < max(shifts) - QUICK_GAIN:
-        return False
-    if evidence.are_boxes:
-        return True
-    film = _sample_film(recording, evidence, QUICK_FRAMES, QUICK_FILM_FRAMES)
-    count = recording.source.frame_count or 1
-    return film is None or not needs_video_correction(hypothesis, film, count)
-
-
-def _edge_ratio(recording: Capture, hypothesis: CaptureGeometry) -> float | None:
-    """Return the edge ratio along the body's outline; None if no image can be decoded."""
-    skin = SkinPoints.of(recording.shaped)
-    with suppress(InputError):
-        images = sample_video(hypothesis, skin, recording.cameras, recording.source)
-        return edge_contrast(hypothesis, skin, images)
-    return None
-
-
-def _sample_film(
-    recording: Capture,
-    evidence: SilhouetteObjective,
-    count: int = SAMPLED_IMAGES,
-    within: int = MAX_DECODED_FRAMES,
-) -> EdgeObjective | None:
-    """Sample images with all masks; None if the masks are the images' alpha."""
-    masks = recording.masks
-    if masks is None:
-        return None
-    return sample_images(
-        recording.source, mask_lookup(recording, masks, evidence.size_px), masks.count,
-        evidence.size_px, count=count, within=within,
-    )  # fmt: skip
+    return now >= GOOD_IOU and now >= max(shifts) - QUICK_GAIN
 
 
 def mask_lookup(
-    recording: Capture, masks: Masks, size_px: tuple[int, int]
-) -> Callable[[int], Float32[np.ndarray, "height width"]]:
-    """Return a function from a frame number, also beyond the video's, to its mask.
+    recording: Capture, masks: Masks
+) -> Callable[[int, tuple[int, int]], Float32[np.ndarray, "height width"]]:
+    """Return a function from a frame number, also beyond the video's, and a size to the mask.
 
     The function raises InputError where there is no such mask.
     """
     row_of = _mask_row_lookup(recording)
 
-    def alpha(number: int) -> Float32[np.ndarray, "height width"]:
+    def alpha(number: int, size_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
         row = row_of(number)
         if not 0 <= row < masks.count:
             raise InputError(f"There is no mask for frame {number} in {masks.path}.")
@@ -281,13 +278,13 @@ def mask_lookup(
 
 def _mask_row_lookup(recording: Capture) -> Callable[[int], int]:
     """Return a function from a frame number to its mask; in order if counts differ."""
+    masks = recording.masks
     try:
-        return associate_masks(recording.masks, recording.source)
+        return associate_masks(masks, recording.source)
     except InputError:
-        masks = recording.masks
         if masks is None or not same_aspect_ratio(masks.size_px, recording.source.size_px):
             raise
-        path, count = masks.path, masks.count
+        count, path = masks.count, masks.path
 
     def in_order(index: int) -> int:
         if index >= count:
@@ -347,7 +344,7 @@ def check_command(inputs: CaptureInputs, *, fix: bool = True) -> str:
 def preflight_check(
     recording: Capture, inputs: CaptureInputs, console: Console, *, force: bool
 ) -> None:
-    """Check a few masks and images; diagnose the capture only if they disagree.
+    """Check a few masks; diagnose the capture only if they and the poses disagree.
 
     Args:
         recording: The capture; live sources are not checked.
@@ -360,18 +357,14 @@ def preflight_check(
     """
     if passes_quick_check(recording):
         return
-    with console.status("poses, masks and images disagree; diagnosing"):
+    with console.status("poses and masks disagree; diagnosing"):
         found = check_opened_capture(recording)
     causes, iou = set(found.causes) - {"mask_polarity"}, found.mask_iou or 0.0
     unusable = found.verdict == "unusable"
     if not (unusable or causes or iou < GOOD_IOU):
         return
     expected = f" ({GOOD_IOU} or more expected)" if unusable else ""
-    but = " The masks do not match the images." if found.has_film_errors else ""
-    message = (
-        f"IoU of body and masks: {iou:.2f}{expected}.{but} {_explain(found)} "
-        f"{_suggest_command(found, inputs)}"
-    )
+    message = f"{found.agreement}{expected} {_explain(found)} {_suggest_command(found, inputs)}"
     if unusable and not force:
         raise InputError(f"{message} To train anyway, pass --force.")
     console.warning(message)
@@ -388,7 +381,7 @@ def correction_hint(inputs: CaptureInputs) -> str:
 
 
 def _explain(check: CaptureValidation) -> str:
-    if check.diagnosis is None or not check.diagnosis.corrections:
+    if not check.causes:
         return check.unexplained
     words = "; and ".join(each.description for each in check.diagnosis.corrections)
     return f"Probable cause: {words}. {check.expected_improvement}".strip()

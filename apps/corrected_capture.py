@@ -1,13 +1,11 @@
 """Corrected copy of a capture."""
 
 import shutil
-from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float32
 from scipy.spatial.transform import Rotation, Slerp
 
 from apps.capture_validation import CaptureValidation, mask_lookup
@@ -19,7 +17,6 @@ from capture.source import FrameSource
 from capture.source_opening import open_source
 from preprocess.alignment.capture_geometry import (
     FULL_WINDOW,
-    IDENTITY_TRANSFORM,
     CaptureGeometry,
     VideoTransform,
     frame_step,
@@ -48,86 +45,86 @@ def check_new_or_empty(out: Path) -> None:
 def write_corrected_capture(check: CaptureValidation, out: Path) -> None:
     """Write a native capture folder with all corrections applied.
 
-    Unchanged files are copied: who edits the copy does not change the original. Images that must be
-    rotated or mirrored are written as images; for a crop or an offset, masks, poses and cameras are
-    changed instead.
+    Unchanged images are copied: who edits the copy does not change the original. Images that must
+    be rotated or mirrored are written as images; for a crop or an offset, masks, poses and cameras
+    are changed instead.
 
     Raises:
         InputError: If no correctable mistake was found.
         OSError: If the disk is full; then nothing is written.
     """
-    if check.diagnosis is None or not check.diagnosis.corrections:
+    if not check.causes:
         raise InputError("No correctable mistake was found; --fix wrote nothing.")
     check_new_or_empty(out)
-    source, healed = check.recording.source, check.diagnosis.corrected
-    frames = source.frames_in_file
+    source, corrected = check.recording.source, check.diagnosis.corrected
+    video, frames, missing = corrected.video_transform, source.frames_in_file, set[int]()
     with atomic_folder(out) as part:
-        missing = _write_film(source, healed.video_transform, part)
-        _write_masks(check, healed, part)
-        claim = _to_film_frames(healed, frames)
-        motion = renumber_motion(claim, frames, resampled="frame_rate" in check.causes)
-        motion = replace(motion, keypoints=None)  # of the film as it was
+        if video.reorients:
+            missing = _write_images(source, video, part / "images")
+        elif source.path.is_dir():
+            (part / "images").mkdir()
+            for file in list_images(source.path):
+                shutil.copyfile(file, part / "images" / file.name)
+        else:
+            shutil.copyfile(source.path, part / f"video{source.path.suffix}")
+        # without masks, ia-ingest estimates them
+        if check.recording.masks is not None and video.window == FULL_WINDOW:
+            _write_masks(check, check.recording.masks, part / "masks")
+        geometry = corrected.in_video_frames(frames)
+        motion = renumber_motion(geometry, frames, resampled="frame_rate" in check.causes)
         if missing and motion.frames is not None:
             kept = np.flatnonzero(~np.isin(motion.frames, list(missing)))
             motion = motion.select_rows(kept, motion.frames[kept])
-        write_motion(part / "poses.npz", motion)
-        _write_cameras(claim, part / "cameras.npz")
+        # key points are those of the video as it was
+        write_motion(part / "poses.npz", replace(motion, keypoints=None))
+        one = len(geometry.extrinsics) == 1
+        np.savez(
+            part / "cameras.npz",
+            intrinsic=geometry.intrinsics[0] if one else geometry.intrinsics,
+            extrinsic=geometry.extrinsics[0] if one else geometry.extrinsics,
+            width=geometry.size_px[0],
+            height=geometry.size_px[1],
+            distortion=np.array(geometry.distortion),
+        )
 
 
-def _write_film(source: FrameSource, film: VideoTransform, folder: Path) -> set[int]:
-    """Write the video, reoriented if necessary; return the frames without an image."""
-    if not film.reorients:
-        if source.path.is_dir():
-            _copy_all(list_images(source.path), folder / "images")
-        else:
-            shutil.copyfile(source.path, folder / f"video{source.path.suffix}")
-        return set()
+def _write_images(source: FrameSource, video: VideoTransform, folder: Path) -> set[int]:
+    """Write all images upright; return the frames without one, for which the last is repeated."""
     png = source.path.is_dir() and list_images(source.path)[0].suffix.lower() == ".png"
-    (folder / "images").mkdir()
-    missing = set(range(source.frames_in_file))
-    code = b""
+    suffix, options = (".png", []) if png else (".jpg", JPEG_OPTIONS)
+    missing, place = set(range(source.frames_in_file)), folder
+    folder.mkdir()
     for frame in open_source(source.path).frames():
-        picture = film.reorient(frame.rgb)[..., ::-1]
-        suffix, options = (".png", []) if png else (".jpg", JPEG_OPTIONS)
-        code = cv2.imencode(suffix, np.ascontiguousarray(picture), options)[1].tobytes()
-        (folder / "images" / f"{frame.index:06d}{suffix}").write_bytes(code)
+        picture = np.ascontiguousarray(video.reorient(frame.rgb)[..., ::-1])
+        place = folder / f"{frame.index:06d}{suffix}"
+        place.write_bytes(cv2.imencode(suffix, picture, options)[1].tobytes())
         missing -= set() if "corrupt" in frame.flags else {frame.index}
-    for index in range(source.frames_in_file):  # frame numbers count files: none may be missing
-        place = folder / "images" / f"{index:06d}{'.png' if png else '.jpg'}"
-        if not place.exists():
-            place.write_bytes(code)
+    for index in missing:  # frame numbers count files: none may be missing
+        if not (folder / f"{index:06d}{suffix}").exists():
+            shutil.copyfile(place, folder / f"{index:06d}{suffix}")
     return missing
 
 
-def _to_film_frames(hypothesis: CaptureGeometry, frames: int) -> CaptureGeometry:
-    """Convert poses and cameras to the video's own frame numbers and window.
-
-    Args:
-        hypothesis: After all corrections.
-        frames: Number of frames of the video.
-    """
-    film = hypothesis.video_transform
-    left, top, right, bottom = film.window
-    corner = np.array([left, top]) * np.array(hypothesis.size_px)
-    scale = np.array([right - left, bottom - top])
-    intrinsics, extrinsics = hypothesis.intrinsics.copy(), hypothesis.extrinsics
-    intrinsics[:, :2, 2] -= corner
-    intrinsics[:, :2] /= scale[:, None]
-    if film.renumbers_frames:
-        numbers = np.array([film.mask_frame(frame) for frame in range(frames)])
-        intrinsics, extrinsics = (
-            each if len(each) == 1 else each[numbers.clip(0, len(each) - 1)]
-            for each in (intrinsics, extrinsics)
-        )
-        places = (
-            film.first_frame - hypothesis.row_frames
-            if film.backwards
-            else hypothesis.row_frames - film.first_frame
-        )
-        hypothesis = replace(hypothesis, row_frames=places)
-    return replace(
-        hypothesis, intrinsics=intrinsics, extrinsics=extrinsics, video_transform=IDENTITY_TRANSFORM
-    )
+def _write_masks(check: CaptureValidation, masks: Masks, folder: Path) -> None:
+    """Write the mask of each video frame that has one."""
+    source, corrected = check.recording.source, check.diagnosis.corrected
+    video, sampled = corrected.video_transform, check.objective.masks
+    by_name = source.path.is_dir() and not video.reorients
+    names = [file.stem for file in list_images(source.path)] if by_name else []
+    mask_of = mask_lookup(check.recording, masks)
+    folder.mkdir()
+    for frame in range(source.frames_in_file):
+        number = video.first_frame + frame
+        try:
+            alpha = mask_of(number, masks.size_px)
+        except InputError:  # this frame is skipped then
+            alpha = np.zeros(masks.size_px[::-1], dtype=np.float32)
+        else:
+            alpha = np.float32(1.0) - alpha if corrected.masks_inverted else alpha
+        if corrected.keeps_person_only and sampled is not None:
+            alpha = sampled.keep_person(corrected, number, alpha)
+        name = names[frame] if frame < len(names) else f"{frame:06d}"
+        write_png(folder / f"{name}.png", (alpha * 255.0 + 0.5).astype(np.uint8))
 
 
 def renumber_motion(hypothesis: CaptureGeometry, frames: int, *, resampled: bool) -> Motion:
@@ -176,89 +173,3 @@ def _interpolate_motion(hypothesis: CaptureGeometry, frames: int) -> Motion:
         camera_from_world=None,
         interpolated=None,
     )
-
-
-def _write_masks(check: CaptureValidation, corrected: CaptureGeometry, folder: Path) -> None:
-    masks = check.recording.masks
-    if masks is None:  # masks are the images' alpha
-        return
-    if (
-        corrected.video_transform.renumbers_frames
-        or corrected.video_transform.window != FULL_WINDOW
-        or corrected.keeps_person_only
-    ):
-        _write_mask_images(_transformed_masks(check, masks, corrected), folder / "masks")
-        return
-    stored = not masks.inverted and not corrected.masks_inverted
-    if stored and masks.path.is_dir():
-        _copy_all(sorted(p for p in masks.path.iterdir() if p.is_file()), folder / "masks")
-        return
-    suffix = masks.path.suffix.lower()
-    if stored and suffix in (".npz", ".npy"):
-        shutil.copyfile(masks.path, folder / f"masks{suffix}")
-        return
-    _write_mask_images(_stored_masks(masks, corrected), folder / "masks")
-
-
-def _write_mask_images(
-    masks: Iterator[tuple[str, Float32[np.ndarray, "height width"]]], folder: Path
-) -> None:
-    folder.mkdir()
-    for name, alpha in masks:
-        write_png(folder / f"{name}.png", (alpha * 255.0 + 0.5).astype(np.uint8))
-
-
-def _stored_masks(
-    masks: Masks, corrected: CaptureGeometry
-) -> Iterator[tuple[str, Float32[np.ndarray, "height width"]]]:
-    """Yield name and content of each readable mask, under its own name."""
-    for row in range(masks.count):
-        try:
-            alpha = masks.alpha(row, masks.size_px)
-        except InputError:  # this frame has no mask then
-            continue
-        alpha = np.float32(1.0) - alpha if corrected.masks_inverted else alpha
-        yield f"{row:06d}" if masks.names is None else masks.names[row], alpha
-
-
-def _transformed_masks(
-    check: CaptureValidation, masks: Masks, corrected: CaptureGeometry
-) -> Iterator[tuple[str, Float32[np.ndarray, "height width"]]]:
-    """Yield name and content of the mask of each video frame; empty where there is none."""
-    source, film, evidence = check.recording.source, corrected.video_transform, check.sampled_masks
-    folder = source.path.is_dir() and not film.reorients
-    names = [file.stem for file in list_images(source.path)] if folder else []
-    width, height = masks.size_px
-    stored = mask_lookup(check.recording, masks, masks.size_px)
-    for frame in range(source.frames_in_file):
-        alpha, number = np.zeros((height, width), dtype=np.float32), film.mask_frame(frame)
-        try:
-            alpha = stored(number)
-        except InputError:  # this frame is skipped then
-            pass
-        else:
-            alpha = np.float32(1.0) - alpha if corrected.masks_inverted else alpha
-            if corrected.keeps_person_only and evidence is not None:
-                alpha = evidence.keep_person(corrected, number, alpha)
-        if film.window != FULL_WINDOW:
-            affine = np.linalg.inv(film.mask_from_video((width, height)))[:2]
-            alpha = np.asarray(cv2.warpAffine(alpha, affine, (width, height)), dtype=np.float32)
-        yield names[frame] if frame < len(names) else f"{frame:06d}", alpha
-
-
-def _write_cameras(hypothesis: CaptureGeometry, path: Path) -> None:
-    one = len(hypothesis.extrinsics) == 1
-    np.savez(
-        path,
-        intrinsic=hypothesis.intrinsics[0] if one else hypothesis.intrinsics,
-        extrinsic=hypothesis.extrinsics[0] if one else hypothesis.extrinsics,
-        width=hypothesis.size_px[0],
-        height=hypothesis.size_px[1],
-        distortion=np.array(hypothesis.distortion),
-    )
-
-
-def _copy_all(files: Iterable[Path], folder: Path) -> None:
-    folder.mkdir()
-    for file in files:
-        shutil.copyfile(file, folder / file.name)

@@ -127,13 +127,19 @@ def main() -> None:
     arguments.add_argument(
         "--keep", type=Path, help="folder in which the sample captures are kept for later runs"
     )
-    keep = arguments.parse_args().keep
+    arguments.add_argument(
+        "--only", nargs="+", type=int, metavar="N", help="numbers of the cases to check, from 0"
+    )
+    parsed = arguments.parse_args()
+    keep: Path | None = parsed.keep
+    cases = list(enumerate((*CORRUPTED, *INTACT)))
+    chosen = [cases[number] for number in parsed.only] if parsed.only else cases
     print("\n".join(Hardware.here().lines()))
     with tempfile.TemporaryDirectory(dir=keep and _make_folder(keep)) as scratch:
         samples = shoot_captures(keep or Path(scratch) / "captures")
         found = whole = quiet = 0
         slowest = 0.0
-        for number, case in enumerate((*CORRUPTED, *INTACT)):
+        for number, case in chosen:
             folder = case.write(samples, Path(scratch) / f"case{number}")
             right, all_named, seconds, said = check_case(case, folder)
             slowest = max(slowest, seconds)
@@ -142,7 +148,10 @@ def main() -> None:
             whole += all_named and corrupted
             wanted = " + ".join(cause for cause, _ in case.corruptions if cause) or "good"
             mark = " " if right else "✗"
-            print(f"{mark} {case.capture:<6} {wanted:<30} {seconds:4.1f} s  {said}", flush=True)
+            print(
+                f"{mark} {number:2d} {case.capture:<6} {wanted:<30} {seconds:4.1f} s  {said}",
+                flush=True,
+            )
     print(
         f"right cause first: {found} of {len(CORRUPTED)} (target: {REQUIRED_FIRST}); "
         f"all causes: {whole}"

@@ -14,7 +14,7 @@ import numpy as np
 from capture.input_error import InputError
 from preprocess.alignment.capture_evidence import CaptureEvidence
 from preprocess.alignment.capture_geometry import CaptureGeometry
-from preprocess.alignment.correction_search import MIN_FITTED_CHANGE, MIN_FITTED_IOU_GAIN
+from preprocess.alignment.correction_search import MIN_FITTED_CHANGE, MIN_FITTED_GAIN
 from preprocess.alignment.corrections import fit_factor, scale_focal_length
 from preprocess.alignment.mask_alignment import (
     ALIGNMENT_SAMPLES,
@@ -64,7 +64,7 @@ def estimate_focal_length(
     factor = scale.factor or 1.0
     before = mean_score(objective.frame_scores(geometry))
     after = mean_score(objective.frame_scores(scale.apply(geometry)))
-    is_better = after >= max(MIN_FOCAL_IOU, before + MIN_FITTED_IOU_GAIN)
+    is_better = after >= max(MIN_FOCAL_IOU, before + MIN_FITTED_GAIN)
     if not is_better or abs(factor - 1.0) < MIN_FITTED_CHANGE:
         return cameras
     usual = cameras[0].focal_px[0]

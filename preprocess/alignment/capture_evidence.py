@@ -1,6 +1,6 @@
 """What shows where the person of a capture is: given masks, or a few images without masks.
 
-Without any, masks are estimated in reduced images, and edges along the body's outline are measured.
+Without any, masks are estimated in reduced images.
 """
 
 from collections.abc import Sequence
@@ -9,14 +9,13 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import UInt8
 
 from capture.camera import Camera
 from capture.input_error import InputError
 from capture.source import Frame, FrameSource
 from capture.source_opening import open_source
 from preprocess.alignment.capture_geometry import CaptureGeometry
-from preprocess.alignment.edge_objective import gradient_along, outward_normals
 from preprocess.alignment.silhouette_objective import (
     MaskSample,
     SilhouetteObjective,
@@ -28,8 +27,6 @@ from preprocess.body.body_surface import (
     NEAR_PLANE_M,
     SILHOUETTE_PERSON_PX,
     SkinPoints,
-    signed_distance_px,
-    splat_silhouette,
 )
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.masks.mask_files import Masks
@@ -42,12 +39,6 @@ ALIGNMENT_IMAGES = 8
 """Images to align to."""
 ALIGNMENT_FRAMES = 240
 """Frames at the beginning of a video over which they are spread: decoding takes longest."""
-MAX_CLOTHING_M = 0.03
-"""Distance outside the body within which clothes end, metres."""
-OFF_OUTLINE_MIN_M = 0.04
-"""Least distance from the outline of pixels beside it, metres."""
-OFF_OUTLINE_MAX_M = 0.1
-"""Largest distance from the outline of pixels beside it, metres."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -69,19 +60,6 @@ class ImageSample:
         """Width and height."""
         height, width = self.rgb.shape[:2]
         return int(width), int(height)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class BodyOutline:
-    """The outline of a posed body in an image.
-
-    Attributes:
-        signed_distance_m: Distance of each pixel from the outline, metres; negative inside.
-        px_per_m: Pixels per metre at the body.
-    """
-
-    signed_distance_m: Float32[np.ndarray, "height width"]
-    px_per_m: float
 
 
 def sample_video(
@@ -141,49 +119,6 @@ def thumbnail_size_px(skin: SkinPoints, pose: BodyPose, camera: Camera) -> tuple
     tall = float(np.clip(tall, 1.0, 2.0 * height)) if np.isfinite(tall) else float(height)
     scale = min(1.0, IMAGE_PERSON_PX / tall)
     return max(8, round(width * scale)), max(8, round(height * scale))
-
-
-def body_outline(
-    geometry: CaptureGeometry, skin: SkinPoints, sample: ImageSample
-) -> BodyOutline | None:
-    """Outline of the body in an image; None without a pose, or if it is outside the image."""
-    row = geometry.row_for_frame(sample.index)
-    if row is None:
-        return None
-    camera = geometry.camera_at(sample.camera_row, sample.size_px)
-    points = skin.posed(geometry.motion[row])
-    depth = points @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
-    shape = splat_silhouette(points, camera)
-    if depth.min() < NEAR_PLANE_M or not shape.any() or shape.all():
-        return None
-    px_per_m = max(camera.focal_px) / float(np.median(depth))
-    away = signed_distance_px(shape) / np.float32(px_per_m)
-    return BodyOutline(signed_distance_m=away, px_per_m=px_per_m)
-
-
-def edge_contrast(
-    geometry: CaptureGeometry, skin: SkinPoints, samples: Sequence[ImageSample]
-) -> float:
-    """Strength of edges across the body's outline relative to such edges beside it.
-
-    About 1 for a body drawn anywhere, 2 to 5 for a person's outline. Unlike masks estimated around
-    the body itself, this shows whether poses and images belong together at all.
-    """
-    along = beside = 0.0
-    along_px = beside_px = 0
-    for sample in samples:
-        body = body_outline(geometry, skin, sample)
-        if body is None:
-            continue
-        away = body.signed_distance_m
-        across = gradient_along(sample.rgb, outward_normals(away))
-        near = (away > 0.0) & (away < MAX_CLOTHING_M)
-        off = (np.abs(away) > OFF_OUTLINE_MIN_M) & (np.abs(away) < OFF_OUTLINE_MAX_M)
-        along, along_px = along + float(across[near].sum()), along_px + int(near.sum())
-        beside, beside_px = beside + float(across[off].sum()), beside_px + int(off.sum())
-    if not along_px or not beside_px or beside <= 0.0:
-        return 0.0
-    return (along / along_px) / (beside / beside_px)
 
 
 def estimate_silhouettes(

@@ -7,9 +7,8 @@ without rendering.
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from capture.camera import Camera
@@ -36,8 +35,6 @@ MAX_BETA = 6.0
 MAX_LISTED_FRAMES = 6
 """Frame numbers that a message lists."""
 
-RgbImage = UInt8[np.ndarray, "height width 3"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class VideoTransform:
@@ -49,62 +46,22 @@ class VideoTransform:
         window: Left, top, right and bottom of the video's image within the mask, as fractions of
             the mask's width and height. A cropped video shows less than 0 to 1, a padded one more.
         first_frame: Frame number that the masks and poses have for the video's frame 0.
-        backwards: Whether their numbers descend where the video's ascend.
     """
 
     quarter_turns: int = 0
     mirrored: bool = False
     window: tuple[float, float, float, float] = FULL_WINDOW
     first_frame: int = 0
-    backwards: bool = False
 
     @property
     def reorients(self) -> bool:
         """Whether images must be rotated or mirrored."""
         return self.mirrored or self.quarter_turns % 4 != 0
 
-    @property
-    def renumbers_frames(self) -> bool:
-        """Whether frames belong to masks and poses of other numbers."""
-        return self.backwards or self.first_frame != 0
-
-    def mask_frame(self, frame: int) -> int:
-        """Frame number in masks and poses of one of the video's frames."""
-        return self.first_frame - frame if self.backwards else self.first_frame + frame
-
-    def video_frame(self, number: int) -> int:
-        """The video's frame of a frame number in masks and poses."""
-        return self.first_frame - number if self.backwards else number - self.first_frame
-
     def reorient(self, image: np.ndarray) -> np.ndarray:
         """Rotate and mirror one of the video's images, or a map of that size."""
         turned = np.rot90(image, self.quarter_turns)
         return np.ascontiguousarray(turned[:, ::-1] if self.mirrored else turned)
-
-    def warp_to_mask(
-        self, rgb: RgbImage
-    ) -> tuple[UInt8[np.ndarray, "rows columns 3"], UInt8[np.ndarray, "rows columns"]]:
-        """Warp an image to the mask; and the mask's pixels that the video shows (1)."""
-        upright = self.reorient(rgb)
-        height, width = upright.shape[:2]
-        shown = np.ones((height, width), dtype=np.uint8)
-        if self.window == FULL_WINDOW:
-            return upright, shown
-        affine = self.mask_from_video((width, height))[:2].astype(np.float32)
-        shrinks = affine[0, 0] < 1.0
-        if shrinks:  # else a padded video would be sampled, not averaged
-            upright = cv2.GaussianBlur(upright, (0, 0), max(0.01, 0.5 / affine[0, 0] - 0.4))
-        moved = cv2.warpAffine(upright, affine, (width, height), borderMode=cv2.BORDER_REPLICATE)
-        inside = cv2.warpAffine(shown, affine, (width, height), flags=cv2.INTER_NEAREST)
-        return np.asarray(moved), np.asarray(inside)
-
-    def mask_from_video(self, size_px: tuple[int, int]) -> Float[np.ndarray, "3 3"]:
-        """Homography from pixel indices of the upright video to the mask's, at one size."""
-        left, top, right, bottom = self.window
-        scale = np.array([right - left, bottom - top])
-        # The center of pixel i is at i + 0.5.
-        moved = np.array([left, top]) * np.array(size_px) + 0.5 * (scale - 1.0)
-        return np.array([[scale[0], 0.0, moved[0]], [0.0, scale[1], moved[1]], [0.0, 0.0, 1.0]])
 
 
 IDENTITY_TRANSFORM = VideoTransform()
@@ -165,10 +122,40 @@ class CaptureGeometry:
 
     def row_for_frame(self, frame: int) -> int | None:
         """The valid row nearest to a frame; None if it belongs to another frame."""
+        rows, known = self.rows_for_frames(np.array([frame]))
+        return int(rows[0]) if known[0] else None
+
+    def rows_for_frames(
+        self, frames: Int[np.ndarray, "frames"]
+    ) -> tuple[Int[np.ndarray, "frames"], Bool[np.ndarray, "frames"]]:
+        """The valid row nearest to each frame, and whether it belongs to that frame."""
         reach = 0.5 * min(max(1.0, frame_step(self.row_frames)), MAX_FRAME_STEP) + 1e-6
-        away = np.where(self.motion.valid, np.abs(self.row_frames - frame), np.inf)
-        row = int(np.argmin(away))
-        return row if away[row] <= reach else None
+        away = np.abs(self.row_frames - frames[:, None])
+        away = np.where(self.motion.valid & np.isfinite(away), away, np.inf)
+        rows = away.argmin(axis=1)
+        return rows, np.take_along_axis(away, rows[:, None], axis=1)[:, 0] <= reach
+
+    def in_video_frames(self, frames: int) -> "CaptureGeometry":
+        """The same for the video's own frame numbers and the part of the image that it shows.
+
+        Args:
+            frames: Number of frames of the video.
+        """
+        video = self.video_transform
+        low, high = np.array(video.window[:2]), np.array(video.window[2:])
+        intrinsics, extrinsics = self.intrinsics.copy(), self.extrinsics
+        intrinsics[:, :2, 2] -= low * self.size_px
+        intrinsics[:, :2] /= (high - low)[:, None]
+        if video.first_frame and len(extrinsics) > 1:
+            numbers = (video.first_frame + np.arange(frames)).clip(0, len(extrinsics) - 1)
+            intrinsics, extrinsics = intrinsics[numbers], extrinsics[numbers]
+        return replace(
+            self,
+            intrinsics=intrinsics,
+            extrinsics=extrinsics,
+            row_frames=self.row_frames - video.first_frame,
+            video_transform=IDENTITY_TRANSFORM,
+        )
 
     def camera_rows(self) -> Int[np.ndarray, "poses"]:
         """Index of the camera of each pose."""

@@ -1,24 +1,19 @@
-"""A mistake in a capture as the change that undoes it: those with a size, and their fit to masks.
+"""A mistake in a capture as the change that undoes it: those with a size, and how it is fitted.
 
-Fitted to masks are one factor (focal length, size), a principal point, or a camera's whole pose.
+Key points give factors, windows and cameras in closed form; masks alone give factors, too.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
+import cv2
 import numpy as np
-from jaxtyping import Float, Float32
-from scipy.spatial.transform import Rotation
+from jaxtyping import Float
 
-from preprocess.alignment.capture_geometry import CaptureGeometry
-from preprocess.alignment.silhouette_objective import (
-    MaskSample,
-    SilhouetteObjective,
-    mean_score,
-    mean_with_missing,
-)
+from preprocess.alignment.capture_geometry import FULL_WINDOW, CaptureGeometry
+from preprocess.alignment.keypoint_objective import KeypointObjective
+from preprocess.alignment.silhouette_objective import SilhouetteObjective, mean_with_missing
 from preprocess.body.kinematics import rigid_transform
 
 CAUSES = (
@@ -29,25 +24,14 @@ CAUSES = (
 """Names of the mistakes in commands and files; of equal candidates the first cause is named."""
 
 GeometryChange = Callable[[CaptureGeometry], CaptureGeometry]
-CAMERA_SAMPLES = 6
-"""Frames to which a camera is fitted."""
 MAX_CENTER_OFFSET = 0.45
 """Largest shift of the principal point, as a fraction of the image's sides."""
-YAW_STARTS = 24
-"""Directions around the person from which the search for a camera starts."""
-LEVEL_CAMERAS = {
-    "y": np.diag([1.0, -1.0, -1.0]),
-    "z": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
-}
-"""Rotations of level OpenCV cameras, by the axis that is up in the world."""
-REFINED_STARTS = 2
-"""Best starts that are refined."""
-CAMERA_EVALUATIONS = 200
-"""Evaluations of one refinement."""
-FIRST_TURN_RAD = 0.15
-"""First step of the rotation, radians."""
-FIRST_SHIFT_M = 0.15
-"""First step of the translation, metres."""
+MAX_LOG_WINDOW = 0.7
+"""Largest logarithm of the size of a cropped or padded video relative to the masks' image."""
+CAMERA_ERROR_HEIGHTS = 0.06
+"""Distance at which a key point is an outlier of a fitted camera, in the person's height."""
+MIN_CAMERA_POINTS = 24
+"""Fewest key points to which a camera is fitted."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -67,6 +51,11 @@ class Correction:
     apply: GeometryChange
     factor: float | None = None
     frame_shift: int | None = None
+
+    @property
+    def is_of_video(self) -> bool:
+        """Whether the mistake is one of the video alone."""
+        return self.cause.startswith("video_")
 
 
 def undo_pose_delay(frames: int) -> Correction:
@@ -116,15 +105,6 @@ def undo_video_offset(frames: int) -> Correction:
         f"{question}",
         apply=lambda c: _with_video(c, first_frame=c.video_transform.first_frame + frames),
         frame_shift=frames,
-    )
-
-
-def undo_video_reversal(frames: int) -> Correction:
-    """A video of this many frames that runs backwards against its masks and poses."""
-    return Correction(
-        cause="video_offset",
-        description="the video runs backwards against its masks and poses",
-        apply=lambda c: _with_video(c, first_frame=frames - 1, backwards=True),
     )
 
 
@@ -232,66 +212,19 @@ def _with_intrinsics(
     return replace(geometry, intrinsics=intrinsics)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _CameraProblem:
-    """Posed bodies in the world and their masks, for one static camera."""
-
-    geometry: CaptureGeometry
-    objective: SilhouetteObjective
-
-    @cached_property
-    def bodies(self) -> list[tuple[Float32[np.ndarray, "points 3"], MaskSample]]:
-        """The skin in each sample that has a pose, and the sample."""
-        rows = [self.geometry.row_for_frame(sample.index) for sample in self.objective.samples]
-        return [
-            (self.objective.posed_points(self.geometry.motion, row), sample)
-            for row, sample in zip(rows, self.objective.samples, strict=True)
-            if row is not None
-        ]
-
-    def mean_iou(self, extrinsic: Float[np.ndarray, "4 4"]) -> float:
-        """Mean IoU of bodies and masks seen from this camera."""
-        geometry = replace(self.geometry, extrinsics=extrinsic[None])
-        return mean_score(self.objective.frame_scores(geometry))
-
-    def extrinsic_for(self, rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4 4"]:
-        """The camera of a given rotation that puts the bodies where the masks are."""
-        middle = np.mean([p.mean(axis=0) for p, _ in self.bodies], axis=0)
-        extrinsic = rigid_transform(rotation, -rotation @ middle + (0.0, 0.0, 4.0))
-        for _ in range(4):
-            camera = replace(self.geometry, extrinsics=extrinsic[None]).camera_at(
-                0, self.objective.size_px
-            )
-            drawn = np.median(
-                [_point_bounds(camera.project(p[::8])) for p, _ in self.bodies], axis=0
-            )
-            wanted = np.median([_mask_bounds(each.alpha) for _, each in self.bodies], axis=0)
-            depth = float(np.mean([(p @ rotation[2]).mean() for p, _ in self.bodies]))
-            far = (depth + extrinsic[2, 3]) * (drawn[3] - drawn[1]) / (wanted[3] - wanted[1])
-            off = 0.5 * (wanted[:2] + wanted[2:] - drawn[:2] - drawn[2:])
-            extrinsic[:2, 3] += off * far / np.array(camera.focal_px)
-            extrinsic[2, 3] = far - depth
-        return extrinsic
-
-
 def fit_factor(
-    make: Callable[[float], Correction],
-    geometry: CaptureGeometry,
-    objective: SilhouetteObjective,
-    *,
-    near_one: bool = False,
+    make: Callable[[float], Correction], geometry: CaptureGeometry, objective: SilhouetteObjective
 ) -> Correction:
-    """Fit the one factor of a correction: a coarse grid, then a bounded scalar search.
+    """Fit the one factor of a correction to masks: a coarse grid, then a bounded scalar search.
 
     Args:
         make: Makes the correction of a factor (`scale_focal_length`, `divide_distances`).
         geometry: The capture that the correction is applied to.
         objective: Masks of a few frames.
-        near_one: Skips the grid: the factor is within 20 % of 1.
     """
     from scipy.optimize import minimize_scalar  # 0.1 s that a capture in order does not need
 
-    logs = np.zeros(1) if near_one else np.linspace(-0.8, 0.8, 9)
+    logs = np.linspace(-0.8, 0.8, 9)
 
     def loss(log: float) -> float:
         return -mean_with_missing(objective.frame_scores(make(float(np.exp(log))).apply(geometry)))
@@ -302,89 +235,71 @@ def fit_factor(
     return make(float(np.exp(found.x)))
 
 
+def fit_to_keypoints(
+    geometry: CaptureGeometry, objective: KeypointObjective
+) -> Iterator[Correction]:
+    """The best focal length, size, aspect and window of the video, each fitted alone."""
+    bodies, found = objective.bodies(geometry), objective.found_px(geometry)
+    if found is None:
+        return
+    from_center = bodies.pixels - bodies.center_px
+    wanted = found - bodies.center_px
+    only_x = from_center * (1.0, np.nan)
+    factors = [(scale_focal_length, from_center, wanted), (stretch_width, only_x, wanted)]
+    pelvis = bodies.to_cameras(bodies.pelvis_m)
+    rays, limbs = wanted / bodies.focal_px, bodies.in_camera_m - pelvis
+    # The ray of a key point at distance k times the pelvis's: x (k P_z + l_z) = k P_x + l_x.
+    distance = rays * pelvis[..., 2:] - pelvis[..., :2], limbs[..., :2] - rays * limbs[..., 2:]
+    rest = objective.shaped.joints[0]
+    factors.append((lambda k: divide_distances(1.0 / k, rest), *distance))
+    for make, design, target in factors:
+        factor = float(objective.fit(bodies, design[..., None], target)[0])
+        if factor > 0.0:
+            yield make(factor)
+    if geometry.video_transform.window == FULL_WINDOW:
+        inside = (found / geometry.size_px)[..., None]
+        axes = np.eye(2)
+        design = np.concatenate([(1.0 - inside) * axes, inside * axes], axis=-1)
+        sides = objective.fit(bodies, design, bodies.pixels / geometry.size_px)
+        if (np.abs(np.log(np.maximum(sides[2:] - sides[:2], 1e-9))) < MAX_LOG_WINDOW).all():
+            left, top, right, bottom = sides.tolist()
+            yield undo_video_crop((left, top, right, bottom))
+
+
 def fit_principal_point(
-    geometry: CaptureGeometry, objective: SilhouetteObjective
+    geometry: CaptureGeometry, objective: KeypointObjective
 ) -> Correction | None:
-    """Fit the principal point that puts the bodies where the masks are.
+    """Fit the principal point that puts the bodies where the key points are.
 
-    None if no mask has a pose, or the shift is too large to be a crop.
+    None if the shift is too large to be a crop.
     """
-    problem = _CameraProblem(geometry=geometry, objective=objective.subset(CAMERA_SAMPLES))
-    if not problem.bodies:
+    bodies, found = objective.bodies(geometry), objective.found_px(geometry)
+    if found is None:
         return None
-    small = np.array(objective.size_px) / np.array(geometry.size_px)
-    wanted = np.stack([_mask_bounds(sample.alpha) for _, sample in problem.bodies])
-    drawn = np.stack(
-        [
-            _point_bounds(
-                geometry.camera_at(sample.camera_row, objective.size_px).project(points[::8])
-            )
-            for points, sample in problem.bodies
-        ]
-    )
-    away = np.median(wanted - drawn, axis=0)
-    right, down = 0.5 * (away[:2] + away[2:]) / small
-    near = bool((np.abs([right, down]) < MAX_CENTER_OFFSET * np.array(geometry.size_px)).all())
-    return shift_principal_point(float(right), float(down)) if near else None
+    design = np.broadcast_to(np.eye(2), (*found.shape, 2))
+    right, down = objective.fit(bodies, design, found - bodies.pixels).tolist()
+    near = np.abs([right, down]) < MAX_CENTER_OFFSET * np.array(geometry.size_px)
+    return shift_principal_point(right, down) if near.all() else None
 
 
-def fit_extrinsics(geometry: CaptureGeometry, objective: SilhouetteObjective) -> Correction | None:
-    """Fit the pose of a static camera; None if there are several cameras, or no mask has a pose.
-
-    Starts from level cameras on all sides, in worlds with y or z up; the best are refined freely.
-    """
-    problem = _CameraProblem(geometry=geometry, objective=objective.subset(CAMERA_SAMPLES))
-    if len(geometry.extrinsics) > 1 or not problem.bodies:
+def fit_extrinsics(geometry: CaptureGeometry, objective: KeypointObjective) -> Correction | None:
+    """Solve the pose of a static camera from all key points; None if there are several cameras."""
+    bodies, found = objective.bodies(geometry), objective.found_px(geometry)
+    if len(geometry.extrinsics) > 1 or found is None:
         return None
-    yaws = [2.0 * np.pi * k / YAW_STARTS for k in range(YAW_STARTS)]
-    starts = [
-        problem.extrinsic_for(level @ _yaw_rotation(level, yaw))
-        for level in LEVEL_CAMERAS.values()
-        for yaw in yaws
-    ]
-    starts.sort(key=problem.mean_iou, reverse=True)
-    extrinsic = max(
-        (_refine_extrinsics(problem, start) for start in starts[:REFINED_STARTS]),
-        key=problem.mean_iou,
-    )
+    used = bodies.known[:, None] & (objective.confidence > np.median(objective.confidence))
+    if used.sum() < MIN_CAMERA_POINTS:
+        return None
+    success, turn, shift, _ = cv2.solvePnPRansac(
+        bodies.world_m[used], found[used], geometry.intrinsics[0], np.array(geometry.distortion),
+        reprojectionError=CAMERA_ERROR_HEIGHTS * objective.person_px, flags=cv2.SOLVEPNP_SQPNP,
+    )  # fmt: skip
+    if not success:
+        return None
+    extrinsic = rigid_transform(cv2.Rodrigues(turn)[0], shift[:, 0])
     return Correction(
         cause="world_frame",
         description="the poses are in world coordinates and no file gives the camera's position; "
-        "one that fits was found from the masks",
+        "one that fits was found from the key points",
         apply=lambda c: replace(c, extrinsics=extrinsic[None]),
     )
-
-
-def _yaw_rotation(level: Float[np.ndarray, "3 3"], angle: float) -> Float[np.ndarray, "3 3"]:
-    """Rotation of the world about its up axis."""
-    return Rotation.from_rotvec(-angle * level[1]).as_matrix()
-
-
-def _refine_extrinsics(
-    problem: _CameraProblem, start: Float[np.ndarray, "4 4"]
-) -> Float[np.ndarray, "4 4"]:
-    """Move the camera and turn it about the bodies' center (Nelder-Mead on the mean IoU)."""
-    from scipy.optimize import minimize  # 0.1 s that a capture in order does not need
-
-    middle = np.mean([p.mean(axis=0) for p, _ in problem.bodies], axis=0) @ start[:3, :3].T
-
-    def moved(x: Float[np.ndarray, "6"]) -> Float[np.ndarray, "4 4"]:
-        turn = Rotation.from_rotvec(x[:3]).as_matrix()
-        return rigid_transform(turn @ start[:3, :3], start[:3, 3] + middle - turn @ middle + x[3:])
-
-    size = np.diag([FIRST_TURN_RAD] * 3 + [FIRST_SHIFT_M] * 3)
-    found = minimize(
-        lambda x: -problem.mean_iou(moved(x)), np.zeros(6), method="Nelder-Mead",
-        options={"maxfev": CAMERA_EVALUATIONS, "initial_simplex": np.vstack([np.zeros(6), size])},
-    )  # fmt: skip
-    return moved(found.x)
-
-
-def _point_bounds(pixels: Float[np.ndarray, "points 2"]) -> Float[np.ndarray, "4"]:
-    return np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
-
-
-def _mask_bounds(alpha: Float32[np.ndarray, "height width"]) -> Float[np.ndarray, "4"]:
-    rows, columns = np.nonzero(alpha > 0.5)
-    low, high = (columns.min(), rows.min()), (columns.max() + 1, rows.max() + 1)
-    return np.array([*low, *high], dtype=np.float64)
