@@ -287,7 +287,7 @@ def fit_extrinsics(geometry: CaptureGeometry, objective: KeypointObjective) -> C
     bodies, found = objective.bodies(geometry), objective.found_px(geometry)
     if len(geometry.extrinsics) > 1 or found is None:
         return None
-    used = bodies.known[:, None] & (objective.confidence > np.median(objective.confidence))
+    used = bodies.known[:, None] & (objective.confidence >= np.median(objective.confidence))
     if used.sum() < MIN_CAMERA_POINTS:
         return None
     success, turn, shift, _ = cv2.solvePnPRansac(

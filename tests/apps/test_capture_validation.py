@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from apps import check, ingest
-from apps.capture_validation import check_opened_capture, passes_quick_check, preflight_check
-from apps.cli.console import Console
+from apps.capture_validation import passes_quick_check
 from benchmarks import capture_corruptions
 from preprocess.capture_session import CaptureInputs
 from preprocess.open_capture import open_capture
@@ -82,14 +81,6 @@ def test_a_good_capture_is_called_good(dancing, call_check, tmp_path):
     assert sheet.shape[1] > 3 * sheet.shape[0]
 
 
-@pytest.mark.slow
-def test_a_good_capture_of_a_noisy_tracker_is_called_good(tmp_path, call_check):
-    config = ShootConfig(frames=40, size=96, pose_noise_deg=2.0, pose_noise_cm=1.0, turns=1.0)
-    film_capture(tmp_path / "noisy", config)
-    _, _, found = call_check(tmp_path / "noisy")
-    assert (found["verdict"], found["cause"]) == ("good", None)
-
-
 def quick_where(causes, quick):
     """Parameters of which all but a few are slow: each is searched for like any other."""
     return [c if c in quick else pytest.param(c, marks=pytest.mark.slow) for c in causes]
@@ -140,26 +131,14 @@ def stretched(folder: Path) -> None:
 
 
 def test_two_persons_who_touch_in_the_masks_are_named(spoilt, call_check):
-    _, said, found = call_check(spoilt(with_neighbor))
-    assert found["cause"] is None
-    assert "times the body's area" in said
-    assert "another person" in said
-
-
-@pytest.mark.slow
-def test_ingest_warns_of_masks_that_nothing_explains(spoilt, capsys):
-    inputs = CaptureInputs(video=spoilt(lambda folder: with_neighbor(folder, share=0.6)))
-    preflight_check(open_capture(inputs), inputs, Console(), force=False)
-    assert "times the body's area" in " ".join(capsys.readouterr().err.split())
-
-
-def with_neighbor(folder: Path, share: float = 1.0) -> None:
-    """Shows the person twice in masks, side by side and touching."""
-    paths = sorted((folder / "masks").iterdir())
-    for path in paths[: round(share * len(paths))]:
+    folder = spoilt()
+    for path in (folder / "masks").iterdir():
         mask = cv2.imread(str(path), 0)
         moved = np.roll(mask, round(0.25 * mask.shape[1]), axis=1)
         cv2.imwrite(str(path), np.maximum(mask, moved))
+    _, said, found = call_check(folder)
+    assert found["cause"] is None
+    assert "times the body's area" in said
 
 
 def test_poses_that_are_not_numbers_disturb_nothing(spoilt, call_check, recwarn):
@@ -200,13 +179,12 @@ def test_a_mistake_of_the_film_alone_is_named_and_corrected(cause, spoilt, tmp_p
     assert [cure["cause"] for cure in found["corrections"]] == [cause]
     assert found["iou"]["now"] > 0.75
     assert found["film"]["now"] + 0.05 < found["film"]["after_fix"] > 0.7
-    assert "do not match the images" in said
+    assert "masks do not match the images" in said
     assert cv2.imread(str(tmp_path / "sheet.png")) is not None
-    recording = open_capture(CaptureInputs(video=out))
-    examined_again = check_opened_capture(recording)
-    assert examined_again.causes == ()
-    assert examined_again.diagnosis.video.score_before > found["film"]["after_fix"] - 0.03
-    assert recording.source.frames_in_file == (36 if cause == "video_offset" else 40)
+    _, _, again = call_check(out)
+    assert again["cause"] is None
+    assert again["film"]["now"] > found["film"]["after_fix"] - 0.03
+    assert (out / "masks").exists() == (cause != "video_crop")
 
 
 def narrowed(folder: Path) -> None:
@@ -250,44 +228,18 @@ def test_two_people_in_the_masks_are_named_and_one_is_taken_away(spoilt, tmp_pat
     assert len(alone) > 35  # an arm that touches the other person makes one part of both
 
 
-@pytest.mark.slow
-def test_poses_of_the_last_frames_alone_are_found_where_they_belong(spoilt, call_check):
-    _, _, found = call_check(spoilt(capture_corruptions.keep_last_poses(22)))
-    assert found["cause"] == "frame_offset"
-    assert "18 frames too early" in found["corrections"][0]["words"]
-    assert found["iou"]["after_fix"] > 0.75
-
-
-@pytest.mark.slow
-def test_a_world_with_z_up_is_one_mistake_however_it_was_converted(spoilt, call_check):
-    _, _, found = call_check(spoilt(capture_corruptions.use_z_up_poses_without_pelvis))
-    assert [cure["cause"] for cure in found["corrections"]] == ["root_rotation"]
-    assert found["iou"]["after_fix"] > 0.8
-
-
-def test_without_masks_the_sheet_shows_the_body(spoilt, call_check, tmp_path):
-    folder = spoilt(lambda folder: shutil.rmtree(folder / "masks"))
-    _, said, found = call_check(folder)
-    assert found["iou"]["now"] is None
-    assert "times as strong across it as beside it" in said
+def test_without_masks_the_key_points_name_the_mistake(spoilt, call_check, tmp_path):
+    folder = spoilt(capture_corruptions.use_opengl_poses)
+    shutil.rmtree(folder / "masks")
+    code, _, found = call_check(folder, "--fix", tmp_path / "mended")
+    assert (code, found["iou"]["now"], found["cause"]) == (0, None, "opengl_axes")
+    assert found["film"]["now"] < 0.3 < 0.7 < found["film"]["after_fix"]
+    code, _, found = call_check(tmp_path / "mended")
+    assert (code, found["verdict"], found["cause"]) == (0, "good", None)
     sheet = cv2.imread(str(tmp_path / "sheet.png"))
     assert sheet is not None
     orange = (sheet[..., 2] > 200) & (sheet[..., 0] < 60)
     assert orange.mean() > 0.005
-
-
-@pytest.mark.slow
-def test_poses_that_fit_where_there_are_any_are_not_called_a_riddle(spoilt, call_check, changed):
-    folder = spoilt()
-    with np.load(folder / "poses.npz") as archive:
-        fewer = {key: archive[key] for key in archive.files}
-    count = len(fewer["transl"])
-    fewer = {key: a[:-12] if a.shape[:1] == (count,) else a for key, a in fewer.items()}
-    np.savez(folder / "poses.npz", **fewer)
-    _, said, found = call_check(folder)
-    assert found["verdict"] == "warn"
-    assert "12 of" in said
-    assert "Poses and masks match where both exist" in said
 
 
 @pytest.mark.slow
@@ -315,13 +267,6 @@ def test_two_mistakes_are_both_named_and_an_unusable_capture_ends_with_2(spoilt,
     assert found["iou"]["after_fix"] > 0.75
     assert "OpenGL" in said
     assert "--fix" in said
-
-
-@pytest.mark.slow
-def test_an_unknown_camera_is_found(spoilt, call_check):
-    _, _, found = call_check(spoilt(capture_corruptions.reset_extrinsics))
-    assert found["cause"] == "world_frame"
-    assert found["iou"]["after_fix"] > 0.75
 
 
 def test_mending_needs_a_mistake_and_a_free_place(dancing, tmp_path, call_check):
@@ -372,18 +317,6 @@ def test_a_glance_is_enough_for_a_good_capture_and_notices_a_late_one(dancing, s
     )
 
 
-def test_a_delay_that_gains_little_is_chance(dancing, monkeypatch):
-    scores = iter([0.80, 0.81, 0.80, 0.79, 0.80])
-    monkeypatch.setattr("apps.capture_validation.mean_score", lambda _: next(scores))
-    assert passes_quick_check(open_capture(CaptureInputs(video=dancing)))
-
-
-def test_a_glance_notices_a_mirrored_film(spoilt):
-    assert not passes_quick_check(
-        open_capture(CaptureInputs(video=spoilt(capture_corruptions.mirror_video)))
-    )
-
-
 def test_ingest_stops_before_an_unusable_capture_and_says_why(spoilt, capsys, tmp_path):
     folder = spoilt(capture_corruptions.scale_focal(0.4))
     assert ingest.main([str(folder), "--out", str(tmp_path / "run")]) == 2
@@ -394,25 +327,9 @@ def test_ingest_stops_before_an_unusable_capture_and_says_why(spoilt, capsys, tm
 
 
 @pytest.mark.slow
-def test_ingest_says_what_would_mend_what_it_refuses(spoilt, capsys, tmp_path):
-    folder = spoilt(capture_corruptions.resample_poses(0.5))
-    assert ingest.main([str(folder), "--out", str(tmp_path / "run")]) == 2
-    said = " ".join(capsys.readouterr().err.split())
-    assert "There are 20 poses, but 40 frames" in said
-    assert "0.5 times the video's frame rate" in said
-
-
-@pytest.mark.slow
 def test_ingest_goes_on_with_force(spoilt, call_ingest, without_baking, tmp_path):
     outcome = call_ingest(
         spoilt(capture_corruptions.delay_poses(-9)), "--force", "--out", tmp_path / "run"
     )
     assert outcome.code == 0
     assert "the poses come 9 frames too early" in " ".join(outcome.err.split())
-
-
-@pytest.mark.slow
-def test_ingest_warns_of_late_poses_and_goes_on(spoilt, call_ingest, without_baking, tmp_path):
-    outcome = call_ingest(spoilt(capture_corruptions.delay_poses(2)), "--out", tmp_path / "run")
-    assert outcome.code == 0
-    assert "the poses come 2 frames too late" in " ".join(outcome.err.split())
