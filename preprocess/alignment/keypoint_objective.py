@@ -165,7 +165,9 @@ class KeypointObjective:
         bodies, found = self.bodies(geometry), self.found_px(geometry)
         if found is None:
             return np.full(len(self.images), np.nan)
+        left, top, right, bottom = geometry.video_transform.window
         tall = self.person_px * max(geometry.size_px) / max(self.images[0].size_px)
+        tall *= 0.5 * (right - left + bottom - top)
         away = np.linalg.norm(bodies.pixels - found, axis=-1) / (HALF_SCORE_HEIGHTS * tall)
         scores = np.where(bodies.in_camera_m[..., 2] > NEAR_PLANE_M, 1.0 / (1.0 + away**2), 0.0)
         weights = self.confidence
