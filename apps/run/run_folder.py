@@ -21,12 +21,10 @@ LOCK_FILE_NAME = f"{RESERVED_PREFIX}lock"
 """Name of the locked file in a folder."""
 NO_LOCKS_ERRNOS = frozenset({errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP})
 """Errors of file systems without locks."""
-PROBE_S = 1.0
-"""How long a shared claim waits for another that only looks at the lock, seconds."""
 
 
 @contextmanager
-def claim_folder(folder: Path, console: Console, *, shared: bool = False) -> Iterator[None]:
+def claim_folder(folder: Path, console: Console) -> Iterator[None]:
     """Create and lock a folder during a block; remove the folders it made if they stayed empty.
 
     After `kill -9` the lock file remains, but not the lock. File systems without locks cause a
@@ -35,18 +33,15 @@ def claim_folder(folder: Path, console: Console, *, shared: bool = False) -> Ite
     Args:
         folder: The folder.
         console: Shows warnings.
-        shared: Only check that no other process has locked the folder.
 
     Raises:
         CommandExit: If another process has locked it.
     """
     made = [each for each in (folder, *folder.parents) if not each.exists()]
     folder.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder / LOCK_FILE_NAME, timeout=PROBE_S if shared else 0.0)
+    lock = FileLock(folder / LOCK_FILE_NAME, timeout=0.0)
     try:
         _acquire(lock, folder, console)
-        if shared:
-            lock.release()
         yield
     finally:
         if lock.is_locked:
