@@ -51,15 +51,15 @@ def play(arguments: PlayArguments, console: Console) -> int:
 
 
 def _render_clip(arguments: PlayArguments, console: Console) -> int:
-    from apps.animation.clip_rendering import (
+    from apps.animation.clip_file import (
         MAX_GIF_FPS,
         TRANSPARENT,
         background_compositor,
         check_clip_path,
-        choose_encoder,
-        plan_render,
+        clip_format,
         write_clip,
     )
+    from apps.animation.clip_rendering import plan_render
     from apps.cli.command_line import stop_on_interrupt
     from export.player import Player
 
@@ -72,7 +72,7 @@ def _render_clip(arguments: PlayArguments, console: Console) -> int:
         else arguments.background == TRANSPARENT
     )
     blend = None if clear else background_compositor(arguments.background or "white")
-    encoder = choose_encoder(out, blend)
+    description = clip_format(out, transparent=blend is None).description
     player = Player.load(arguments.avatar, tier=arguments.tier, provider=arguments.provider)
     _print_package_warnings(player, console)
     shots = plan_render(
@@ -102,10 +102,9 @@ def _render_clip(arguments: PlayArguments, console: Console) -> int:
             pictures(),
             fps=shots.fps,
             blend=blend,
-            encoder=encoder,
             replace=arguments.overwrite,
         )
-    console.info(f"Rendered {_describe_clip(shots, count)}; {encoder.description}:")
+    console.info(f"Rendered {_describe_clip(shots, count)}; {description}:")
     print(out)  # noqa: T201 - paths go to stdout, for scripts
     return DONE if count == total else INTERRUPTED
 

@@ -33,7 +33,7 @@ from apps.run.run_folder import RunFolder, claim_folder
 from capture.atomic_files import OutputFileList, atomic_file, write_text_atomically
 from capture.input_error import InputError
 from capture.live_sources import camera_address
-from capture.video import video_encoder
+from capture.video_writer import VP9, write_video
 from preprocess.body.body_surface import SkinPoints, splat_silhouette
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.observation import Observation, shrink_to_longer_side
@@ -248,7 +248,7 @@ def write_skeleton_film(path: Path, capture: Capture, doubts: Mapping[int, str])
     """Draw skeleton, body and mask over each frame, and why a frame is doubtful.
 
     Args:
-        path: Video to write, .webm or .mp4.
+        path: Video to write, .webm.
         capture: The video with its tracked poses and masks.
         doubts: Why frames are doubtful, by their numbers.
 
@@ -256,15 +256,13 @@ def write_skeleton_film(path: Path, capture: Capture, doubts: Mapping[int, str])
         Number of frames drawn.
 
     Raises:
-        InputError: If this OpenCV cannot write such a video.
         OSError: If it cannot be written.
     """
     source = capture.source
     count, duration = source.frame_count or 1, source.duration_s
     fps = min(60.0, max(1.0, count / duration)) if duration else 10.0
     with atomic_file(path) as part:
-        encoder = video_encoder(path.suffix, transparent=False)
-        return encoder.write(part, _draw_frames(capture, doubts), fps)
+        return write_video(part, _draw_frames(capture, doubts), fps, VP9)
 
 
 def _draw_frames(capture: Capture, doubts: Mapping[int, str]) -> Iterator[Rgb]:

@@ -8,7 +8,7 @@ import numpy as np
 import tyro
 from PIL import Image
 
-from apps.animation.clip_rendering import background_compositor
+from apps.animation.clip_file import background_compositor
 from apps.animation.driving_motion import FollowingCamera
 from capture.atomic_files import atomic_file
 from capture.source_opening import open_source

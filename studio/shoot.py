@@ -9,7 +9,6 @@ from os import cpu_count
 from pathlib import Path
 from typing import final
 
-import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
@@ -17,7 +16,9 @@ from capture.atomic_files import atomic_folder, check_replaceable_folder
 from capture.camera import Camera
 from capture.image_folder import write_png
 from capture.input_error import InputError
-from capture.video import lossless_video, video_encoder
+from capture.source import FrameSelection
+from capture.video import VideoFile
+from capture.video_writer import FFV1, VP9, open_video_writer, write_video
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.parametric_body import ShapedBody, load_body_model
 from preprocess.cameras.camera_file import CameraTrack, write_cameras
@@ -154,10 +155,10 @@ def _film(
     generator = np.random.default_rng([config.seed, 26])
     camera, body = scene.camera, scene.actor.shaped
     pictures = draw_ahead(lambda row: scene.frame(truth, row), frames)
-    with lossless_video(folder / "video.mp4", camera.size_px, config.fps, frames) as writer:
+    with open_video_writer(folder / "video.mp4", config.fps, FFV1) as write:
         for row, (rgb, alpha) in enumerate(pictures):
             stored = expose(rgb, gains[row], generator)
-            writer.write(np.ascontiguousarray(stored[..., ::-1]))
+            write(stored)
             joints = body.with_pose(truth[row]).joints()
             away = float(np.linalg.norm(joints[0] - camera.center_world))
             mask = segmenter.apply(
@@ -353,10 +354,9 @@ def _write_video(
     """video.mp4, lossless (FFV1), and masks/."""
     (folder / "masks").mkdir()
     generator = np.random.default_rng([config.seed, 5])
-    size_px = stage.cameras[0].size_px
-    with lossless_video(folder / "video.mp4", size_px, config.fps, len(motion)) as writer:
+    with open_video_writer(folder / "video.mp4", config.fps, FFV1) as write:
         for index, (rgb, alpha) in enumerate(stage.render_all(motion)):
-            writer.write(np.ascontiguousarray(rgb[..., ::-1]))
+            write(rgb)
             mask = add_mask_noise(alpha, config.mask_noise_px, generator)
             write_png(folder / "masks" / f"{index:04d}.png", _to_uint8(mask))
             done(index + 1)
@@ -364,11 +364,5 @@ def _write_video(
 
 def _write_preview(folder: Path, fps: float) -> None:
     """Write preview.webm: the film for browsers and phones, which play no lossless video."""
-
-    def frames() -> Iterator[UInt8[np.ndarray, "height width 3"]]:
-        video = cv2.VideoCapture(str(folder / "video.mp4"), cv2.CAP_FFMPEG)
-        while (read := video.read())[0]:
-            yield np.ascontiguousarray(read[1][..., ::-1])
-        video.release()
-
-    video_encoder(".webm", transparent=False).write(folder / "preview.webm", frames(), fps)
+    video = VideoFile(folder / "video.mp4", FrameSelection())
+    write_video(folder / "preview.webm", (frame.rgb for frame in video.frames()), fps, VP9)

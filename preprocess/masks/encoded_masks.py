@@ -1,6 +1,6 @@
 """Masks of all frames in one file: a video, or COCO's run-length encoding (RLE)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Shaped, UInt8
 
-from capture.image_folder import natural_sort_key, silence_opencv
+from capture.image_folder import natural_sort_key
 from capture.input_error import InputError
 from capture.source import FrameSelection
-from capture.video import VideoFile
+from capture.video import DecodedFrame, VideoFile
 
 MAX_RLE_PIXELS = 1 << 28
 """Largest number of pixels of one run-length encoded mask."""
@@ -30,15 +30,15 @@ RawMaskReader = Callable[[int], Shaped[np.ndarray, "height width"]]
 def open_mask_video(path: Path) -> tuple[int, RawMaskReader]:
     """Number of frames of a mask video, and the function that reads one."""
     source = VideoFile(path, FrameSelection())
-    return source.frames_in_file, _MaskVideo(path).read
+    return source.frames_in_file, _MaskVideo(source).read
 
 
 class _MaskVideo:
     """Random access to a video's frames; fast in ascending order."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._capture: cv2.VideoCapture | None = None
+    def __init__(self, video: VideoFile) -> None:
+        self._video = video
+        self._frames: Iterator[tuple[int, DecodedFrame]] = iter(())
         self._at = -1
         self._last: Float32[np.ndarray, "height width"] | None = None
 
@@ -46,17 +46,14 @@ class _MaskVideo:
         """Read the mask of one frame."""
         if row == self._at and self._last is not None:
             return self._last
-        if self._capture is None or row <= self._at:
-            silence_opencv()
-            self._capture, self._at = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG), -1
-        while self._at < row:
-            if not self._capture.grab():
-                raise InputError(f"Frame {row} of the masks {self._path} cannot be decoded.")
-            self._at += 1
-        ok, image = self._capture.retrieve()
-        if not ok:
-            raise InputError(f"Frame {row} of the masks {self._path} cannot be decoded.")
-        gray = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY).astype(np.float32)
+        if row <= self._at or self._at < 0:
+            self._frames = self._video.numbered()
+        self._at, frame = next((item for item in self._frames if item[0] >= row), (-1, None))
+        image = frame.rgb() if frame is not None and self._at == row else None
+        if image is None:
+            self._at = -1  # the next one starts anew
+            raise InputError(f"Frame {row} of the masks {self._video.path} cannot be decoded.")
+        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
         self._last = np.clip(
             (gray - np.float32(VIDEO_BLACK)) / np.float32(VIDEO_WHITE - VIDEO_BLACK), 0.0, 1.0
         )

@@ -8,7 +8,6 @@ import pytest
 from PIL import Image
 
 from capture.source_opening import open_source
-from capture.video_decoder import OpenCvDecoder
 from preprocess.capture_session import CaptureInputs
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
@@ -113,8 +112,7 @@ def test_one_opaque_picture_at_the_start_does_not_decide(folder):
 def test_an_unread_alpha_channel_is_reported_where_masks_are_estimated(
     capture, monkeypatch, masked
 ):
-    monkeypatch.setattr("capture.video_decoder.has_alpha_plane", lambda tag: True)
-    monkeypatch.setattr("capture.video.open_decoder", OpenCvDecoder)
+    monkeypatch.setattr("capture.video._has_transparency", lambda frame: True)
     if not masked:
         shutil.rmtree(capture / "masks")
     said = [n for n in open_capture(CaptureInputs(video=capture)).notes if "alpha" in n]

@@ -1,60 +1,11 @@
-"""HDR: seen in a file's index, and brought to the colors of other pictures."""
+"""HDR is brought to the colors of other pictures."""
 
+import av
 import numpy as np
 import pytest
 
+from capture.hdr_tone_mapping import HLG, PEAK_NITS, PQ, WHITE_NITS, tone_map_hdr
 from capture.source_opening import open_source
-from capture.video_decoder import (
-    HLG,
-    PEAK_NITS,
-    PQ,
-    WHITE_NITS,
-    OpenCvDecoder,
-    read_hdr_transfer,
-    tone_map_hdr,
-)
-
-
-def box(kind: bytes, content: bytes) -> bytes:
-    return (len(content) + 8).to_bytes(4, "big") + kind + content
-
-
-def color_box(transfer: int, kind: bytes = b"nclx") -> bytes:
-    return box(b"colr", kind + (9).to_bytes(2, "big") + transfer.to_bytes(2, "big") + b"\0\x09\0")
-
-
-def movie(*boxes: bytes, wide: bool = False) -> bytes:
-    head, media = box(b"ftyp", b"isom" * 4), bytes(5000) + b"colrnclx\0\x09\0\x10"
-    mdat = box(b"mdat", media)
-    if wide:
-        mdat = b"\0\0\0\x01mdat" + (len(media) + 16).to_bytes(8, "big") + media
-    return head + mdat + box(b"moov", box(b"trak", b"".join(boxes)))
-
-
-@pytest.mark.parametrize("wide", [False, True])
-@pytest.mark.parametrize(
-    ("boxes", "curve"),
-    [
-        ([color_box(HLG)], HLG),
-        ([color_box(PQ, b"nclc")], PQ),
-        ([color_box(1)], None),
-        ([box(b"colr", b"prof" + bytes(40)), color_box(HLG)], HLG),
-        ([], None),
-    ],
-)
-def test_a_files_index_tells_its_curve_and_its_pictures_do_not(tmp_path, boxes, curve, wide):
-    path = tmp_path / "video.mov"
-    path.write_bytes(movie(*boxes, wide=wide))
-    assert read_hdr_transfer(path) == curve
-
-
-@pytest.mark.parametrize(
-    "data", [b"", b"abc", bytes(64), b"\xff\xff\xff\xffmdat", b"\0\0\0\x01moov"]
-)
-def test_what_is_no_movie_has_no_curve(tmp_path, data):
-    path = tmp_path / "video.mp4"
-    path.write_bytes(data)
-    assert read_hdr_transfer(path) is None
 
 
 def code_of(nits: float, curve: int) -> int:
@@ -104,13 +55,8 @@ def test_a_grey_stays_grey_and_a_skin_tone_stays_its_hue():
     np.testing.assert_allclose(hue(low), hue(high), atol=0.02)
 
 
-# --- a real file, where its writer is installed --------------------------------------------------
-
-
 @pytest.fixture
 def write_hdr(tmp_path):
-    av = pytest.importorskip("av", reason="PyAV (extra [video]) writes the test's HDR video")
-
     def write(curve: int, name: str = "hdr.mp4"):
         path = tmp_path / name
         with av.open(str(path), "w") as container:
@@ -144,16 +90,3 @@ def test_an_hdr_video_comes_in_sdr_and_without_a_warning(write_hdr, curve):
     assert len(frames) == 6
     assert np.abs(frames[0].rgb.astype(int) - expected.astype(int)).max() <= 3
     assert not source.warnings
-
-
-def test_without_pyav_an_hdr_video_is_read_and_warned_of(write_hdr, monkeypatch):
-    path = write_hdr(HLG)
-    monkeypatch.setattr("capture.video.open_decoder", OpenCvDecoder)
-    source = open_source(path)
-    assert len(list(source.frames())) == 6
-    assert "HDR video" in source.warnings[0]
-    assert "[video]" in source.warnings[0]
-
-
-def test_an_ordinary_video_is_not_warned_of(write_video):
-    assert not open_source(write_video(frames=3)).warnings

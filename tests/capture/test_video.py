@@ -3,12 +3,14 @@
 import os
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 
 from capture.input_error import InputError
+from capture.source import FrameSelection
 from capture.source_opening import open_source
-from capture.video_decoder import OpenCvDecoder, PyAvDecoder, has_alpha_plane
+from capture.video import VideoFile
 
 
 def greys(frames) -> list[int]:
@@ -188,21 +190,8 @@ def test_pixels_that_are_not_square_are_named_with_a_cure(write_video, with_pixe
     assert "ffmpeg -i video.mp4 -vf scale=iw*sar:ih,setsar=1" in told
 
 
-@pytest.mark.parametrize(
-    ("tag", "expected"),
-    [(b"Y4\x00\x0c", True), (b"Y4\x0b\x08", True), (b"ARGB", True), (b"RGBA", True),
-     (b"G4\x00\x08", True), (b"BGRA", False), (b"I420", False), (b"Y3\x0b\x0a", False)],
-)  # fmt: skip
-def test_formats_with_an_alpha_channel_are_known_by_their_tags(tag, expected):
-    assert has_alpha_plane(int.from_bytes(tag, "little", signed=True)) == expected
-    assert not has_alpha_plane(-1)
-
-
 @pytest.mark.parametrize("opaque", [False, True])
-@pytest.mark.parametrize("decoder", [PyAvDecoder, OpenCvDecoder])
-def test_a_videos_alpha_channel_is_known_to_be_left_out(tmp_path, decoder, opaque):
-    """PyAV looks whether it is opaque; OpenCV cannot."""
-    av = pytest.importorskip("av", reason="PyAV (extra [video]) writes the test's video")
+def test_a_videos_alpha_channel_is_known_to_be_left_out_unless_it_is_opaque(tmp_path, opaque):
     rgba = np.full((32, 32, 4), 255, np.uint8)
     rgba[8:24, :, 3] = 255 if opaque else 0
     with av.open(str(tmp_path / "cut.mov"), "w") as container:
@@ -211,5 +200,4 @@ def test_a_videos_alpha_channel_is_known_to_be_left_out(tmp_path, decoder, opaqu
         stream.pix_fmt = "argb"
         frame = av.VideoFrame.from_ndarray(rgba, format="rgba").reformat(format="argb")
         container.mux([*stream.encode(frame), *stream.encode(None)])
-    found = decoder(tmp_path / "cut.mov").has_unread_alpha
-    assert found == (decoder is OpenCvDecoder or not opaque)
+    assert VideoFile(tmp_path / "cut.mov", FrameSelection()).has_unread_alpha != opaque

@@ -1,35 +1,13 @@
 """What is written of pictures, and with what."""
 
-import importlib.util
-
+import av
 import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
-from apps.animation.clip_rendering import (
-    background_compositor,
-    check_clip_path,
-    choose_encoder,
-    write_clip,
-)
-from capture import video as video_module
+from apps.animation.clip_file import background_compositor, check_clip_path, write_clip
 from capture.input_error import InputError
-
-needs_av = pytest.mark.skipif(
-    importlib.util.find_spec("av") is None, reason="the extra [video] is not installed"
-)
-
-
-@pytest.fixture(params=["av", "opencv"])
-def library(request, monkeypatch):
-    """With and without the extra [video]."""
-    if request.param == "av":
-        if importlib.util.find_spec("av") is None:
-            pytest.skip("the extra [video] is not installed")
-    else:
-        monkeypatch.setattr(video_module, "_pyav_has", lambda codec: False)
-    return request.param
 
 
 def disc(count, *, height=60, width=80):
@@ -44,7 +22,7 @@ def disc(count, *, height=60, width=80):
 
 
 def written(path, pictures, *, blend, fps=25.0):
-    return write_clip(path, pictures, fps=fps, blend=blend, encoder=choose_encoder(path, blend))
+    return write_clip(path, pictures, fps=fps, blend=blend)
 
 
 def shown(path):
@@ -58,7 +36,7 @@ def shown(path):
 
 @pytest.mark.parametrize("suffix", [".webm", ".mp4"])
 @pytest.mark.parametrize("color", ["#808080", "#4080c0", "#c8d2dc"])
-def test_a_video_has_the_colors_that_were_drawn(tmp_path, library, suffix, color):
+def test_a_video_has_the_colors_that_were_drawn(tmp_path, suffix, color):
     path, blend = tmp_path / f"clip{suffix}", background_compositor(color)
     assert written(path, disc(6), blend=blend) == 6
     frames, fps = shown(path)
@@ -71,7 +49,7 @@ def test_a_video_has_the_colors_that_were_drawn(tmp_path, library, suffix, color
 
 
 @pytest.mark.parametrize("suffix", [".webm", ".mp4"])
-def test_odd_sizes_and_odd_rates_are_written(tmp_path, library, suffix):
+def test_odd_sizes_and_odd_rates_are_written(tmp_path, suffix):
     path = tmp_path / f"clip{suffix}"
     pictures = disc(5, height=61, width=79)
     assert written(path, pictures, blend=background_compositor("black"), fps=23.976) == 5
@@ -80,13 +58,9 @@ def test_odd_sizes_and_odd_rates_are_written(tmp_path, library, suffix):
     assert fps == pytest.approx(23.976, rel=1e-3)
 
 
-@needs_av
-def test_with_the_extra_an_mp4_is_h264_and_a_webm_is_vp9(tmp_path):
-    import av
-
-    for name, codec, word in (("a.mp4", "h264", "everywhere"), ("a.webm", "vp9", "browsers")):
+def test_an_mp4_is_h264_and_a_webm_is_vp9(tmp_path):
+    for name, codec in (("a.mp4", "h264"), ("a.webm", "vp9")):
         path = tmp_path / name
-        assert word in choose_encoder(path, background_compositor("white")).description
         written(path, disc(3), blend=background_compositor("white"))
         with av.open(str(path)) as file:
             stream = file.streams.video[0]
@@ -97,10 +71,7 @@ def test_with_the_extra_an_mp4_is_h264_and_a_webm_is_vp9(tmp_path):
         assert 255 - first[:8].mean() < 0.5
 
 
-@needs_av
 def test_a_webm_keeps_soft_alpha(tmp_path):
-    import av
-
     path = tmp_path / "a.webm"
     written(path, disc(4), blend=None)
     decoder, frames = av.CodecContext.create("libvpx-vp9", "r"), []
@@ -114,18 +85,9 @@ def test_a_webm_keeps_soft_alpha(tmp_path):
         assert np.abs(alpha - rgba[..., 3]).mean() < 2.0
 
 
-def test_without_the_extra_the_fallback_codec_is_named(monkeypatch, tmp_path):
-    monkeypatch.setattr(video_module, "_pyav_has", lambda codec: False)
-    white = background_compositor("white")
-    assert "VP8" in choose_encoder(tmp_path / "a.webm", white).description
-    monkeypatch.setattr(video_module, "_opencv_has", lambda code: False)
-    assert "browsers do not play it" in choose_encoder(tmp_path / "a.mp4", white).description
-    monkeypatch.setattr(video_module, "_opencv_has", lambda code: code == "avc1")
-    assert "H.264" in choose_encoder(tmp_path / "a.mp4", white).description
-    with pytest.raises(InputError, match=r"\[video\]"):
-        choose_encoder(tmp_path / "a.webm", None)
+def test_an_mp4_keeps_no_alpha(tmp_path):
     with pytest.raises(InputError, match="no transparency"):
-        choose_encoder(tmp_path / "a.mp4", None)
+        written(tmp_path / "a.mp4", disc(1), blend=None)
 
 
 def frames_in(path):
@@ -181,7 +143,7 @@ def test_a_png_is_one_picture_exactly(tmp_path):
 
 def test_nothing_but_frames_is_replaced(tmp_path):
     out = tmp_path / "frames"
-    write_clip(out, disc(1), fps=30.0, blend=None, encoder=choose_encoder(out, None))
+    written(out, disc(1), blend=None)
     check_clip_path(out, [], overwrite=False)
     (out / "0001.png").write_bytes(b"mine")
     for overwrite in (False, True):

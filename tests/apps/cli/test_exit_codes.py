@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from rich.console import Console as RichConsole
 
-from apps.animation.clip_rendering import background_compositor
+from apps.animation.clip_file import background_compositor
 from apps.cli.command_line import CommandExit, run_command, stop_on_interrupt
 from apps.cli.console import MAX_PRINTED_WARNINGS, Console, format_duration
 from capture.image_folder import read_image
