@@ -9,7 +9,7 @@ from importlib.util import find_spec
 from apps.capture_validation import correction_hint, preflight_check
 from apps.cli.command_line import (
     exit_on_interrupt,
-    fill_optional_port,
+    fill_optional_value,
     parse_arguments,
     run_command,
 )
@@ -31,7 +31,7 @@ from preprocess.fitting.capture_fitting import apply_fit, fit_capture
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
-    words = fill_optional_port(sys.argv[1:] if argv is None else argv, "--view", VIEW_PORT)
+    words = fill_optional_value(sys.argv[1:] if argv is None else argv, "--view", VIEW_PORT)
     arguments = parse_arguments(IngestArguments, PROGRAM, words)
     return run_command(PROGRAM, lambda: ingest(arguments, Console()))
 

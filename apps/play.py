@@ -12,8 +12,7 @@ from apps.cli.command_line import (
     BAD_INPUT,
     DONE,
     INTERRUPTED,
-    fill_optional_number,
-    fill_optional_port,
+    fill_optional_value,
     parse_arguments,
     run_command,
 )
@@ -27,8 +26,8 @@ if TYPE_CHECKING:  # onnxruntime is loaded after --help has been answered
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
-    words = fill_optional_port(sys.argv[1:] if argv is None else argv, "--web", WEB_PORT)
-    words = fill_optional_number(words, "--turntable", DEFAULT_TURN_S)
+    words = fill_optional_value(sys.argv[1:] if argv is None else argv, "--web", WEB_PORT)
+    words = fill_optional_value(words, "--turntable", DEFAULT_TURN_S)
     given = parse_arguments(PlayArguments, "ia-play", words)
     return run_command("ia-play", lambda: play(given, Console()))
 

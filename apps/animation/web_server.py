@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from apps.animation.driving_motion import FollowingCamera
-from apps.cli.command_line import DONE, interrupt_event, parse_arguments, run_command
+from apps.cli.command_line import DONE, stop_on_interrupt, parse_arguments, run_command
 from apps.cli.console import Console
 from capture.atomic_files import atomic_folder
 from capture.input_error import InputError
@@ -80,7 +80,7 @@ def serve_site(files: Mapping[str, bytes], port: int, console: Console) -> None:
     """
     server = make_server(files, port)
     address = f"http://{HOST}:{server.server_port}"
-    with interrupt_event() as ended:
+    with stop_on_interrupt(console, "closing the server") as ended:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         console.info("Open this address in a browser of this machine; Ctrl-C stops the server:")
         print(address, flush=True)  # noqa: T201 - the address goes to stdout, for scripts

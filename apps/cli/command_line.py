@@ -4,28 +4,27 @@ The first Ctrl-C requests a stop, the second one quits.
 """
 
 import errno
-import io
+import inspect
 import os
 import re
-import shutil
 import signal
 import sys
-import textwrap
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stdout
-from dataclasses import field, fields, make_dataclass
+from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
-from typing import Annotated, Any, TypeVar
+from itertools import zip_longest
+from typing import Any, TypeVar
 
 import tyro
+from rich.console import Console as RichConsole
 from rich.markup import escape
 
 from apps.cli.console import Console, StderrConsole
 from capture.input_error import InputError
 
-INTERRUPTED = 130
-"""Exit code of a command that Ctrl-C ended."""
+DONE, NO_AVATAR, BAD_INPUT, RESOURCE_UNAVAILABLE, INTERRUPTED = 0, 1, 2, 3, 130
+"""Exit codes; 1: trained, but the avatar is not usable (failed, or nothing to draw)."""
 
 
 @contextmanager
@@ -44,7 +43,7 @@ def handle_signals(handlers: dict[signal.Signals, Callable[[int, Any], object]])
 
 @contextmanager
 def stop_on_interrupt(
-    console: Console, saving_message: str = "saving the checkpoint"
+    console: Console, closing_message: str = "saving the checkpoint"
 ) -> Iterator[threading.Event]:
     """Yield an event that the first Ctrl-C sets; the second raises KeyboardInterrupt.
 
@@ -52,14 +51,14 @@ def stop_on_interrupt(
 
     Args:
         console: Shows that the work is stopping.
-        saving_message: What happens to the work done.
+        closing_message: What happens before the end.
     """
     stop = threading.Event()
 
     def first(signal_number: int, frame: object) -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         stop.set()
-        console.info(f"Stopping; {saving_message}. Press Ctrl-C again to quit immediately.")
+        console.info(f"Stopping; {closing_message}. Press Ctrl-C again to quit immediately.")
 
     with handle_signals({signal.SIGINT: first}):
         yield stop
@@ -89,36 +88,6 @@ def exit_on_interrupt(
         yield
 
 
-@contextmanager
-def record_interrupt() -> Iterator[threading.Event]:
-    """Yield an event that Ctrl-C sets; KeyboardInterrupt is still raised.
-
-    A module being imported may turn the exception into its own error; the event remains set.
-    SIGTERM is treated like Ctrl-C. On other threads than the main one the event is never set.
-    """
-    came = threading.Event()
-
-    def note(signal_number: int, frame: object) -> None:
-        came.set()
-        raise KeyboardInterrupt
-
-    ends = {signal.SIGINT: note, signal.SIGTERM: lambda *_: signal.raise_signal(signal.SIGINT)}
-    with handle_signals(ends):
-        yield came
-
-
-@contextmanager
-def interrupt_event() -> Iterator[threading.Event]:
-    """Yield an event that Ctrl-C sets without raising an exception.
-
-    A KeyboardInterrupt could be swallowed by the callback that it is raised in. On other threads
-    than the main one the event is never set.
-    """
-    ended = threading.Event()
-    with handle_signals({signal.SIGINT: lambda *_: ended.set()}):
-        yield ended
-
-
 LEARN_PACKAGES = frozenset({"torch", "numba", "onnx"})
 """Large packages of the extra [learn], which playing does not need."""
 SMALL_PACKAGES = frozenset({"trimesh", "pycolmap", "fast_simplification"})
@@ -139,15 +108,11 @@ def install_advice(error: ModuleNotFoundError) -> str | None:
     return None
 
 
-DONE, NO_AVATAR, BAD_INPUT, RESOURCE_UNAVAILABLE = 0, 1, 2, 3
-"""Exit codes; 1: trained, but the avatar is not usable (failed, or nothing to draw)."""
-
 DISK_FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """Disk full, quota exceeded, or file too large."""
-PERMISSION_ERRNOS = frozenset({errno.EACCES, errno.EPERM, errno.EROFS})
-"""Missing permission to read or write."""
 PATH_ERRNOS = frozenset(
-    {errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP, errno.EEXIST}
+    {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.EISDIR}
+    | {errno.ENAMETOOLONG, errno.ELOOP, errno.EEXIST}
 )
 """Paths that cannot be read or written."""
 DEVICE_BUSY_PHRASES = ("out of memory", "busy or unavailable", "not enough memory")
@@ -167,54 +132,70 @@ def run_command(program: str, work: Callable[[], int]) -> int:
     """Run a command; turn failures of user and machine into one message and an exit code.
 
     No usable avatar is 1, bad input or a missing package 2, a full disk or a busy device 3, Ctrl-C
-    130. Bugs keep their traceback.
+    and SIGTERM 130. Bugs keep their traceback.
 
     Args:
         program: Name of the command, in front of the message.
         work: Returns the exit code of a command that does not fail.
     """
-    with record_interrupt() as interrupted:
+    interrupted = threading.Event()
+
+    def interrupt(signal_number: int, frame: object) -> None:
+        interrupted.set()
+        raise KeyboardInterrupt
+
+    terminate = {signal.SIGTERM: lambda *_: signal.raise_signal(signal.SIGINT)}
+    with handle_signals({signal.SIGINT: interrupt, **terminate}):
         try:
-            return _run_translating_errors(program, work)
-        except Exception:
-            if not interrupted.is_set():
+            return work()
+        except BaseException as error:
+            failure = describe_failure(error)
+            if failure is None and interrupted.is_set():  # an import made another error of it
+                failure = INTERRUPTED, "stopped by Ctrl-C."
+            if failure is None:
                 raise
-    print_error(program, "stopped by Ctrl-C.")
-    return INTERRUPTED
-
-
-def _run_translating_errors(program: str, work: Callable[[], int]) -> int:
-    try:
-        return work()
-    except (Exception, KeyboardInterrupt) as error:
-        failure = describe_failure(error)
-        if failure is None:
-            raise
-        print_error(program, failure[1])
-        return failure[0]
+    code, message = failure
+    StderrConsole().print(f"[bold red]{program}:[/] {escape(message)}", highlight=False)
+    return code
 
 
 def describe_failure(error: BaseException) -> tuple[int, str] | None:
     """Return exit code and message of what user or machine has caused; None for a bug."""
-    match error:
-        case CommandExit():
-            return error.code, str(error)
-        case InputError():
-            return BAD_INPUT, str(error)
-        case ModuleNotFoundError():
-            advice = install_advice(error)
-            return None if advice is None else (BAD_INPUT, advice)
-        case KeyboardInterrupt():
-            return INTERRUPTED, _with_notes("stopped by Ctrl-C.", error)
-        case OSError() | RuntimeError() | MemoryError():
-            failure = _machine_failure(error)
-            return None if failure is None else (failure[0], _with_notes(failure[1], error))
+    if isinstance(error, CommandExit):
+        return error.code, str(error)
+    if isinstance(error, InputError):
+        return BAD_INPUT, str(error)
+    if isinstance(error, ModuleNotFoundError):
+        advice = install_advice(error)
+        return None if advice is None else (BAD_INPUT, advice)
+    failure = None
+    if isinstance(error, KeyboardInterrupt):
+        failure = INTERRUPTED, "stopped by Ctrl-C."
+    elif isinstance(error, OSError):
+        failure = _system_failure(error)
+    elif isinstance(error, RuntimeError | MemoryError):
+        message = str(error).strip() or "out of memory"
+        is_busy = any(phrase in message.lower() for phrase in DEVICE_BUSY_PHRASES)
+        if is_busy or isinstance(error, MemoryError):
+            reason = message.splitlines()[0]
+            failure = (
+                RESOURCE_UNAVAILABLE,
+                f"the device is out of memory or busy ({reason}). Try a smaller --size.",
+            )
+    if failure is None:
+        return None
+    return failure[0], " ".join([failure[1], *getattr(error, "__notes__", [])])
+
+
+def _system_failure(error: OSError) -> tuple[int, str] | None:
+    reason = f"{error.strerror}: {error.filename}" if error.filename else error.strerror
+    if is_disk_full(error):
+        return RESOURCE_UNAVAILABLE, f"the disk is full ({reason}). Free some space."
+    if error.errno == errno.EBUSY:
+        return RESOURCE_UNAVAILABLE, f"a device is busy ({reason})."
+    if error.errno in PATH_ERRNOS:
+        return BAD_INPUT, f"cannot read or write ({reason}). Choose another path."
     return None
-
-
-def print_error(program: str, message: str) -> None:
-    """Print one message to stderr."""
-    StderrConsole().print(f"[bold red]{program}:[/] {escape(message)}", highlight=False)
 
 
 def is_disk_full(error: OSError) -> bool:
@@ -222,48 +203,10 @@ def is_disk_full(error: OSError) -> bool:
     return error.errno in DISK_FULL_ERRNOS
 
 
-def _machine_failure(error: OSError | RuntimeError | MemoryError) -> tuple[int, str] | None:
-    """Exit code and message of what the machine could not do; None for everything else."""
-    if isinstance(error, OSError):
-        why = f"{error.strerror}: {error.filename}" if error.filename else error.strerror
-        if is_disk_full(error):
-            return (
-                RESOURCE_UNAVAILABLE,
-                f"the disk is full ({why}). Free some space.",
-            )
-        if error.errno == errno.EBUSY:
-            return RESOURCE_UNAVAILABLE, f"a device is busy ({why})."
-        if error.errno in PERMISSION_ERRNOS | PATH_ERRNOS:
-            return BAD_INPUT, f"cannot read or write ({why}). Choose another path."
-        return None
-    message = str(error).strip() or "out of memory"
-    if isinstance(error, MemoryError) or any(
-        words in message.lower() for words in DEVICE_BUSY_PHRASES
-    ):
-        first = message.splitlines()[0]
-        return (
-            RESOURCE_UNAVAILABLE,
-            f"the device is out of memory or busy ({first}). Try a smaller --size.",
-        )
-    return None
-
-
-def _with_notes(message: str, error: BaseException) -> str:
-    return " ".join([message, *getattr(error, "__notes__", [])])
-
-
 DISTRIBUTION = "instant-avatar-stream"
 """Name of the installed package."""
 
-HELP_FLAGS = frozenset({"-h", "--help"})
-"""Flags that print the help."""
-
 Arguments = TypeVar("Arguments")
-Flag = Annotated[
-    bool,
-    tyro.conf.FlagCreatePairsOff,
-    tyro.conf.arg(help="Print the version and exit.", help_behavior_hint=""),
-]
 
 
 def parse_arguments(
@@ -281,30 +224,13 @@ def parse_arguments(
     """
     argv = sys.argv[1:] if argv is None else list(argv)
     if "--version" in argv:
-        print(f"{program} ({DISTRIBUTION}) {_installed_version()}")  # noqa: T201 - the answer to --version
+        print(f"{program} ({DISTRIBUTION}) {_installed_version()}")  # noqa: T201 - the answer
         raise SystemExit(0)
-    own: list[tuple[str, Any, Any]] = [("version", Flag, field(default=False))]
-    both: Any = make_dataclass(
-        arguments_type.__name__, own, bases=(arguments_type,), frozen=True, kw_only=True
-    )
-    both.__doc__ = arguments_type.__doc__
-    if HELP_FLAGS.isdisjoint(argv):
-        parsed = tyro.cli(both, prog=program, args=argv)
-    else:
-        parsed = _parse_with_wrapped_help(both, program, argv)
-    given = {each.name: getattr(parsed, each.name) for each in fields(both)}
-    del given["version"]
-    return arguments_type(**given)
-
-
-def _parse_with_wrapped_help(arguments_type: Any, program: str, argv: Sequence[str]) -> Any:
-    """Parse like tyro, but wrap the paragraphs of --help to the terminal."""
-    captured = _CapturedStdout()
-    try:
-        with redirect_stdout(captured):
-            return tyro.cli(arguments_type, prog=program, args=argv)
-    finally:
-        print(_wrap_paragraphs(captured.getvalue()), end="")  # noqa: T201 - the answer to --help
+    if {"-h", "--help"} & set(argv):  # tyro would not wrap paragraphs
+        about = f"{inspect.getdoc(arguments_type)}\n\n--version prints the version and exits.\n"
+        paragraphs = re.sub(r"(?<=\S)\n(?=\w)", " ", about)
+        RichConsole(highlight=False, markup=False).print(paragraphs)
+    return tyro.cli(arguments_type, prog=program, args=argv, description="")
 
 
 def _installed_version() -> str:
@@ -315,51 +241,11 @@ def _installed_version() -> str:
         return "(checkout, not installed)"
 
 
-class _CapturedStdout(io.StringIO):
-    """Captures what is printed, with the colors and the encoding of stdout."""
-
-    encoding = property(lambda self: getattr(sys.__stdout__, "encoding", "utf-8"))  # type: ignore[assignment]
-
-    def isatty(self) -> bool:
-        return sys.__stdout__ is not None and sys.__stdout__.isatty()
-
-
-def _wrap_paragraphs(text: str) -> str:
-    """Wrap paragraphs, each of which tyro prints as one line, to the terminal's width."""
-    width = shutil.get_terminal_size().columns
-    lines = [
-        textwrap.fill(line, width) if line[:1].isalpha() or line[:1].isdigit() else line
-        for line in text.split("\n")
-    ]
-    return re.sub(r"\n{3,}", "\n\n", "\n".join(lines))
-
-
-def fill_optional_port(argv: Sequence[str], flag: str, port: int) -> list[str]:
-    """Insert a default port after a flag that has none."""
-    return _fill_optional(argv, flag, str(port), lambda word: word.isdecimal())
-
-
-def fill_optional_number(argv: Sequence[str], flag: str, value: float) -> list[str]:
-    """Insert a default number after a flag that has none."""
-    return _fill_optional(argv, flag, f"{value:g}", _is_number)
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
-
-
-def _fill_optional(
-    argv: Sequence[str], flag: str, value: str, is_value: Callable[[str], bool]
-) -> list[str]:
-    """Insert a value after a flag unless one follows; argparse would take any next word."""
-    filled: list[str] = []
-    for place, word in enumerate(argv):
-        filled.append(word)
-        after = argv[place + 1] if place + 1 < len(argv) else ""
-        if word == flag and not is_value(after):
-            filled.append(value)
-    return filled
+def fill_optional_value(argv: Sequence[str], flag: str, value: float) -> list[str]:
+    """Insert a default number after a flag that no number follows."""
+    words: list[str] = []
+    for word, following in zip_longest(argv, argv[1:], fillvalue=""):
+        words.append(word)
+        if word == flag and not re.fullmatch(r"-?[\d.]+|nan", following):
+            words.append(f"{value:g}")
+    return words

@@ -58,7 +58,6 @@ class Console:
         """Write to stderr, unless another console is given."""
         self._rich = console or StderrConsole()
         self.warnings: list[str] = []
-        self._discarded_warnings = 0
 
     @property
     def is_terminal(self) -> bool:
@@ -81,10 +80,7 @@ class Console:
 
     def warning(self, message: str) -> None:
         """Print and keep a warning, once."""
-        if message in self.warnings:
-            return
-        if len(self.warnings) == MAX_KEPT_WARNINGS:
-            self._discarded_warnings += 1
+        if message in self.warnings or len(self.warnings) == MAX_KEPT_WARNINGS:
             return
         self.warnings.append(message)
         if len(self.warnings) <= MAX_PRINTED_WARNINGS:
@@ -94,9 +90,7 @@ class Console:
         """Print how many warnings were not printed."""
         rest = len(self.warnings) - MAX_PRINTED_WARNINGS
         if rest > 0:
-            lost = self._discarded_warnings
-            beyond = f", and {lost} that are not" if lost else ""
-            self._rich.print(f"[yellow]warning:[/] … and {rest} more, all in the report{beyond}")
+            self._rich.print(f"[yellow]warning:[/] … and {rest} more, all in the report")
 
     @contextmanager
     def status(self, message: str) -> Iterator[Callable[[str], None]]:

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from apps.cli.command_line import interrupt_event
+from apps.cli.command_line import stop_on_interrupt
 from apps.cli.console import Console
 from apps.report.report_figures import CoverageMap
 from apps.report.report_schema import format_percent, provisional_verdict
@@ -110,7 +110,7 @@ class LiveViewer:
         status = f"Done after {session.trainer.wall_seconds:.0f} s"
         self._note = f"The avatar: {self._run.package}"
         self._next_panel = 0.0
-        with interrupt_event() as ended:
+        with stop_on_interrupt(self._console, "closing the page") as ended:
             while not ended.wait(0.02):
                 self._update_page(session, status, idle=True)
 

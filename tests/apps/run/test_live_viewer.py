@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from apps import ingest
-from apps.cli.command_line import fill_optional_port
+from apps.cli.command_line import fill_optional_value
 from apps.run.ingest_arguments import VIEW_PORT
 from export.player import Player
 from tests.apps.browser import Browser, chromium, until
@@ -159,7 +159,7 @@ def test_the_port_may_be_left_out(words, port):
 
     from apps.run.ingest_arguments import IngestArguments
 
-    given = tyro.cli(IngestArguments, args=fill_optional_port(words, "--view", VIEW_PORT))
+    given = tyro.cli(IngestArguments, args=fill_optional_value(words, "--view", VIEW_PORT))
     assert given.view == port
     assert given.video == Path("v.mp4")
 
