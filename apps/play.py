@@ -86,9 +86,7 @@ def _render_clip(arguments: PlayArguments, console: Console) -> int:
     ):
 
         def pictures() -> Iterator[np.ndarray]:
-            drawn = player.render_all(
-                shots, workers=arguments.worker_count, samples=arguments.samples
-            )
+            drawn = player.render_all(shots, workers=arguments.worker_count)
             for done, picture in enumerate(drawn):
                 bar.update(float(done), f"{done}/{total} frames")
                 yield picture
@@ -141,21 +139,16 @@ def _run_benchmark(arguments: PlayArguments, console: Console) -> int:
         load_ms=load_ms,
         tier=arguments.tier,
         workers=arguments.workers or 1,
-        samples=arguments.samples,
     )
     if arguments.json is not None:
         write_text_atomically(arguments.json, result.to_json(), replace=arguments.overwrite)
     console.info(
         f"{result.cpu_ms_per_frame:.1f} CPU-ms per {result.size} px frame, "
-        f"{result.pictures_per_second:.1f} frames/s with {_format_workers(result.workers)} "
+        f"{result.pictures_per_second:.1f} frames/s with --workers {result.workers} "
         f"({result.frames} frames, {result.pixels_covered:.0%} covered, {result.provider}); "
         f"loaded in {result.load_ms:.0f} ms; reference graph {result.reference_ms:.1f} ms"
     )
     return DONE
-
-
-def _format_workers(workers: int) -> str:
-    return "1 worker" if workers == 1 else f"{workers} workers"
 
 
 def _run_web(arguments: PlayArguments, port: int, console: Console) -> int:
@@ -197,17 +190,17 @@ def _run_web(arguments: PlayArguments, port: int, console: Console) -> int:
 
 
 def _run_verification(arguments: PlayArguments, console: Console) -> int:
-    from apps.animation.player_checks import verify_package
+    from apps.animation.player_checks import to_json_text, verdict_lines, verify_package
     from capture.atomic_files import write_text_atomically
 
-    verdict = verify_package(arguments.avatar, provider=arguments.provider)
+    result = verify_package(arguments.avatar, provider=arguments.provider)
     if arguments.json is not None:
-        write_text_atomically(arguments.json, verdict.to_json(), replace=arguments.overwrite)
-    for note in verdict.warnings:
+        write_text_atomically(arguments.json, to_json_text(result), replace=arguments.overwrite)
+    for note in result["warnings"]:
         console.warning(note)
-    for line in verdict.to_lines():
+    for line in verdict_lines(result):
         console.info(line)
-    return DONE if verdict.matches else BAD_INPUT
+    return DONE if result["verdict"] == "same" else BAD_INPUT
 
 
 if __name__ == "__main__":

@@ -39,8 +39,9 @@ from preprocess.capture_paths import find_own_masks
 WEIGHTS = ROOT / "preprocess" / "tracking" / "weights"
 """What tracking adds to the installation."""
 OTHER_PACKAGES = frozenset({
-    "jaxtyping", "numpy", "onnxruntime", "opencv-contrib-python-headless", "pillow", "rich",
-    "scipy", "tyro", "numba", "onnx", "pycolmap", "torch", "trimesh", "fast-simplification",
+    "av", "filelock", "jaxtyping", "jinja2", "numpy", "onnxruntime", "pillow", "psutil", "rich",
+    "opencv-contrib-python-headless", "scipy", "tyro", "numba", "onnx", "pycolmap", "torch",
+    "trimesh", "fast-simplification",
 })  # fmt: skip
 """What playing, learning and exporting need without a tracker."""
 AVATAR_TARGETS = {

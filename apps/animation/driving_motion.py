@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from apps.animation.play_arguments import Viewpoint
+from apps.animation.play_arguments import CLOSE_UP_ZOOM, Viewpoint
 from apps.cli.console import Console
 from capture.camera import Camera
 from capture.input_error import InputError
@@ -48,14 +48,9 @@ def demo_motion(frames: int = 48, *, fps: float = 16.0) -> Motion:
     steps = np.sin(2.0 * phase)
     joints = np.zeros((frames, 23, 3))
     limbs = np.zeros((frames, 8, 3))
-    limbs[:, L_HIP, 0], limbs[:, R_HIP, 0] = (
-        -0.9 * _positive_part(steps),
-        -0.9 * _positive_part(-steps),
-    )
-    limbs[:, L_KNEE, 0], limbs[:, R_KNEE, 0] = (
-        1.3 * _positive_part(steps),
-        1.3 * _positive_part(-steps),
-    )
+    left, right = np.maximum(steps, 0.0), np.maximum(-steps, 0.0)
+    limbs[:, L_HIP, 0], limbs[:, R_HIP, 0] = -0.9 * left, -0.9 * right
+    limbs[:, L_KNEE, 0], limbs[:, R_KNEE, 0] = 1.3 * left, 1.3 * right
     limbs[:, L_HIP, 2], limbs[:, R_HIP, 2] = 0.08, -0.08
     limbs[:, L_SHOULDER, 2] = -0.85 + 0.75 * (1.0 - np.cos(phase))
     limbs[:, R_SHOULDER, 2] = 0.85 - 0.35 * (1.0 - np.cos(2.0 * phase))
@@ -73,10 +68,6 @@ def demo_motion(frames: int = 48, *, fps: float = 16.0) -> Motion:
         body_model="body24",
         times_s=np.arange(frames) / fps,
     )
-
-
-def _positive_part(wave: Float[np.ndarray, "frames"]) -> Float[np.ndarray, "frames"]:
-    return np.maximum(wave, 0.0)
 
 
 def load_driving_motion(
@@ -258,20 +249,16 @@ class FollowingCamera:
 
     def camera_for(self, pose: BodyPose, seconds: float = 0.0) -> Camera:
         """Return the camera for a pose, `seconds` after the first frame."""
-        view, (width, height) = self.viewpoint, self.size_px
+        width, height = self.size_px
         away = DISTANCE_HEIGHTS * self.height_m
-        focal = (
-            PERSON_HEIGHT_SHARE
-            * min(height, MAX_HEIGHT_OVER_WIDTH * width)
-            * away
-            / self.height_m
-            * view.zoom
-        )
-        axes = view.rotation_at(seconds) @ self.level_axes
+        person_px = PERSON_HEIGHT_SHARE * min(height, MAX_HEIGHT_OVER_WIDTH * width)
+        zoom = 1.0 if self.viewpoint.joint is None else CLOSE_UP_ZOOM
+        focal = person_px * away / self.height_m * zoom
+        axes = self.viewpoint.rotation_at(seconds) @ self.level_axes
         camera_from_world = np.eye(4)
         camera_from_world[:3, :3] = axes
         camera_from_world[:3, 3] = -axes @ self._look_at_point(pose)
-        camera_from_world[2, 3] += view.distance_m or away
+        camera_from_world[2, 3] += away
         return Camera(
             focal_px=(focal, focal),
             center_px=(width / 2.0, height / 2.0),

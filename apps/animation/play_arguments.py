@@ -7,10 +7,10 @@ from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import Positional, arg
 
 from apps.cli.hardware import usable_cores
-from apps.cli.shared_options import check_output_file
+from apps.cli.shared_options import Flag, check_output_file
 from capture.input_error import InputError
 from preprocess.body.kinematics import JOINT_NAMES, rotation_matrices
 
@@ -25,12 +25,7 @@ MIN_SIZE_PX, MAX_SIZE_PX = 16, 4096
 MAX_WORKERS = 64
 """Limit of --workers."""
 CLOSE_UP_ZOOM = 3.5
-"""Default --zoom with --close-up."""
-MIN_DISTANCE_M, MAX_DISTANCE_M = 0.3, 100.0
-"""Limits of --distance, meters."""
-MAX_ZOOM = 50.0
-"""Limit of --zoom, and of its inverse."""
-Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
+"""Magnification of --close-up relative to a view of the whole person."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,18 +35,13 @@ class Viewpoint:
     Attributes:
         orbit_deg: Azimuth around the person; 90° is at the person's left hand.
         elevation_deg: Elevation above the person's center; 90° looks straight down.
-        zoom: Magnification relative to a view of the whole person.
-        distance_m: Distance to the target; None for 3.5 heights of the person. The focal length is
-            kept, so that a closer camera shows the person larger.
-        joint: Target of the camera (see `JOINT_NAMES`); None for the person's center.
+        joint: Target of a close-up (see `JOINT_NAMES`); None for the whole person.
         turn_period_s: Seconds per turn around the person; negative for the other direction, None
             for no turntable.
     """
 
     orbit_deg: float = 0.0
     elevation_deg: float = 0.0
-    zoom: float = 1.0
-    distance_m: float | None = None
     joint: str | None = None
     turn_period_s: float | None = None
 
@@ -67,13 +57,6 @@ class Viewpoint:
             raise InputError(
                 f"--elevation is {self.elevation_deg:g}, but must lie between -90 (from below) and "
                 "90 degrees (from above)."
-            )
-        if not 1.0 / MAX_ZOOM <= self.zoom <= MAX_ZOOM:
-            raise InputError(f"--zoom is {self.zoom:g}, but must be at most {MAX_ZOOM:g}.")
-        if self.distance_m is not None and not MIN_DISTANCE_M <= self.distance_m <= MAX_DISTANCE_M:
-            raise InputError(
-                f"--distance is {self.distance_m:g}, but must lie between {MIN_DISTANCE_M} and "
-                f"{MAX_DISTANCE_M:g} m. For a closer view use --zoom."
             )
         if self.joint is not None and self.joint not in JOINT_NAMES:
             raise InputError(
@@ -148,20 +131,13 @@ class PlayArguments:
     """Azimuth of the camera around the person: 90 is at its left hand, 180 behind it."""
     elevation: Annotated[float, arg(metavar="DEG", help_behavior_hint="")] = 0.0
     """Elevation of the camera: 30 looks down on the person, -30 up."""
-    distance: Annotated[float | None, arg(metavar="M", help_behavior_hint="")] = None
-    """Distance of the camera in meters (default: 3.5 heights of the person). Closer is larger, with
-    stronger perspective."""
-    zoom: Annotated[float | None, arg(metavar="X", help_behavior_hint="")] = None
-    """Magnification relative to the whole person (default: 1; 3.5 with --close-up)."""
     close_up: Annotated[str | None, arg(metavar="JOINT", help_behavior_hint="")] = None
-    """Follow a joint: head, spine3, left_hand, right_foot, …"""
+    """Follow a joint, 3.5 times as large: head, spine3, left_hand, right_foot, …"""
     turntable: Annotated[float | None, arg(metavar="[SECONDS]", help_behavior_hint="")] = None
     """Orbit the camera once in SECONDS (default 6; negative reverses): around the canonical pose,
     or around the motion while it plays."""
     tier: Literal["hq", "lite"] = "hq"
     """Quality tier: lite takes two thirds of the time of hq."""
-    samples: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
-    """Samples per 5 cm of a ray, 1 to 256 (default: as the tier defines)."""
     workers: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Frames rendered in parallel (default: one per core). They do not depend on it."""
     provider: Annotated[str, arg(metavar="NAME", help_behavior_hint="")] = "cpu"
@@ -191,20 +167,17 @@ class PlayArguments:
             raise InputError("--json requires --bench or --verify.")
         if self.json is not None:
             check_output_file(self.json, "--json", self.inputs, overwrite=self.overwrite)
-        if self.fps is not None and not 0.1 <= self.fps <= 240.0:
-            raise InputError(f"--fps is {self.fps}, but must lie between 0.1 and 240.")
-        if not 0.01 <= self.speed <= 100.0:
-            raise InputError(f"--speed is {self.speed}, but must lie between 0.01 and 100.")
-        if self.workers is not None and not 1 <= self.workers <= MAX_WORKERS:
-            raise InputError(
-                f"--workers is {self.workers}, but must lie between 1 and {MAX_WORKERS}."
-            )
+        limits = {"fps": (0.1, 240), "speed": (0.01, 100), "workers": (1, MAX_WORKERS)}
+        for name, (low, high) in limits.items():
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                raise InputError(f"--{name} is {value}, but must lie between {low} and {high}.")
         if self.still is not None and self.poses is None:
             raise InputError("--still requires --poses.")
         if self.camera is not None and self.viewpoint != Viewpoint():
             raise InputError(
-                "--camera sets the viewpoint: leave out --orbit, --elevation, --distance, --zoom, "
-                "--close-up and --turntable, or leave out --camera."
+                "--camera sets the viewpoint: leave out --orbit, --elevation, --close-up and "
+                "--turntable, or leave out --camera."
             )
         self.size_px  # noqa: B018 - raises
         self.viewpoint  # noqa: B018 - raises
@@ -235,12 +208,9 @@ class PlayArguments:
     @property
     def viewpoint(self) -> Viewpoint:
         """Viewpoint of the camera."""
-        usual = 1.0 if self.close_up is None else CLOSE_UP_ZOOM
         return Viewpoint(
             orbit_deg=self.orbit,
             elevation_deg=self.elevation,
-            zoom=usual if self.zoom is None else self.zoom,
-            distance_m=self.distance,
             joint=self.close_up,
             turn_period_s=self.turntable,
         )

@@ -5,6 +5,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime
@@ -15,7 +16,6 @@ from export.package.package_file import read_package
 from export.player import (
     MAX_CLOSE_DIFFERENCE,
     MIN_CLOSE_FRACTION,
-    PictureDifference,
     Player,
     compare_golden_frames,
     find_provider,
@@ -23,66 +23,10 @@ from export.player import (
 from preprocess.body.body_pose import BodyPose
 
 
-@dataclass(frozen=True, kw_only=True)
-class VerificationResult:
-    """Outcome of drawing a package's golden frames again.
-
-    Attributes:
-        frames: Difference of each from the stored picture.
-        provider: onnxruntime's execution provider.
-        warnings: Weaknesses that the package was written with.
-    """
-
-    frames: tuple[PictureDifference, ...]
-    provider: str
-    warnings: tuple[str, ...] = ()
-
-    @property
-    def matches(self) -> bool:
-        """Whether all frames match; a package without any proves nothing."""
-        return bool(self.frames) and all(frame.matches for frame in self.frames)
-
-    def to_lines(self) -> list[str]:
-        """Return a line for each frame, and the verdict."""
-        lines = [
-            f"golden frame {number}: {'same' if frame.matches else 'DIFFERENT'} "
-            f"({frame.close_fraction:.2%} within {MAX_CLOSE_DIFFERENCE}/255, "
-            f"largest difference {frame.largest_difference:.0f}/255)"
-            for number, frame in enumerate(self.frames)
-        ]
-        where = f"{self.provider}, onnxruntime {onnxruntime.__version__}"
-        if not self.frames:
-            return [f"verdict: none; the package holds no golden frames ({where})."]
-        count, worst = len(self.frames), max(frame.largest_difference for frame in self.frames)
-        if self.matches:
-            verdict = f"same; {count} golden frames, worst difference {worst:.0f}/255 ({where})"
-        else:
-            bad = sum(not frame.matches for frame in self.frames)
-            verdict = (
-                f"DIFFERENT; {bad} of {count} golden frames are not within "
-                f"{MAX_CLOSE_DIFFERENCE}/255 on {MIN_CLOSE_FRACTION:.1%} of the pixels, worst "
-                f"difference {worst:.0f}/255 ({where}). Update onnxruntime, try --provider cpu, or "
-                "report it with these lines."
-            )
-        return [*lines, f"verdict: {verdict}"]
-
-    def to_json(self) -> str:
-        """Serialize for scripts."""
-        content = {
-            "format": 1,
-            "verdict": "same" if self.matches else "different",
-            "provider": self.provider,
-            "onnxruntime": onnxruntime.__version__,
-            "warnings": list(self.warnings),
-            "frames": [
-                {
-                    "largest": round(frame.largest_difference, 3),
-                    "close": round(frame.close_fraction, 6),
-                }
-                for frame in self.frames
-            ],
-        }
-        return json.dumps(content, indent=1) + "\n"
+def to_json_text(content: dict[str, Any]) -> str:
+    """Serialize a result for scripts; floats keep four digits."""
+    rounded = {k: round(v, 4) if isinstance(v, float) else v for k, v in content.items()}
+    return json.dumps(rounded, indent=1) + "\n"
 
 
 def package_warnings(manifest: Manifest) -> list[str]:
@@ -97,18 +41,53 @@ def package_warnings(manifest: Manifest) -> list[str]:
     return notes
 
 
-def verify_package(path: Path, *, provider: str) -> VerificationResult:
+def verify_package(path: Path, *, provider: str) -> dict[str, Any]:
     """Read a package, checking every entry, and draw its golden frames again.
+
+    Returns:
+        JSON: the verdict ("same" if all golden frames match, of which there is at least one), and
+        for each frame the largest difference (in 1/255) and the fraction of close pixels.
 
     Raises:
         InputError: If the file is not a sound package, or the provider is unknown.
     """
     package = read_package(path, tier=None)
-    return VerificationResult(
-        frames=tuple(compare_golden_frames(package, provider=provider)),
-        provider=find_provider(provider),
-        warnings=tuple(package_warnings(package.manifest)),
+    frames = compare_golden_frames(package, provider=provider)
+    matches = bool(frames) and all(frame.matches for frame in frames)
+    return {
+        "format": 1,
+        "verdict": "same" if matches else "different",
+        "provider": find_provider(provider),
+        "onnxruntime": onnxruntime.__version__,
+        "warnings": package_warnings(package.manifest),
+        "frames": [
+            {
+                "largest": round(frame.largest_difference, 3),
+                "close": round(frame.close_fraction, 6),
+            }
+            for frame in frames
+        ],
+    }
+
+
+def verdict_lines(result: dict[str, Any]) -> list[str]:
+    """Return a line for each golden frame of a `verify_package`, and the verdict."""
+    lines = [
+        f"golden frame {number}: "
+        f"{'same' if frame['close'] >= MIN_CLOSE_FRACTION else 'DIFFERENT'} "
+        f"({frame['close']:.2%} within {MAX_CLOSE_DIFFERENCE}/255, largest difference "
+        f"{frame['largest']:.0f}/255)"
+        for number, frame in enumerate(result["frames"])
+    ]
+    where = f"{result['provider']}, onnxruntime {result['onnxruntime']}"
+    if result["verdict"] == "same":
+        return [*lines, f"verdict: same ({where})"]
+    different = sum(frame["close"] < MIN_CLOSE_FRACTION for frame in result["frames"])
+    verdict = (
+        f"verdict: DIFFERENT; {different} of {len(lines)} golden frames ({where}). Update "
+        "onnxruntime, try --provider cpu, or report it with these lines."
     )
+    return [*lines, verdict]
 
 
 REFERENCE_GRAPH = Path(__file__).with_name("reference.onnx")
@@ -124,6 +103,7 @@ class PlayerTiming:
     """Cost of an image: kinematics, graph and 8-bit output, without encoding.
 
     Attributes:
+        format: Version of this record.
         tier: Quality tier of the package.
         size: Longer side, pixels.
         frames: Number of timed images.
@@ -135,9 +115,9 @@ class PlayerTiming:
         provider: onnxruntime's execution provider.
         workers: Images rendered in parallel.
         pictures_per_second: Images per second of wall time.
-        format: Version of this record.
     """
 
+    format: int = 1
     tier: str
     size: int
     frames: int
@@ -149,12 +129,10 @@ class PlayerTiming:
     provider: str = "CPUExecutionProvider"
     workers: int = 1
     pictures_per_second: float = 0.0
-    format: int = 1
 
     def to_json(self) -> str:
         """Return the rounded values as JSON."""
-        content = {k: round(v, 4) if isinstance(v, float) else v for k, v in asdict(self).items()}
-        return json.dumps({"format": content.pop("format"), **content}, indent=1) + "\n"
+        return to_json_text(asdict(self))
 
 
 def benchmark_player(
@@ -164,14 +142,13 @@ def benchmark_player(
     load_ms: float,
     tier: str = "hq",
     workers: int = 1,
-    samples: int | None = None,
 ) -> PlayerTiming:
     """Render a sequence after a warm-up and time it."""
     sequence = list(sequence) * -(-MIN_IMAGES // len(sequence))
-    list(player.render_all(sequence[: WARM_UP_IMAGES * workers], workers=workers, samples=samples))
+    list(player.render_all(sequence[: WARM_UP_IMAGES * workers], workers=workers))
     covered = 0.0
     wall, cpu = time.perf_counter(), time.process_time()
-    for picture in player.render_all(sequence, workers=workers, samples=samples):
+    for picture in player.render_all(sequence, workers=workers):
         covered += float(np.count_nonzero(picture[..., 3])) / picture[..., 3].size
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
     return PlayerTiming(
@@ -182,26 +159,22 @@ def benchmark_player(
         cpu_ms_per_frame=1000.0 * cpu / len(sequence),
         wall_ms_per_frame=1000.0 * wall / len(sequence),
         load_ms=load_ms,
-        reference_ms=_reference_ms(_reference_graph()),
+        reference_ms=_reference_ms(),
         provider=player.provider,
         workers=workers,
         pictures_per_second=len(sequence) / wall,
     )
 
 
-def _reference_graph() -> onnxruntime.InferenceSession:
-    """Load the reference graph: GatherElements, MatMul and ScatterElements of fixed sizes.
+def _reference_ms(runs: int = 9) -> float:
+    """Time the reference graph: GatherElements, MatMul and ScatterElements of fixed sizes.
 
     It is a file, so that the player does not need the `onnx` package.
     """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
-    return onnxruntime.InferenceSession(
-        REFERENCE_GRAPH.read_bytes(), options, providers=["CPUExecutionProvider"]
-    )
-
-
-def _reference_ms(session: onnxruntime.InferenceSession, runs: int = 9) -> float:
+    graph = REFERENCE_GRAPH.read_bytes()
+    session = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
     rng = np.random.default_rng(0)
     inputs = {
         "table": rng.standard_normal((1 << 15, 16)).astype(np.float32),

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from apps.animation.driving_motion import FollowingCamera
-from apps.cli.command_line import DONE, stop_on_interrupt, parse_arguments, run_command
+from apps.cli.command_line import DONE, parse_arguments, run_command, stop_on_interrupt
 from apps.cli.console import Console
 from capture.atomic_files import atomic_folder
 from capture.input_error import InputError

@@ -241,7 +241,7 @@ def _installed_version() -> str:
         return "(checkout, not installed)"
 
 
-def fill_optional_value(argv: Sequence[str], flag: str, value: float) -> list[str]:
+def fill_optional_value(argv: Sequence[str], flag: str, value: int | float) -> list[str]:
     """Insert a default number after a flag that no number follows."""
     words: list[str] = []
     for word, following in zip_longest(argv, argv[1:], fillvalue=""):

@@ -212,7 +212,7 @@ def test_different_golden_frames_set_the_exit_code(call_play, package, tmp_path)
     assert outcome.code == 2
     assert "golden frame 0: same" in outcome.err
     assert "golden frame 1: DIFFERENT" in outcome.err
-    assert f"verdict: DIFFERENT; {len(dark)} of {len(dark) + 1}" in outcome.err
+    assert "verdict: DIFFERENT" in outcome.err
 
 
 def _all(package):
@@ -266,11 +266,8 @@ def test_an_altered_package_is_refused(call_play, package, novel, tmp_path):
         (["--size", "99999x99"], "--size"),
         (["--speed", "0"], "--speed"),
         (["--workers", "0"], "--workers"),
-        (["--samples", "0"], "samples"),
         (["--still", "12"], "0 to 11"),
         (["--elevation", "91"], "--elevation"),
-        (["--zoom", "0"], "--zoom"),
-        (["--distance", "0.1"], "--distance"),
         (["--close-up", "nose"], "left_hand"),
         (["--turntable", "0"], "--turntable"),
         (["--turntable", "nan"], "--turntable"),

@@ -9,7 +9,7 @@ from apps.animation.driving_motion import (
     canonical_pose_of,
     demo_motion,
 )
-from apps.animation.play_arguments import Viewpoint
+from apps.animation.play_arguments import CLOSE_UP_ZOOM, Viewpoint
 from capture.input_error import InputError
 from export.player import Player
 from preprocess.body.body_pose import BodyPose
@@ -33,8 +33,7 @@ def following(player):
 
 def middle(following, pose):
     """Where the camera looks at, in the world."""
-    camera = following.camera_for(pose)
-    away = following.viewpoint.distance_m or DISTANCE_HEIGHTS * following.height_m
+    camera, away = following.camera_for(pose), DISTANCE_HEIGHTS * following.height_m
     return camera.center_world + away * camera.camera_from_world[2, :3]
 
 
@@ -51,17 +50,18 @@ def middle(following, pose):
     ],
 )
 def test_the_camera_stands_where_its_angles_say(player, following, wishes, direction):
-    pose, camera = canonical_pose_of(player), following(**wishes, distance_m=2.0)
+    pose, camera = canonical_pose_of(player), following(**wishes)
     pelvis = player.manifest.rest_joints[0]
     at = pelvis + camera.center_above_pelvis_m * np.array([0.0, 1.0, 0.0])
     place = camera.camera_for(pose).center_world
-    np.testing.assert_allclose(place - at, 2.0 * np.array(direction), atol=1e-9)
+    away = DISTANCE_HEIGHTS * camera.height_m
+    np.testing.assert_allclose(place - at, away * np.array(direction), atol=1e-9)
 
 
 def test_the_person_s_middle_stays_in_the_picture_s_middle_from_all_sides(player, following):
     pose = canonical_pose_of(player)
     at = middle(following(), pose)
-    for wishes in ({"orbit_deg": 77.0}, {"elevation_deg": 50.0}, {"orbit_deg": 9.0, "zoom": 3.0}):
+    for wishes in ({"orbit_deg": 77.0}, {"elevation_deg": 50.0}):
         np.testing.assert_allclose(middle(following(**wishes), pose), at, atol=1e-9)
         assert following(**wishes).camera_for(pose).project(at) == pytest.approx([48.0, 48.0])
 
@@ -84,7 +84,7 @@ def test_a_turntable_goes_round_once_in_its_time(player, following):
 
 
 def test_a_close_up_keeps_its_joint_in_the_middle(player, following, bent_arm):
-    left = following(joint="left_hand", zoom=3.0)
+    left = following(joint="left_hand")
     at, elbow = middle(left, bent_arm), middle(following(joint="left_elbow"), bent_arm)
     rest = player.manifest.rest_joints
     # the forearm points forward, out of the chest, by its own length
@@ -92,7 +92,7 @@ def test_a_close_up_keeps_its_joint_in_the_middle(player, following, bent_arm):
         rotation_matrices(bent_arm.joint_rotations[17]) @ (rest[22] - rest[18]), abs=1e-9
     )
     whole, close = following().camera_for(bent_arm), left.camera_for(bent_arm)
-    assert close.focal_px[0] == pytest.approx(3.0 * whole.focal_px[0])
+    assert close.focal_px[0] == pytest.approx(CLOSE_UP_ZOOM * whole.focal_px[0])
 
 
 @pytest.fixture
@@ -107,20 +107,6 @@ def bent_arm():
     )
 
 
-def test_a_zoom_and_a_shorter_way_make_the_person_larger(player, following):
-    pose = canonical_pose_of(player)
-
-    def height(camera):
-        rows = np.flatnonzero(
-            (player.render(pose, camera.camera_for(pose))[..., 3] > 127).any(axis=1)
-        )
-        return rows[-1] + 1 - rows[0]
-
-    usual, far = height(following(256)), following(256).camera_for(pose).camera_from_world[2, 3]
-    assert height(following(256, zoom=0.5)) == pytest.approx(usual / 2, abs=2)
-    assert height(following(256, distance_m=2.0 * far)) == pytest.approx(usual / 2, abs=3)
-
-
 @pytest.mark.parametrize("size", [(160, 90), (90, 160), (120, 120)])
 def test_the_whole_person_fits_into_every_shape(player, following, size):
     pose = canonical_pose_of(player)
@@ -132,6 +118,6 @@ def test_the_whole_person_fits_into_every_shape(player, following, size):
 
 
 def test_wishes_that_cannot_be_are_named():
-    for wishes in ({"orbit_deg": np.inf}, {"zoom": np.nan}, {"elevation_deg": np.nan}):
+    for wishes in ({"orbit_deg": np.inf}, {"elevation_deg": np.nan}):
         with pytest.raises(InputError, match="--"):
             Viewpoint(**wishes)
