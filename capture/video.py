@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import av
 import numpy as np
+from av.error import FFmpegError
 from jaxtyping import UInt8
 
 from capture.hdr_tone_mapping import HDR_TRANSFERS, tone_map_hdr
@@ -50,7 +51,7 @@ class DecodedFrame(NamedTuple):
                 rgb = tone_map_hdr(self.frame.to_ndarray(format="rgb48le"), curve)
             else:
                 rgb = self.frame.to_ndarray(format="rgb24")
-        except (av.FFmpegError, ValueError):
+        except (FFmpegError, ValueError):
             return None
         return np.ascontiguousarray(np.rot90(rgb, _quarter_turns(self.frame)))
 
@@ -85,7 +86,7 @@ class VideoFile(Recording):
                 pixel_aspect = float(stream.sample_aspect_ratio or 1.0)
                 first = next(_decode(container, stream), None)
                 rgb = None if first is None else first.rgb()
-        except (av.FFmpegError, IndexError, ValueError, OSError) as cause:
+        except (FFmpegError, IndexError, ValueError, OSError) as cause:
             raise InputError(
                 f"{path} is no video that can be opened; does it hold pictures, or sound alone? A "
                 "recording that was cut off before it was finished has no index and cannot be "
@@ -190,7 +191,7 @@ def _decode(container: Any, stream: Any) -> Iterator[DecodedFrame]:
             frames = next(packets).decode()
         except StopIteration:
             return
-        except av.FFmpegError:
+        except FFmpegError:
             failures += 1
             continue
         for frame in frames:

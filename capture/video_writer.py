@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -88,7 +89,7 @@ def open_video_writer(
     is_rgb = codec.pixel_format == "bgr0"
     container_options = {"movflags": "+faststart"} if path.suffix.lower() == ".mp4" else {}
     with av.open(str(path), "w", options=container_options) as container:
-        stream = container.add_stream(
+        stream: Any = container.add_stream(
             codec.name, rate=Fraction(fps).limit_denominator(10_000), options=dict(codec.options)
         )
         stream.pix_fmt = codec.pixel_format

@@ -24,6 +24,22 @@ ONNX_TYPES = {
 """ONNX's name of each element type."""
 
 
+def _operator(kind: str, dtype: Any = None, **attributes: Any) -> Callable[..., "GraphValue"]:
+    """Return a method that adds a node of ONNX's operator `kind` to a value and its operands.
+
+    Args:
+        kind: Name of the operator.
+        dtype: Element type of the result; None for that of the value.
+        attributes: Attributes of the node.
+    """
+
+    def add_node(self: "GraphValue", *others: "Operand") -> "GraphValue":
+        operands = [self.graph.value(other, self.dtype) for other in others]
+        return self.graph.node(kind, self, *operands, dtype=dtype or self.dtype, **attributes)
+
+    return add_node
+
+
 @final
 class GraphValue:
     """A tensor of the graph: known by its name and element type, computed when the graph runs.
@@ -36,33 +52,35 @@ class GraphValue:
         """Wrap an output of a graph; called by `GraphBuilder`."""
         self.graph, self.name, self.dtype = graph, name, np.dtype(dtype)
 
-    def _with(self, kind: str, *others: "Operand", dtype: Any = None) -> "GraphValue":
-        operands = [self.graph.value(other, self.dtype) for other in others]
-        return self.graph.node(kind, self, *operands, dtype=dtype or self.dtype)
-
-    def __add__(self, other: "Operand") -> "GraphValue":
-        """Sum."""
-        return self._with("Add", other)
-
-    __radd__ = __add__
-
-    def __sub__(self, other: "Operand") -> "GraphValue":
-        """Difference."""
-        return self._with("Sub", other)
+    __add__ = __radd__ = _operator("Add")
+    __sub__ = _operator("Sub")
+    __mul__ = __rmul__ = _operator("Mul")
+    __truediv__ = _operator("Div")
+    __neg__ = _operator("Neg")
+    __lt__ = _operator("Less", np.bool_)
+    __gt__ = _operator("Greater", np.bool_)
+    __and__ = _operator("And")  # of truth values, as `|` is
+    __or__ = _operator("Or")
+    equal = _operator("Equal", np.bool_)
+    logical_not = _operator("Not")
+    bitwise_and = _operator("BitwiseAnd")
+    floor = _operator("Floor")
+    exp = _operator("Exp")
+    sqrt = _operator("Sqrt")
+    reciprocal = _operator("Reciprocal")
+    minimum = _operator("Min")
+    maximum = _operator("Max")
+    clip = _operator("Clip")
+    reduce_min = _operator("ReduceMin", keepdims=0)  # a scalar
+    reduce_max = _operator("ReduceMax", keepdims=0)
+    matmul = _operator("MatMul")
+    gather = _operator("GatherElements", axis=0)  # x[places] in 1D: 5 times as fast as "Gather"
+    gather_rows = _operator("Gather", axis=0)  # x[rows] of more than one dimension
+    compress = _operator("Compress", axis=0)  # x[condition] in 1D
 
     def __rsub__(self, other: "Operand") -> "GraphValue":
         """Difference."""
         return self.graph.value(other, self.dtype) - self
-
-    def __mul__(self, other: "Operand") -> "GraphValue":
-        """Product."""
-        return self._with("Mul", other)
-
-    __rmul__ = __mul__
-
-    def __truediv__(self, other: "Operand") -> "GraphValue":
-        """Quotient of floats."""
-        return self._with("Div", other)
 
     def __rtruediv__(self, other: "Operand") -> "GraphValue":
         """Quotient of floats."""
@@ -71,39 +89,7 @@ class GraphValue:
     def __floordiv__(self, other: "Operand") -> "GraphValue":
         """Quotient of integers that are not negative (ONNX rounds towards zero)."""
         assert self.dtype.kind in "iu"
-        return self._with("Div", other)
-
-    def __neg__(self) -> "GraphValue":
-        """Negative."""
-        return self._with("Neg")
-
-    def __lt__(self, other: "Operand") -> "GraphValue":
-        """Less."""
-        return self._with("Less", other, dtype=np.bool_)
-
-    def __gt__(self, other: "Operand") -> "GraphValue":
-        """Greater."""
-        return self._with("Greater", other, dtype=np.bool_)
-
-    def equal(self, other: "Operand") -> "GraphValue":
-        """Where both are the same number."""
-        return self._with("Equal", other, dtype=np.bool_)
-
-    def __and__(self, other: "GraphValue") -> "GraphValue":
-        """Both, of truth values."""
-        return self._with("And", other)
-
-    def __or__(self, other: "GraphValue") -> "GraphValue":
-        """Either, of truth values."""
-        return self._with("Or", other)
-
-    def logical_not(self) -> "GraphValue":
-        """Not, of truth values."""
-        return self._with("Not")
-
-    def bitwise_and(self, mask: int) -> "GraphValue":
-        """Bitwise and with a constant."""
-        return self._with("BitwiseAnd", mask)
+        return self / other
 
     def shift_right(self, bits: int) -> "GraphValue":
         """Bits shifted right, zeros shifted in (ONNX shifts unsigned integers only)."""
@@ -115,96 +101,39 @@ class GraphValue:
         """Cast to another element type; floats are truncated."""
         return self.graph.node("Cast", self, dtype=dtype, to=ONNX_TYPES[np.dtype(dtype)])
 
-    def floor(self) -> "GraphValue":
-        """Next integer below, as a float."""
-        return self._with("Floor")
-
-    def exp(self) -> "GraphValue":
-        """Exponential."""
-        return self._with("Exp")
-
     def exp2(self) -> "GraphValue":
         """Two to the power of it."""
         return self.graph.node("Pow", self.graph.value(2.0, self.dtype), self)
-
-    def sqrt(self) -> "GraphValue":
-        """Square root."""
-        return self._with("Sqrt")
-
-    def reciprocal(self) -> "GraphValue":
-        """One over it."""
-        return self._with("Reciprocal")
-
-    def minimum(self, *others: "Operand") -> "GraphValue":
-        """Elementwise minimum."""
-        return self._with("Min", *others)
-
-    def maximum(self, *others: "Operand") -> "GraphValue":
-        """Elementwise maximum."""
-        return self._with("Max", *others)
-
-    def reduce_min(self) -> "GraphValue":
-        """The smallest element, as a scalar."""
-        return self._with_attributes("ReduceMin", keepdims=0)
-
-    def reduce_max(self) -> "GraphValue":
-        """The largest element, as a scalar."""
-        return self._with_attributes("ReduceMax", keepdims=0)
 
     def reduce_sum(self, axis: int) -> "GraphValue":
         """The sum along one axis, which goes away."""
         along = self.graph.constant(np.array([axis], dtype=np.int64))
         return self.graph.node("ReduceSum", self, along, keepdims=0)
 
-    def clip(self, low: "Operand", high: "Operand") -> "GraphValue":
-        """Clamped to [low, high]."""
-        return self._with("Clip", low, high)
-
-    def gather(self, places: "GraphValue") -> "GraphValue":
-        """`self[places]` for one-dimensional tensors: five times faster than ONNX's Gather."""
-        return self.graph.node("GatherElements", self, places, dtype=self.dtype, axis=0)
-
-    def gather_rows(self, rows: "GraphValue") -> "GraphValue":
-        """`self[rows]` for tensors of more than one dimension."""
-        return self.graph.node("Gather", self, rows, dtype=self.dtype, axis=0)
-
-    def compress(self, condition: "GraphValue") -> "GraphValue":
-        """`self[condition]` for one-dimensional tensors."""
-        return self.graph.node("Compress", self, condition, axis=0)
-
     def row(self, index: int) -> "GraphValue":
         """`self[index]`."""
         return self.gather_rows(self.graph.constant(np.int64(index)))
 
-    def matmul(self, other: "GraphValue") -> "GraphValue":
-        """Matrix product."""
-        return self._with("MatMul", other)
-
     def transpose(self, *order: int) -> "GraphValue":
         """Axes in another order."""
-        return self._with_attributes("Transpose", perm=list(order))
+        return self.graph.node("Transpose", self, perm=list(order))
 
     def reshape(self, *shape: "Operand") -> "GraphValue":
         """Another shape; sizes may be values, and one may be -1."""
-        return self.graph.node("Reshape", self, self.graph.shape(*shape), dtype=self.dtype)
+        return self.graph.node("Reshape", self, self.graph.shape(*shape))
 
     def slice_axes(self, starts: "Sequence[Operand]", ends: "Sequence[Operand]") -> "GraphValue":
         """`self[starts[0]:ends[0], …]` over the leading axes."""
         bounds = self.graph.shape(*starts), self.graph.shape(*ends)
         axes = self.graph.constant(np.arange(len(starts), dtype=np.int64))
-        return self.graph.node("Slice", self, *bounds, axes, dtype=self.dtype)
+        return self.graph.node("Slice", self, *bounds, axes)
 
     def scatter(
         self, places: "GraphValue", updates: "GraphValue", reduction: str = "none"
     ) -> "GraphValue":
         """A copy with `updates` written (or reduced) into one-dimensional `places`."""
         operands = (self, places, updates)
-        return self.graph.node(
-            "ScatterElements", *operands, dtype=self.dtype, axis=0, reduction=reduction
-        )
-
-    def _with_attributes(self, kind: str, **attributes: Any) -> "GraphValue":
-        return self.graph.node(kind, self, dtype=self.dtype, **attributes)
+        return self.graph.node("ScatterElements", *operands, axis=0, reduction=reduction)
 
 
 @final
@@ -309,10 +238,7 @@ class GraphBuilder:
     ) -> list[GraphValue]:
         """`for i in range(count): states = body(i, states)`; the body may use any outer value."""
 
-        def turned(turn: GraphValue, held: list[GraphValue]) -> tuple[None, list[GraphValue]]:
-            return None, list(body(turn, held))
-
-        return self._loop(count, states, turned)
+        return self.loop_while(count, states, lambda turn, held: (None, list(body(turn, held))))
 
     def loop_while(
         self,
@@ -322,25 +248,8 @@ class GraphBuilder:
     ) -> list[GraphValue]:
         """`for i in range(max_turns): go, states = body(i, states)` while `go` holds.
 
-        The states' lengths may change from turn to turn.
+        The states' lengths may change from turn to turn; None for `go` holds always.
         """
-        return self._loop(max_turns, states, body)
-
-    def split(self, value: GraphValue, parts: int, axis: int = 0) -> list[GraphValue]:
-        """Split along an axis of length `parts`, which goes away."""
-        self._count += 1
-        names = [f"split_{self._count}_{i}" for i in range(parts)]
-        self._nodes.append(
-            helper.make_node("Split", [value.name], names, axis=axis, num_outputs=parts)
-        )
-        return [GraphValue(self, name, value.dtype).reshape(-1) for name in names]
-
-    def _loop(
-        self,
-        count: GraphValue,
-        states: Sequence[GraphValue],
-        body: Callable[[GraphValue, list[GraphValue]], tuple[GraphValue | None, list[GraphValue]]],
-    ) -> list[GraphValue]:
         self._count += 1
         prefix = f"loop_{self._count}"
         before, self._nodes = self._nodes, []
@@ -357,10 +266,19 @@ class GraphBuilder:
         )
         self._nodes = before
         outputs = [GraphValue(self, f"{prefix}_result_{i}", s.dtype) for i, s in enumerate(states)]
-        inputs = [count.name, self.constant(np.array(True)).name, *(s.name for s in states)]
+        inputs = [max_turns.name, self.constant(np.array(True)).name, *(s.name for s in states)]
         names = [output.name for output in outputs]
         self._nodes.append(helper.make_node("Loop", inputs, names, name=prefix, body=inner))
         return outputs
+
+    def split(self, value: GraphValue, parts: int, axis: int = 0) -> list[GraphValue]:
+        """Split along an axis of length `parts`, which goes away."""
+        self._count += 1
+        names = [f"split_{self._count}_{i}" for i in range(parts)]
+        self._nodes.append(
+            helper.make_node("Split", [value.name], names, axis=axis, num_outputs=parts)
+        )
+        return [GraphValue(self, name, value.dtype).reshape(-1) for name in names]
 
     def model(self) -> onnx.ModelProto:
         """Return the model; its tables are passed to the runtime separately."""
