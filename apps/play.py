@@ -33,12 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def play(arguments: PlayArguments, console: Console) -> int:
-    """Render a clip, serve or write a page, benchmark, or verify.
-
-    Raises:
-        InputError: If an input is missing, unreadable or does not match the others.
-        OSError: If the disk is full.
-    """
+    """Render a clip, serve or write a page, benchmark, or verify."""
     arguments.validate()
     if arguments.verify:
         return _run_verification(arguments, console)

@@ -70,11 +70,7 @@ class VideoFile(Recording):
     has_alpha = False
 
     def __init__(self, path: Path, selection: FrameSelection) -> None:
-        """Open the file and decode one frame.
-
-        Raises:
-            InputError: If no frame can be decoded, or none is selected.
-        """
+        """Open the file and decode one frame."""
         super().__init__(path, selection)
         refuse_pipe(path)
         try:

@@ -339,9 +339,6 @@ def check_graph(
 
     Returns:
         The largest difference over all frames, in 1/255.
-
-    Raises:
-        ExportRefused: If a picture does not match.
     """
     tables, settings = package.tables[tier], package.manifest.tiers[tier].settings
     worst = 0.0

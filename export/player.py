@@ -113,9 +113,6 @@ class Player:
             tier: Quality tier.
             threads: Threads for one picture.
             provider: onnxruntime's execution provider, "cpu", "cuda", …
-
-        Raises:
-            InputError: If the provider is unknown or the graph does not run.
         """
         self.manifest: Manifest = package.manifest
         self._settings = package.manifest.tiers[tier].settings
@@ -232,9 +229,6 @@ class Player:
             shots: Poses and cameras, as of `render`.
             workers: Threads; onnxruntime releases Python's lock while it draws.
             samples: As of `render`.
-
-        Raises:
-            InputError: As of `render`.
         """
         if workers == 1:
             for pose, camera in shots:
@@ -274,9 +268,6 @@ def compare_golden_frames(
     Args:
         package: A package that was read.
         provider: onnxruntime's execution provider.
-
-    Raises:
-        InputError: If the provider is unknown, or the graph does not run.
     """
     player = Player(package, provider=provider)
     return [
@@ -288,11 +279,7 @@ def compare_golden_frames(
 
 
 def find_provider(name: str) -> str:
-    """Return onnxruntime's full name of a provider: "cpu" is "CPUExecutionProvider".
-
-    Raises:
-        InputError: If this build of onnxruntime lacks it.
-    """
+    """Return onnxruntime's full name of a provider: "cpu" is "CPUExecutionProvider"."""
     known = onnxruntime.get_available_providers()
     for provider in known:
         if name.lower() in (provider.lower(), provider.lower().removesuffix("executionprovider")):
@@ -321,9 +308,6 @@ def create_session(
         tables: Its external tables by name; they must outlive the session.
         threads: Threads for one run.
         provider: A name from `find_provider`.
-
-    Raises:
-        InputError: If the graph does not run with this onnxruntime and provider.
     """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads

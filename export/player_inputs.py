@@ -52,9 +52,6 @@ def skinning_nodes(skin: SkinningGrid, subdivision: int) -> SkinningNodes:
     Args:
         skin: The stored grid.
         subdivision: Parts into which each step is cut, 1 or 2.
-
-    Raises:
-        InputError: If it is neither.
     """
     if subdivision not in (1, 2):
         raise InputError(
@@ -179,9 +176,6 @@ def resize_camera(camera: Camera, size: int | np.integer | tuple[int, int] | Non
     Args:
         camera: Its field of view is kept.
         size: Longer side, or width and height, pixels; None for the camera's own size.
-
-    Raises:
-        InputError: If `size` is neither, or not positive.
     """
     if size is None:
         return camera
@@ -204,11 +198,7 @@ def fit_camera(camera: Camera, longest_px: int, *, max_upscale: int = 1) -> Came
 
 
 def check_render_inputs(pose: BodyPose, camera: Camera, samples: int) -> None:
-    """Check pose, camera and number of samples.
-
-    Raises:
-        InputError: If the player cannot draw them.
-    """
+    """Check pose, camera and number of samples."""
     if not 1 <= samples <= MAX_SAMPLES:
         raise InputError(f"{samples} samples are not possible; expected 1 to {MAX_SAMPLES}.")
     _check_array("root_rotation", pose.root_rotation, (3,))

@@ -157,9 +157,6 @@ def build_page(
         clip: Motion to play.
         name: Title of the avatar.
         compression_level: Of zlib: 1 for a local browser, 6 for a host.
-
-    Raises:
-        InputError: If the package is not sound, or onnxruntime-web is missing.
     """
     runtime = runtime_files()
     draft = _ArrayFiles(compression_level)

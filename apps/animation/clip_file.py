@@ -36,9 +36,6 @@ def background_compositor(color_or_path: str) -> BackgroundBlend:
     Args:
         color_or_path: A color ("white", "#203040", "rgb(10, 20, 30)"), or the path of an image, of
             which the center is shown.
-
-    Raises:
-        InputError: If it is neither.
     """
     try:
         color = np.array(ImageColor.getrgb(color_or_path)[:3], dtype=np.uint8)
@@ -82,9 +79,6 @@ def check_clip_path(path: Path, inputs: Iterable[Path], *, overwrite: bool) -> N
         path: A clip, an image, or a folder for frames.
         inputs: Files that are read and must not be written to.
         overwrite: Whether an existing file may be replaced.
-
-    Raises:
-        InputError: If the suffix is unknown, or the path may not be written.
     """
     if path.suffix.lower() in CLIP_SUFFIXES:
         check_output_file(path, "--out", inputs, overwrite=overwrite)
@@ -112,11 +106,7 @@ class ClipFormat:
 
 
 def clip_format(path: Path, *, transparent: bool) -> ClipFormat:
-    """Return the format that the suffix of a path selects.
-
-    Raises:
-        InputError: If the format has no alpha, but alpha is to be kept.
-    """
+    """Return the format that the suffix of a path selects."""
     suffix = path.suffix.lower()
     if suffix == ".mp4" and transparent:
         raise InputError(
@@ -155,9 +145,6 @@ def write_clip(
 
     Returns:
         The number of frames written.
-
-    Raises:
-        OSError: If the disk is full; then nothing is written.
     """
     encoding = clip_format(path, transparent=blend is None)
     is_file = path.suffix.lower() in CLIP_SUFFIXES

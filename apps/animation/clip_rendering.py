@@ -57,9 +57,6 @@ def plan_render(
         player: Player of the avatar.
         console: Shows notes and warnings about the poses.
         max_fps: Largest frame rate of the output format.
-
-    Raises:
-        InputError: If a file cannot be used, or the arguments do not match it.
     """
     if arguments.poses is None and arguments.turntable is not None:
         motion = _single_pose_motion(canonical_pose_of(player))
@@ -145,9 +142,6 @@ def load_cameras(
         poses: Number of poses of the motion.
         rows: Poses that are shown.
         size: Longer side, or width and height, pixels; None for the file's own.
-
-    Raises:
-        InputError: If the file cannot be read, or does not match poses or size.
     """
     from preprocess.cameras.camera_file import read_cameras
 

@@ -84,9 +84,6 @@ def load_driving_motion(
         rest_joints: Rest joints of the avatar, meters.
         console: Shows notes and warnings about the poses.
         person: Person ID in the file; None for the longest track.
-
-    Raises:
-        InputError: If no pose is valid, or the numbers cannot be radians and meters.
     """
     read = require_plausible(read_poses(path, person=person, prefer_world=True), path)
     motion = anchor_at_pelvis(read, rest_joints)

@@ -46,11 +46,7 @@ class Viewpoint:
     turn_period_s: float | None = None
 
     def __post_init__(self) -> None:
-        """Check ranges.
-
-        Raises:
-            InputError: If a value is out of its range.
-        """
+        """Check ranges."""
         if not np.isfinite(self.orbit_deg):
             raise InputError(f"--orbit is {self.orbit_deg}, but must be an angle in degrees.")
         if not -90.0 <= self.elevation_deg <= 90.0:
@@ -157,11 +153,7 @@ class PlayArguments:
     replaced only in a run's folder, and only if ia-play wrote it."""
 
     def validate(self) -> None:
-        """Check ranges, combinations and output files.
-
-        Raises:
-            InputError: Naming the option.
-        """
+        """Check ranges, combinations and output files."""
         self._validate_mode()
         if self.json is not None and not (self.bench or self.verify):
             raise InputError("--json requires --bench or --verify.")

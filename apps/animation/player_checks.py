@@ -47,9 +47,6 @@ def verify_package(path: Path, *, provider: str) -> dict[str, Any]:
     Returns:
         JSON: the verdict ("same" if all golden frames match, of which there is at least one), and
         for each frame the largest difference (in 1/255) and the fraction of close pixels.
-
-    Raises:
-        InputError: If the file is not a sound package, or the provider is unknown.
     """
     package = read_package(path, tier=None)
     frames = compare_golden_frames(package, provider=provider)

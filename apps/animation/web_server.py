@@ -55,11 +55,7 @@ def web_clip(player: Player, motion: Motion, rows: tuple[int, ...], fps: float) 
 
 
 def write_site(files: Mapping[str, bytes], path: Path) -> None:
-    """Write the page as a folder, whole or not at all.
-
-    Raises:
-        OSError: If the disk is full; then nothing is written.
-    """
+    """Write the page as a folder, whole or not at all."""
     with atomic_folder(path) as part:
         for name, content in files.items():
             target = part / name
@@ -74,9 +70,6 @@ def serve_site(files: Mapping[str, bytes], port: int, console: Console) -> None:
         files: Content by relative path.
         port: First port to try.
         console: Shows a hint; the address goes to stdout.
-
-    Raises:
-        InputError: If no port is free.
     """
     server = make_server(files, port)
     address = f"http://{HOST}:{server.server_port}"
@@ -90,11 +83,7 @@ def serve_site(files: Mapping[str, bytes], port: int, console: Console) -> None:
 
 
 def make_server(files: Mapping[str, bytes], port: int) -> ThreadingHTTPServer:
-    """Return a server of the files on the loopback address, not running yet.
-
-    Raises:
-        InputError: If none of the ports is free.
-    """
+    """Return a server of the files on the loopback address, not running yet."""
     for tried in range(port, min(port + PORTS_TRIED, 1 << 16)):
         try:
             return _QuietHttpServer((HOST, tried), _handler(files))
@@ -165,11 +154,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def fetch_runtime(console: Console) -> int:
-    """Fetch, verify and store the pinned release, unless it exists.
-
-    Raises:
-        InputError: If npm is missing or fails, or the checksum differs.
-    """
+    """Fetch, verify and store the pinned release, unless it exists."""
     try:
         player_page.runtime_files()
     except InputError:

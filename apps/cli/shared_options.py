@@ -56,11 +56,7 @@ class CaptureArguments:
     """Frames to use: START:STOP:STEP, counted from 0."""
 
     def capture_inputs(self) -> CaptureInputs:
-        """Return the inputs to open.
-
-        Raises:
-            InputError: If --frames cannot be parsed, or both mask flags were given.
-        """
+        """Return the inputs to open."""
         if self.mask_invert and self.no_mask_invert:
             raise InputError("--mask-invert and --no-mask-invert are mutually exclusive.")
         return CaptureInputs(

@@ -203,9 +203,6 @@ def bake_tables(grid: FieldGrid, rig: Rig, config: BakeConfig) -> PlayerTables:
         grid: The sampled field.
         rig: What moves it.
         config: Resolution.
-
-    Raises:
-        ExportRefused: If the field is empty.
     """
     surface = _surface_within_surfel_limit(grid, config)
     canonical = body_from_rest(rig.rest_joints, rig.parents, rig.canonical_rotations)

@@ -75,9 +75,6 @@ def write_package(package: AvatarPackage, path: Path) -> int:
 
     Returns:
         Its size in bytes.
-
-    Raises:
-        OSError: If the disk is full or the folder not writable; nothing is left behind.
     """
     with PackageWriter(path) as draft:
         draft.add_tables(package.tables["hq"])
@@ -93,9 +90,6 @@ def update_metrics(path: Path, metrics: Mapping[str, Any]) -> int:
 
     Returns:
         The new size in bytes.
-
-    Raises:
-        OSError: If the disk is full; the package is then as it was.
     """
     with zipfile.ZipFile(path) as old, PackageWriter(path) as draft:
         manifest = Manifest.from_json(old.read(MANIFEST_ENTRY))
@@ -120,11 +114,7 @@ class PackageWriter:
         self._sums: dict[str, str] = {}
 
     def __enter__(self) -> "PackageWriter":
-        """Open the temporary file.
-
-        Raises:
-            OSError: If the folder is not writable.
-        """
+        """Open the temporary file."""
         self._draft = AtomicFile(self._path)
         self._file = self._draft.temporary_path.open("wb")
         self._archive = zipfile.ZipFile(self._file, "w")
@@ -230,11 +220,7 @@ class _BoundedFile:
         self._file, self.max_read_bytes = file, max_read_bytes
 
     def read(self, size: int = -1) -> bytes:
-        """Read as a file does.
-
-        Raises:
-            zipfile.BadZipFile: If more bytes than the limit are there to be returned.
-        """
+        """Read as a file does."""
         if self.max_read_bytes is not None and not 0 <= size <= self.max_read_bytes:
             content = self._file.read(self.max_read_bytes + 1)
             if len(content) > self.max_read_bytes:

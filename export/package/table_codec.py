@@ -81,11 +81,7 @@ class TableLayout:
         )
 
     def check(self) -> None:
-        """Refuse tables larger than the player can use, before anything is allocated.
-
-        Raises:
-            InputError: If a size is out of bounds.
-        """
+        """Refuse tables larger than the player can use, before anything is allocated."""
         sound = (
             0 < self.surfels < 1 << SURFEL_BITS
             and 0 <= self.bricks <= MAX_BRICKS
@@ -154,11 +150,7 @@ def estimate_brick_bytes(bricks: BrickTable) -> float:
 
 
 def decode_tables(streams: dict[str, bytes], layout: TableLayout) -> PlayerTables:
-    """Decode the streams of `encode_tables`, whose sizes are already checked.
-
-    Raises:
-        InputError: If blocks and bricks, or nodes and weights, differ in number.
-    """
+    """Decode the streams of `encode_tables`, whose sizes are already checked."""
     arrays = {
         name: np.frombuffer(streams[name], dtype=dtype).reshape(shape)
         for name, (dtype, shape) in layout.stream_types().items()
@@ -168,7 +160,7 @@ def decode_tables(streams: dict[str, bytes], layout: TableLayout) -> PlayerTable
             low=np.array(layout.surfel_low, dtype=np.float32),
             extent_m=layout.surfel_extent_m,
             spacing_m=layout.surfel_spacing_m,
-            position_codes=_delta_decode(arrays["positions"], axes=(-1,)).T,
+            position_codes=np.cumsum(arrays["positions"], axis=-1, dtype=np.uint16).T,
             normal_codes=arrays["normals"].T,
             thickness_codes=arrays["thickness"],
         ),
@@ -184,41 +176,18 @@ def _delta_encode(
 ) -> Shaped[np.ndarray, "*shape"]:
     """Subtract from each code the one before it along each axis in turn, modulo its type."""
     for axis in axes:
-        first = np.take(codes, [0], axis=axis)
-        codes = np.concatenate([first, np.diff(codes, axis=axis)], axis=axis)
+        codes = np.diff(codes, axis=axis, prepend=codes.dtype.type(0))
     return codes
-
-
-def _delta_decode(
-    codes: Shaped[np.ndarray, "*shape"], *, axes: tuple[int, ...]
-) -> Shaped[np.ndarray, "*shape"]:
-    """Invert `_delta_encode`."""
-    for axis in axes:
-        codes = np.cumsum(codes, axis=axis, dtype=codes.dtype)
-    return codes
-
-
-EVEN_BYTES = np.uint64(0x00FF00FF00FF00FF)
-"""Mask of every second byte of eight."""
 
 
 def cumsum_cubes(codes: UInt8[np.ndarray, "*cubes 8 8 8"]) -> UInt8[np.ndarray, "*cubes 8 8 8"]:
-    """Sum cumulatively along the last three axes, eight bytes to a word: a sixth of numpy's time.
-
-    Along a word, bytes are summed in two sets of 16-bit lanes by one multiplication each (a lane's
-    four bytes cannot overflow it); across words they are added lane by lane.
-    """
-    words = np.ascontiguousarray(codes).view("<u8")[..., 0]  # …, 8, 8
-    ones = np.uint64(0x0001000100010001)
-    even, odd = (words & EVEN_BYTES) * ones, (words >> np.uint64(8) & EVEN_BYTES) * ones
-    even, odd = even + (odd << np.uint64(16)) & EVEN_BYTES, even + odd & EVEN_BYTES
-    for lanes in (even, odd):
-        for row in range(1, 8):
-            lanes[..., row] = lanes[..., row] + lanes[..., row - 1] & EVEN_BYTES
-        for layer in range(1, 8):
-            lanes[..., layer, :] = lanes[..., layer, :] + lanes[..., layer - 1, :] & EVEN_BYTES
-    whole = (even | odd << np.uint64(8)).astype("<u8", copy=False)
-    return whole[..., None].view(np.uint8)
+    """Sum cumulatively along the last three axes: a third of the time of numpy's cumsum."""
+    sums = codes.copy()
+    for axis in (-3, -2, -1):
+        layers = np.moveaxis(sums, axis, 0)
+        for layer in range(1, BRICK_SIZE):
+            layers[layer] += layers[layer - 1]
+    return sums
 
 
 def _decorrelate_colors(voxels: UInt8[np.ndarray, "4 *nodes"]) -> UInt8[np.ndarray, "4 *nodes"]:
@@ -227,19 +196,14 @@ def _decorrelate_colors(voxels: UInt8[np.ndarray, "4 *nodes"]) -> UInt8[np.ndarr
     return np.stack([red - green, green, blue - green, density])
 
 
-def _recorrelate_colors(voxels: UInt8[np.ndarray, "4 *nodes"]) -> UInt8[np.ndarray, "4 *nodes"]:
-    """Invert `_decorrelate_colors`."""
-    red, green, blue, density = voxels
-    return np.stack([red + green, green, blue + green, density])
-
-
 def _decode_bricks(
     blocks: UInt8[np.ndarray, "bytes"],
     voxels: UInt8[np.ndarray, "4 bricks 8 8 8"],
     layout: TableLayout,
 ) -> BrickTable:
     index = _number_set_bits(blocks, layout.brick_counts, layout.bricks)
-    core = np.moveaxis(_recorrelate_colors(cumsum_cubes(voxels)), 0, -1)
+    core = np.moveaxis(cumsum_cubes(voxels), 0, -1)
+    core[..., [0, 2]] += core[..., 1:2]  # as `_decorrelate_colors` subtracted green
     whole = add_border_voxels(index, np.pad(core, [(1, 0), *[(0, 0)] * 4]))
     low = np.array(layout.brick_low, dtype=np.float32)
     return BrickTable(low=low, voxel_m=layout.voxel_m, index=index, voxels=whole)
