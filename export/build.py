@@ -213,14 +213,7 @@ def _fine_tune(
     max_pictures: int,
     progress: ExportProgress,
 ) -> FineTuningResult:
-    """Fine-tune bricks until Ctrl-C; bake again where the player is far from the renderer.
-
-    Args:
-        inputs: What is tuned, against what.
-        bake_again: Bakes the tables of a thick field, whose bricks take about `BRICK_BYTES`.
-        max_pictures: Pictures to learn from; 0 for no fine-tuning.
-        progress: Receives the fraction of the fine-tuning that is done.
-    """
+    """Fine-tune bricks until Ctrl-C; bake again where the player is far from the renderer."""
     if max_pictures:
         with suppress(KeyboardInterrupt):
             if is_below_target(inputs):
@@ -238,15 +231,7 @@ def _checked_package(
     executor: Executor,
     warnings: list[str],
 ) -> AvatarPackage:
-    """Check every tier; add scores, warnings, golden frames and the preview.
-
-    Args:
-        package: As `_unchecked_package` makes it.
-        views: Poses and cameras.
-        exact: The renderer's pictures of them on white.
-        executor: Opens the other tiers' players while the best one is checked.
-        warnings: Warnings known so far.
-    """
+    """Check every tier; add scores, warnings, golden frames and the preview."""
     manifest = package.manifest
     others = {t: executor.submit(Player, package, tier=t) for t in manifest.tiers if t != "hq"}
     hq, tiers = Player(package), {}

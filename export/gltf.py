@@ -89,12 +89,6 @@ def encode_glb(
 
     Colors include the recording's light, so the material is unlit (KHR_materials_unlit), and matt
     for importers without that extension. The canonical pose is the bind pose and the rest pose.
-
-    Args:
-        mesh: In the canonical pose.
-        manifest: The skeleton.
-        animation: The motion.
-        name: Name of the avatar.
     """
     draft = _GltfBuffer()
     skin, nodes = _skeleton(draft, mesh, manifest)

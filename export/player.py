@@ -263,12 +263,7 @@ class Player:
 def compare_golden_frames(
     package: AvatarPackage, *, provider: str = "cpu"
 ) -> list[PictureDifference]:
-    """Draw a package's golden frames again and compare them with the stored ones.
-
-    Args:
-        package: A package that was read.
-        provider: onnxruntime's execution provider.
-    """
+    """Draw a package's golden frames again and compare them with the stored ones."""
     player = Player(package, provider=provider)
     return [
         PictureDifference.of(

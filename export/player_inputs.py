@@ -47,12 +47,7 @@ class SkinningNodes:
 
 
 def skinning_nodes(skin: SkinningGrid, subdivision: int) -> SkinningNodes:
-    """Return the nodes of a skinning grid.
-
-    Args:
-        skin: The stored grid.
-        subdivision: Parts into which each step is cut, 1 or 2.
-    """
+    """Return the nodes of a skinning grid."""
     if subdivision not in (1, 2):
         raise InputError(
             f"The package cuts steps of its skinning grid into {subdivision} parts; expected 1 or "
@@ -251,12 +246,7 @@ class ResolutionLimit:
         self._footprint_m = tables.surfels.spacing_m * settings.footprint_spacings
 
     def downscale_factor(self, bones: Float32[np.ndarray, "24 3 4"], camera: Camera) -> float:
-        """Return the factor by which a picture has to be coarser; 1 if surfels leave no gaps.
-
-        Args:
-            bones: Camera-from-canonical matrices.
-            camera: Its lens and size.
-        """
+        """Return the factor by which a picture has to be coarser; 1 if surfels leave no gaps."""
         most = max(self._largest_px - 1, 1)
         footprint = max(camera.focal_px) * self._footprint_m  # pixels at a depth of 1 m
         depth = float(bones[0, 2, :3] @ self._pelvis + bones[0, 2, 3])

@@ -73,13 +73,7 @@ def _crop_to_cover(
 
 
 def check_clip_path(path: Path, inputs: Iterable[Path], *, overwrite: bool) -> None:
-    """Check that a clip can be written.
-
-    Args:
-        path: A clip, an image, or a folder for frames.
-        inputs: Files that are read and must not be written to.
-        overwrite: Whether an existing file may be replaced.
-    """
+    """Check that a clip can be written."""
     if path.suffix.lower() in CLIP_SUFFIXES:
         check_output_file(path, "--out", inputs, overwrite=overwrite)
     elif path.suffix and not path.is_dir():

@@ -50,14 +50,7 @@ class RenderSequence:
 def plan_render(
     arguments: PlayArguments, player: Player, console: Console, *, max_fps: float = np.inf
 ) -> RenderSequence:
-    """Plan the images that the arguments request.
-
-    Args:
-        arguments: Of ia-play.
-        player: Player of the avatar.
-        console: Shows notes and warnings about the poses.
-        max_fps: Largest frame rate of the output format.
-    """
+    """Plan the images that the arguments request."""
     if arguments.poses is None and arguments.turntable is not None:
         motion = _single_pose_motion(canonical_pose_of(player))
     elif arguments.poses is None:

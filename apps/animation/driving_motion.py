@@ -38,12 +38,7 @@ _JOINTS = np.array([1, 2, 4, 5, 16, 17, 18, 19]) - 1
 
 
 def demo_motion(frames: int = 48, *, fps: float = 16.0) -> Motion:
-    """Turn once at the world's origin, wave and lift the knees; the motion is a loop.
-
-    Args:
-        frames: Number of poses.
-        fps: Poses per second.
-    """
+    """Turn once at the world's origin, wave and lift the knees; the motion is a loop."""
     phase = np.linspace(0.0, 2.0 * np.pi, frames, endpoint=False)
     steps = np.sin(2.0 * phase)
     joints = np.zeros((frames, 23, 3))
@@ -77,14 +72,7 @@ def load_driving_motion(
     *,
     person: str | None = None,
 ) -> Motion:
-    """Read poses from a file and anchor them at the avatar's pelvis.
-
-    Args:
-        path: A pose file of any format that `preprocess.poses` reads.
-        rest_joints: Rest joints of the avatar, meters.
-        console: Shows notes and warnings about the poses.
-        person: Person ID in the file; None for the longest track.
-    """
+    """Read poses from a file and anchor them at the avatar's pelvis."""
     read = require_plausible(read_poses(path, person=person, prefer_world=True), path)
     motion = anchor_at_pelvis(read, rest_joints)
     if motion.note is not None:

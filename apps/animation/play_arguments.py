@@ -65,11 +65,7 @@ class Viewpoint:
             )
 
     def rotation_at(self, seconds: float) -> Float[np.ndarray, "3 3"]:
-        """Return the rotation from a level camera in front of the person to this viewpoint.
-
-        Args:
-            seconds: Time since the first frame.
-        """
+        """Return the rotation from a level camera in front of the person to this viewpoint."""
         turns = 0.0 if self.turn_period_s is None else seconds / self.turn_period_s
         round_it = np.array([0.0, np.deg2rad(self.orbit_deg) + 2.0 * np.pi * turns, 0.0])
         above = np.array([np.deg2rad(self.elevation_deg), 0.0, 0.0])

@@ -64,13 +64,7 @@ def write_site(files: Mapping[str, bytes], path: Path) -> None:
 
 
 def serve_site(files: Mapping[str, bytes], port: int, console: Console) -> None:
-    """Serve the page on the loopback address until Ctrl-C.
-
-    Args:
-        files: Content by relative path.
-        port: First port to try.
-        console: Shows a hint; the address goes to stdout.
-    """
+    """Serve the page on the loopback address until Ctrl-C."""
     server = make_server(files, port)
     address = f"http://{HOST}:{server.server_port}"
     with stop_on_interrupt(console, "closing the server") as ended:

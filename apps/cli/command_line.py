@@ -48,10 +48,6 @@ def stop_on_interrupt(
     """Yield an event that the first Ctrl-C sets; the second raises KeyboardInterrupt.
 
     On other threads than the main one the event is never set.
-
-    Args:
-        console: Shows that the work is stopping.
-        closing_message: What happens before the end.
     """
     stop = threading.Event()
 
@@ -72,11 +68,6 @@ def exit_on_interrupt(
 
     For imports, kernel compilation and native threads, where an exception in the main thread would
     turn into other errors or a crash.
-
-    Args:
-        console: Restores the terminal.
-        program: Name of the command, in front of the message.
-        cleanup: Called before the process exits.
     """
 
     def leave(signal_number: int, frame: object) -> None:
@@ -133,10 +124,6 @@ def run_command(program: str, work: Callable[[], int]) -> int:
 
     No usable avatar is 1, bad input or a missing package 2, a full disk or a busy device 3, Ctrl-C
     and SIGTERM 130. Bugs keep their traceback.
-
-    Args:
-        program: Name of the command, in front of the message.
-        work: Returns the exit code of a command that does not fail.
     """
     interrupted = threading.Event()
 

@@ -46,12 +46,7 @@ PROBE_SPACING_M = 0.012
 
 
 def bake_skinning(rig: Rig, surface: ProxySurface) -> SkinningGrid:
-    """Keep the cells of the rig's skinning grid in which rays may be marched.
-
-    Args:
-        rig: Its weights are kept.
-        surface: Where rays enter, and how deep they see.
-    """
+    """Keep the cells of the rig's skinning grid in which rays may be marched."""
     shape = np.array(rig.weights.shape[:3])
     step_m = (rig.box_high - rig.box_low) / (shape - 1)
     depths = np.arange(
@@ -197,13 +192,7 @@ def sample_field(
 
 
 def bake_tables(grid: FieldGrid, rig: Rig, config: BakeConfig) -> PlayerTables:
-    """Bake sampled density and color, the second half; numpy and serial kernels, on any thread.
-
-    Args:
-        grid: The sampled field.
-        rig: What moves it.
-        config: Resolution.
-    """
+    """Bake sampled density and color, the second half; numpy and serial kernels, on any thread."""
     surface = _surface_within_surfel_limit(grid, config)
     canonical = body_from_rest(rig.rest_joints, rig.parents, rig.canonical_rotations)
     pelvis = canonical[0, :3, :3] @ rig.rest_joints[0] + canonical[0, :3, 3]

@@ -260,11 +260,6 @@ def fine_tune(
 
     Trains on poses near the views, seen from all sides. After each round the quantized bricks are
     judged on the views and on novel poses, which are not trained on.
-
-    Args:
-        inputs: What is tuned, against what.
-        max_pictures: Pictures to train on, at most.
-        progress: Receives the fraction that is done.
     """
     tables, generator = inputs.tables, np.random.default_rng(0)
     training = inputs.perturbed_views(max_pictures, POSE_NOISE_RAD, generator, TRAINING_PX)

@@ -147,14 +147,7 @@ class FieldGrid:
 def sample_field_grid(
     field_at: FieldFunction, rig: Rig, occupied: UInt8[np.ndarray, "cx cy cz"], voxel_m: float
 ) -> FieldGrid:
-    """Sample the field at every node inside an occupied cell; the others are empty.
-
-    Args:
-        field_at: The field.
-        rig: Its box is what the cells divide.
-        occupied: Cells of the box that are not empty, as in `rig.skin_distance`.
-        voxel_m: Distance between nodes, metres.
-    """
+    """Sample the field at every node inside an occupied cell; the others are empty."""
     first, last = _occupied_bounds(occupied)
     cell = (rig.box_high - rig.box_low) / occupied.shape
     low = (rig.box_low + (first - 1) * cell).astype(np.float32)

@@ -183,12 +183,6 @@ def march_segments(
     After each block, rays that have ended are dropped; a Newton step moves the others back onto
     their camera rays and updates their directions. The last block takes the rest of a ray.
 
-    Args:
-        context: Tables, settings and inputs.
-        posed: Skinning nodes in the camera's frame.
-        segment: The rays.
-        close_up: Whether the picture is one (`MIN_FOOTPRINT_PX`): then there is one more block.
-
     Returns:
         Premultiplied color, and the transmittance, in [0, 1].
     """

@@ -105,11 +105,7 @@ class PackageWriter:
     """
 
     def __init__(self, path: Path) -> None:
-        """Open nothing yet.
-
-        Args:
-            path: Name of the finished package; replaces an older one.
-        """
+        """Open nothing yet."""
         self._path = path
         self._sums: dict[str, str] = {}
 
@@ -127,9 +123,6 @@ class PackageWriter:
 
     def finish(self, package: AvatarPackage) -> int:
         """Add graphs, golden frames, preview and manifest, and rename the package.
-
-        Args:
-            package: Its tables have been added.
 
         Returns:
             Its size in bytes.
