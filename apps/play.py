@@ -20,7 +20,7 @@ from apps.cli.console import Console
 from capture.input_error import InputError
 
 if TYPE_CHECKING:  # onnxruntime is loaded after --help has been answered
-    from apps.animation.clip_rendering import RenderSequence
+    from apps.animation.clip_rendering import Shot
     from export.player import Player
 
 
@@ -69,10 +69,10 @@ def _render_clip(arguments: PlayArguments, console: Console) -> int:
     description = clip_format(out, transparent=blend is None).description
     player = Player.load(arguments.avatar, tier=arguments.tier, provider=arguments.provider)
     _print_package_warnings(player, console)
-    shots = plan_render(
+    shots, fps = plan_render(
         arguments, player, console, max_fps=MAX_GIF_FPS if suffix == ".gif" else np.inf
     )
-    if arguments.fps is not None and shots.fps < arguments.fps:
+    if arguments.fps is not None and fps < arguments.fps:
         console.info(f"note: GIF output is limited to {MAX_GIF_FPS:g} fps.")
     total = len(shots)
     with (
@@ -92,21 +92,21 @@ def _render_clip(arguments: PlayArguments, console: Console) -> int:
         count = write_clip(
             out,
             pictures(),
-            fps=shots.fps,
+            fps=fps,
             blend=blend,
             replace=arguments.overwrite,
         )
-    console.info(f"Rendered {_describe_clip(shots, count)}; {description}:")
+    console.info(f"Rendered {_describe_clip(shots, count, fps)}; {description}:")
     print(out)  # noqa: T201 - paths go to stdout, for scripts
     return DONE if count == total else INTERRUPTED
 
 
-def _describe_clip(shots: "RenderSequence", count: int) -> str:
+def _describe_clip(shots: "list[Shot]", count: int, fps: float) -> str:
     """Return how many frames were rendered, their size, and their rate if there are several."""
-    width, height = shots.cameras[0].size_px
+    width, height = shots[0][1].size_px
     cut = f" of {len(shots)}" if count < len(shots) else ""
     frames = "1 frame" if len(shots) == 1 else f"{count}{cut} frames"
-    rate = f" at {shots.fps:.4g} fps" if count > 1 else ""
+    rate = f" at {fps:.4g} fps" if count > 1 else ""
     return f"{frames} of {width}x{height} px{rate}"
 
 
@@ -127,7 +127,7 @@ def _run_benchmark(arguments: PlayArguments, console: Console) -> int:
     player = Player.load(arguments.avatar, tier=arguments.tier, provider=arguments.provider)
     load_ms = 1000.0 * (time.perf_counter() - started)
     _print_package_warnings(player, console)
-    shots = list(plan_render(arguments, player, console))
+    shots, _ = plan_render(arguments, player, console)
     result = benchmark_player(
         player,
         shots,

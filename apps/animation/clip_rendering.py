@@ -1,7 +1,6 @@
 """Poses and cameras of the images that ia-play renders."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,6 @@ import numpy as np
 from apps.animation.driving_motion import (
     FollowingCamera,
     ResampledMotion,
-    canonical_pose_of,
     demo_motion,
     load_driving_motion,
 )
@@ -18,49 +16,31 @@ from apps.cli.console import Console
 from capture.camera import Camera
 from capture.input_error import InputError
 from export.player import Player
-from preprocess.body.body_pose import BodyPose, Motion
+from preprocess.body.body_pose import BodyPose
 
 TURNTABLE_FPS = 30.0
 """Frames per second of a turntable around a still pose."""
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class RenderSequence:
-    """Images to render.
-
-    Attributes:
-        poses: Pose of each image.
-        cameras: Camera of each image.
-        fps: Frames per second.
-    """
-
-    poses: tuple[BodyPose, ...]
-    cameras: tuple[Camera, ...]
-    fps: float
-
-    def __len__(self) -> int:
-        """Return the number of images."""
-        return len(self.poses)
-
-    def __iter__(self) -> Iterator[tuple[BodyPose, Camera]]:
-        """Iterate over pairs of pose and camera."""
-        return zip(self.poses, self.cameras, strict=True)
+Shot = tuple[BodyPose, Camera]
+"""What one image shows."""
 
 
 def plan_render(
     arguments: PlayArguments, player: Player, console: Console, *, max_fps: float = np.inf
-) -> RenderSequence:
-    """Plan the images that the arguments request."""
-    if arguments.poses is None and arguments.turntable is not None:
-        motion = _single_pose_motion(canonical_pose_of(player))
-    elif arguments.poses is None:
-        motion = demo_motion()
-    else:
+) -> tuple[list[Shot], float]:
+    """Return the images that the arguments request, and their frame rate."""
+    if arguments.poses is not None:
         motion = load_driving_motion(
             arguments.poses, player.manifest.rest_joints, console, person=arguments.person
         )
-    one = arguments.still is not None or len(motion) == 1
-    if one or arguments.output_path.suffix.lower() == ".png":
+    elif arguments.turntable is not None:
+        canonical = player.manifest.canonical_rotations
+        motion = replace(demo_motion(1), joint_rotations=canonical[None])
+    else:
+        motion = demo_motion()
+    is_image = arguments.output_path.suffix.lower() == ".png"
+    if arguments.still is not None or len(motion) == 1 or is_image:
         row = arguments.still or 0
         if not (0 <= row < len(motion) and motion.valid[row]):
             raise InputError(
@@ -68,66 +48,28 @@ def plan_render(
                 f"{len(motion)} poses, 0 to {len(motion) - 1}, {int(motion.valid.sum())} of them "
                 "valid."
             )
-        return _plan_single_pose(arguments, player, motion, row, max_fps)
-    fps = arguments.fps and min(arguments.fps, max_fps)
-    line = ResampledMotion.of(motion, fps=fps, speed=arguments.speed)
-    if line.fps > max_fps:
-        line = ResampledMotion.of(motion, fps=max_fps, speed=arguments.speed)
-    poses = tuple(line.pose(picture) for picture in range(len(line)))
-    rows = tuple(line.nearest_row(picture) for picture in range(len(line)))
-    cameras = _plan_cameras(arguments, player, motion, rows, poses, line.fps)
-    return RenderSequence(poses=poses, cameras=cameras, fps=line.fps)
-
-
-def _single_pose_motion(pose: BodyPose) -> Motion:
-    """Return a motion of one pose."""
-    return Motion(
-        root_rotations=pose.root_rotation[None],
-        root_translations=pose.root_translation[None],
-        joint_rotations=pose.joint_rotations[None],
-        valid=np.ones(1, dtype=bool),
-        betas=np.zeros(10),
-        body_model="body24",
-    )
-
-
-def _plan_single_pose(
-    arguments: PlayArguments, player: Player, motion: Motion, row: int, max_fps: float
-) -> RenderSequence:
-    """Plan one image of a pose, or a turntable around it."""
-    fps = min(arguments.fps or TURNTABLE_FPS, max_fps)
-    count = 1
-    if arguments.turntable is not None and arguments.output_path.suffix.lower() != ".png":
-        count = max(1, round(abs(arguments.turntable) * fps))
-    poses = (motion[row],) * count
-    valid = np.arange(len(motion)) == row
-    held = replace(motion, valid=valid)  # the camera faces this pose
-    return RenderSequence(
-        poses=poses,
-        cameras=_plan_cameras(arguments, player, held, (row,) * count, poses, fps),
-        fps=fps,
-    )
-
-
-def _plan_cameras(
-    arguments: PlayArguments,
-    player: Player,
-    motion: Motion,
-    rows: tuple[int, ...],
-    poses: tuple[BodyPose, ...],
-    fps: float,
-) -> tuple[Camera, ...]:
+        motion = replace(motion, valid=np.arange(len(motion)) == row)  # the camera faces this pose
+        fps, count = min(arguments.fps or TURNTABLE_FPS, max_fps), 1
+        if arguments.turntable is not None and not is_image:
+            count = max(1, round(abs(arguments.turntable) * fps))
+        poses, rows = [motion[row]] * count, [row] * count
+    else:
+        line = ResampledMotion.of(motion, fps=arguments.fps, speed=arguments.speed, max_fps=max_fps)
+        fps = line.fps
+        poses = [line.pose(frame) for frame in range(len(line))]
+        rows = [line.nearest_row(frame) for frame in range(len(line))]
     if arguments.camera is not None:
-        return load_cameras(arguments.camera, len(motion), rows, arguments.size_px)
-    following = FollowingCamera.of(
-        player, motion, arguments.size_px or DEFAULT_SIZE_PX, arguments.viewpoint
-    )
-    return tuple(following.camera_for(pose, number / fps) for number, pose in enumerate(poses))
+        cameras = load_cameras(arguments.camera, len(motion), rows, arguments.size_px)
+    else:
+        size_px = arguments.size_px or DEFAULT_SIZE_PX
+        following = FollowingCamera.of(player, motion, size_px, arguments.viewpoint)
+        cameras = [following.camera_for(pose, frame / fps) for frame, pose in enumerate(poses)]
+    return list(zip(poses, cameras, strict=True)), fps
 
 
 def load_cameras(
-    path: Path, poses: int, rows: tuple[int, ...], size: int | tuple[int, int] | None
-) -> tuple[Camera, ...]:
+    path: Path, poses: int, rows: list[int], size: int | tuple[int, int] | None
+) -> list[Camera]:
     """Read the cameras of some poses as pinhole cameras of a size.
 
     Args:
@@ -144,7 +86,7 @@ def load_cameras(
             f"{path} holds {len(track.cameras)} cameras for {poses} poses, but must hold one, or "
             "one per pose."
         )
-    return tuple(_resize_camera(track[row], size) for row in rows)
+    return [_resize_camera(track[row], size) for row in rows]
 
 
 def _resize_camera(camera: Camera, size: int | tuple[int, int] | None) -> Camera:

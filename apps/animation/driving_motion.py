@@ -108,7 +108,9 @@ class ResampledMotion:
     positions: Float[np.ndarray, "frames"]
 
     @classmethod
-    def of(cls, motion: Motion, *, fps: float | None, speed: float = 1.0) -> "ResampledMotion":
+    def of(
+        cls, motion: Motion, *, fps: float | None, speed: float = 1.0, max_fps: float = np.inf
+    ) -> "ResampledMotion":
         """Resample a motion; without times, it has one pose per frame.
 
         Args:
@@ -116,9 +118,10 @@ class ResampledMotion:
             fps: Frames per second; None for the motion's own rate, divided by an integer to stay
                 within `MAX_FPS`.
             speed: Factor on the speed of the motion.
+            max_fps: Largest frame rate of the output.
         """
         rows, rate = np.flatnonzero(motion.valid), pose_rate(motion)
-        pace = fps or rate / float(np.ceil(rate / MAX_FPS - 1e-6))
+        pace = min(fps or rate / float(np.ceil(rate / MAX_FPS - 1e-6)), max_fps)
         step = speed if motion.times_s is None else speed * rate / pace
         step = 1.0 if abs(step - 1.0) < 1e-3 else step
         count = int((len(rows) - 1) / step + 1e-6) + 1
