@@ -355,7 +355,7 @@ def test_a_full_disk_leaves_nothing(package, novel, tmp_path):
     ended = done.stdout.splitlines()
     assert len(ended) == 5, done.stderr
     assert [line.split()[-1] for line in ended] == ["3"] * 5, ended
-    assert done.stderr.count("full") == 5
+    assert done.stderr.count("the disk is full") == 5
     assert "Traceback" not in done.stderr
     assert list(tmp_path.iterdir()) == []
 
