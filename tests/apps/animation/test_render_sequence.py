@@ -127,7 +127,7 @@ def test_pictures_do_not_depend_on_the_workers(frames, novel):
 
 def test_by_itself_there_is_a_worker_for_each_core(monkeypatch, package):
     monkeypatch.setattr(hardware, "CGROUP", Path("/none"))
-    monkeypatch.setattr(hardware.psutil.Process, "cpu_affinity", lambda process: [0, 2, 5])
+    monkeypatch.setattr(hardware.os, "sched_getaffinity", lambda process: {0, 2, 5})
     assert play_arguments.PlayArguments(avatar=package).worker_count == 3
     assert play_arguments.PlayArguments(avatar=package, workers=2).worker_count == 2
 
