@@ -51,7 +51,7 @@ class _MaskVideo:
         self._at, frame = next((item for item in self._frames if item[0] >= row), (-1, None))
         image = frame.rgb() if frame is not None and self._at == row else None
         if image is None:
-            self._at = -1  # the next one starts anew
+            self._at = -1  # the next call decodes from the start
             raise InputError(f"Frame {row} of the masks {self._video.path} cannot be decoded.")
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
         self._last = np.clip(
