@@ -59,7 +59,7 @@ class FrameScore(HeldOutScore):
     cpu_ms: float
     lpips: Mapping[str, float] = field(default_factory=dict)
 
-    def as_json(self) -> dict[str, float]:
+    def as_json(self) -> dict[str, float | int]:
         """Return all values by name."""
         values = {key: value for key, value in vars(self).items() if key != "lpips"}
         return values | {f"lpips_{name}": value for name, value in self.lpips.items()}

@@ -174,7 +174,7 @@ def test_a_box_is_scored_without_the_white_around_it(film):
 
 
 def test_each_background_has_its_own_scores_of_one_rendering(film, monkeypatch):
-    monkeypatch.setattr(Lpips, "compare", lambda self, image, truth, name: image.mean())
+    monkeypatch.setattr(Lpips, "compare", lambda self, image, truth, name: float(image.mean()))
     lpips = Lpips(())
     lpips.conventions = ("alex",)
     (seen, *_) = open_capture(CaptureInputs(video=film)).observations()
