@@ -16,15 +16,15 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	touch $@
 
 demo: install
-	$(BIN)/python -m apps.sample $(DEMO)/capture --size 256 --overwrite
-	$(BIN)/python -m apps.ingest $(DEMO)/capture/video.mp4 --poses $(DEMO)/capture/poses.npz --out $(DEMO)/run --seconds 60 --overwrite
+	$(BIN)/python -m instant_avatar.sample $(DEMO)/capture --size 256 --overwrite
+	$(BIN)/python -m instant_avatar.ingest $(DEMO)/capture/video.mp4 --poses $(DEMO)/capture/poses.npz --out $(DEMO)/run --seconds 60 --overwrite
 	cp $(DEMO)/capture/video.mp4 $(DEMO)/video.mp4
-	$(BIN)/python -m apps.ingest $(DEMO)/video.mp4 --out $(DEMO)/from-video --seconds 60 --overwrite
-	$(BIN)/python -m apps.evaluate $(DEMO)/run $(DEMO)/from-video --markdown $(DEMO)/comparison.md --overwrite
-	$(BIN)/python -m apps.play $(DEMO)/run/avatar.iavatar --poses $(DEMO)/capture/dance.npz --out $(DEMO)/dance.webm --overwrite
+	$(BIN)/python -m instant_avatar.ingest $(DEMO)/video.mp4 --out $(DEMO)/from-video --seconds 60 --overwrite
+	$(BIN)/python -m instant_avatar.evaluate $(DEMO)/run $(DEMO)/from-video --markdown $(DEMO)/comparison.md --overwrite
+	$(BIN)/python -m instant_avatar.play $(DEMO)/run/avatar.iavatar --poses $(DEMO)/capture/dance.npz --out $(DEMO)/dance.webm --overwrite
 
 web: install # what `ia-play --web` needs: onnxruntime-web, pinned, through npm
-	$(BIN)/python -m apps.animation.web_server
+	$(BIN)/python -m instant_avatar.animation.web_server
 
 results: install # docs/results.md: about an hour on two cores (calculated from its parts); MOTION=track.npz films a track of poses, PLAN=whole runs all
 	$(BIN)/python -m benchmarks.results --write docs/results.md $(if $(PLAN),--plan $(PLAN)) $(if $(MOTION),--motion $(MOTION))
@@ -33,7 +33,7 @@ test: install # on one thread: these tests are small, a second thread costs more
 	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -q -m "not slow"
 
 test-all: install # the slow ones, too: long trainings, the browser, a fresh installation
-	-$(BIN)/python -m apps.animation.web_server # without it the browser's tests are skipped
+	-$(BIN)/python -m instant_avatar.animation.web_server # without it the browser's tests are skipped
 	$(BIN)/python -m pytest -q
 
 check: install

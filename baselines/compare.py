@@ -11,11 +11,17 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from apps.cli.command_line import DONE, INTERRUPTED, parse_arguments, run_command, stop_on_interrupt
-from apps.cli.console import Console
 from baselines.comparison_table import comparison_table
 from capture.atomic_files import OutputFileList, atomic_file, atomic_folder, write_text_atomically
 from capture.input_error import InputError
+from instant_avatar.cli.command_line import (
+    DONE,
+    INTERRUPTED,
+    parse_arguments,
+    run_command,
+    stop_on_interrupt,
+)
+from instant_avatar.cli.console import Console
 
 if TYPE_CHECKING:  # torch is loaded after --help has been answered
     from baselines.systems.compared_capture import ComparedCapture
@@ -166,7 +172,7 @@ def compare(arguments: CompareArguments, console: Console) -> int:
 
 def _is_done(arguments: CompareArguments, name: str) -> bool:
     """Whether a method was trained before, under the same conditions, and is to be kept."""
-    from apps.cli.hardware import Hardware
+    from instant_avatar.cli.hardware import Hardware
 
     scores = arguments.out / name / "scores.json"
     kept = json.loads(scores.read_text()) if scores.is_file() else {}
@@ -194,9 +200,9 @@ def _train_method(
     stop: threading.Event,
 ) -> None:
     """Trains a method, and writes its folder whole; nothing if it is stopped."""
-    from apps.cli.hardware import Hardware
     from baselines.comparison_scores import curve_point, score_all
     from baselines.systems.compared_systems import make_system, train_config
+    from instant_avatar.cli.hardware import Hardware
 
     made_on = asdict(Hardware.here())
     config = train_config(data, arguments.seconds, arguments.steps, seed=arguments.seed)

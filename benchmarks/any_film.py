@@ -24,7 +24,6 @@ import cv2
 import numpy as np
 import tyro
 
-from apps.run.session_start import new_trainer
 from avatar.avatar_model import Avatar
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.evaluation.image_metrics import composite_on_white, psnr
@@ -44,6 +43,7 @@ from capture.source_opening import open_source
 from export.bake.bake_tables import ExportRefused
 from export.build import export_avatar
 from export.player import Player, premultiply
+from instant_avatar.run.session_start import new_trainer
 
 CUTS = {"sixth": 6, "third": 3, "half": 2, "all": 1}
 """Parts of a film, by what they are called: the first one of this number."""
@@ -143,7 +143,7 @@ def track_film(film: Path, folder: Path) -> Path:
         link.unlink(missing_ok=True)
         link.symlink_to(film.resolve())
         out = folder / "poses.npz"
-        words = [sys.executable, "-m", "apps.track", str(link), "--out", str(out)]
+        words = [sys.executable, "-m", "instant_avatar.track", str(link), "--out", str(out)]
         subprocess.run(words, cwd=ROOT, check=True, stdout=sys.stderr)
     return folder
 

@@ -21,7 +21,7 @@ import tyro
 
 from benchmarks.hardware import ROOT, Hardware
 from benchmarks.measurements import Measurement, markdown_rows
-from studio.shoot import ShootConfig, film_capture
+from instant_avatar.studio.shoot import ShootConfig, film_capture
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +76,7 @@ def run(command: list[str], environment: dict[str, str]) -> Cost:
 
 def run_batch(films: list[Path], out: Path, steps: int, environment: dict[str, str]) -> Cost:
     """Learn captures one after the other: each takes all cores."""
-    command = [sys.executable, "-m", "apps.batch", *map(str, films), "--out", str(out)]
+    command = [sys.executable, "-m", "instant_avatar.batch", *map(str, films), "--out", str(out)]
     words = ["--threads", str(os.cpu_count()), "--steps", str(steps)]
     wall_s = run([*command, "--", *words], environment).wall_s
     lines = (out / "results.jsonl").read_text(encoding="utf-8").splitlines()
@@ -89,7 +89,7 @@ def overhead(
     """ia-ingest on each capture, then ia-batch on all of them, one at a time, in turns."""
     alone, batches = [], []
     words = ["--steps", str(given.steps), "--threads", str(os.cpu_count()), "--overwrite"]
-    ingest = [sys.executable, "-m", "apps.ingest"]
+    ingest = [sys.executable, "-m", "instant_avatar.ingest"]
     run([*ingest, str(films[0]), *words, "--out", str(place / "warm")], environment)
     for number in range(given.rounds):
         for film in films:

@@ -21,17 +21,17 @@ import tyro
 from jaxtyping import Float
 from tyro.conf import Positional
 
-from apps.animation.driving_motion import FollowingCamera, demo_motion
-from apps.animation.web_server import make_server, web_clip
-from apps.cli.command_line import run_command
 from benchmarks.hardware import Hardware
 from benchmarks.measurements import Measurement, markdown_rows
 from benchmarks.stopwatch import limit_threads
 from export.package.player_tables import QUALITY_TIERS
 from export.player import Player
 from export.player_page import build_page
+from instant_avatar.animation.driving_motion import FollowingCamera, demo_motion
+from instant_avatar.animation.web_server import make_server, web_clip
+from instant_avatar.cli.command_line import run_command
 from preprocess.body.body_pose import Motion
-from tests.apps.browser import Browser, until
+from tests.instant_avatar.browser import Browser, until
 
 SIZE_PX = 540
 FRAMES = 24

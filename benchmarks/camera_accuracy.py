@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.hardware import Hardware
 from capture.camera import Camera
 from capture.input_error import InputError
+from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.mask_alignment import body_height_m, rescale_motion, scale_to_height
 from preprocess.cameras.camera_file import CameraTrack, read_cameras
@@ -31,7 +32,6 @@ from preprocess.open_capture import open_capture
 from preprocess.poses.pose_file import read_motion
 from preprocess.sfm.camera_solution import CameraSolution
 from preprocess.sfm.capture_solving import apply_camera_solution, solve_capture_cameras
-from studio.shoot import ShootConfig, film_capture
 
 MOST_CENTER_CM, MOST_ROTATION_DEG, MOST_SCALE, MOST_SCALE_STATED = 1.0, 0.2, 0.03, 0.01
 MOST_PSNR_LOSS = 0.5

@@ -13,12 +13,12 @@ import tempfile
 import time
 from pathlib import Path
 
-from apps.capture_validation import check_capture
 from benchmarks import capture_corruptions as corrupt
 from benchmarks.capture_corruptions import CorruptedCapture, Corruption
 from benchmarks.hardware import Hardware
+from instant_avatar.capture_validation import check_capture
+from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.capture_session import CaptureInputs
-from studio.shoot import ShootConfig, film_capture
 
 CAPTURES = {
     "turn": ShootConfig(frames=120, size=256),

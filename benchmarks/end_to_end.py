@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 import tyro
 
-from apps.report.report_schema import CurvePoint
 from avatar.evaluation.image_metrics import composite_on_white, ground_truth_on_white, psnr, ssim
 from benchmarks.hardware import ROOT, Hardware
 from export.player import Player, premultiply
+from instant_avatar.report.report_schema import CurvePoint
+from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.capture_session import CaptureInputs
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
-from studio.shoot import ShootConfig, film_capture
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,7 +128,7 @@ def video_seconds(job: EndToEndJob) -> float:
 
 def run_ingest(job: EndToEndJob, capture: Path, run: Path) -> tuple[dict[str, Any], float]:
     """Runs ia-ingest as a user does; its report, and how long all of it took."""
-    command = [sys.executable, "-m", "apps.ingest", str(capture / "video.mp4")]
+    command = [sys.executable, "-m", "instant_avatar.ingest", str(capture / "video.mp4")]
     command += ["--poses", str(capture / "poses.npz"), "--out", str(run), "--overwrite"]
     command += ["--seconds", str(job.seconds), "--seed", str(job.seed), *job.ingest_options]
     began = time.perf_counter()

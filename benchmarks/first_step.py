@@ -18,7 +18,6 @@ def main() -> None:
     capture, began = Path(sys.argv[1]), float(sys.argv[2])
     recording = open_capture(CaptureInputs(video=capture))
 
-    from apps.run.session_start import set_threads
     from avatar.config import TrainConfig
     from avatar.evaluation.held_out import HeldOutFrame
     from avatar.events import Stepped
@@ -26,6 +25,7 @@ def main() -> None:
     from avatar.training.frame_stream import prepare_stream
     from avatar.training.train import Trainer, train, warm_up
     from capture.inbox import Inbox
+    from instant_avatar.run.session_start import set_threads
 
     set_threads(None)
     rig = Rig.from_shaped_body(recording.shaped)

@@ -13,12 +13,12 @@ import threading
 import time
 from typing import final
 
-from apps.cli.command_line import parse_arguments
-from apps.cli.console import Console
-from apps.run.ingest_arguments import IngestArguments
-from apps.run.session_start import prepare_trainer, set_threads
-from apps.run.training_session import TrainingSession
 from avatar.events import Stepped, TrainEvent
+from instant_avatar.cli.command_line import parse_arguments
+from instant_avatar.cli.console import Console
+from instant_avatar.run.ingest_arguments import IngestArguments
+from instant_avatar.run.session_start import prepare_trainer, set_threads
+from instant_avatar.run.training_session import TrainingSession
 from preprocess.observation import Observation
 
 

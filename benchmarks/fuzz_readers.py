@@ -94,9 +94,9 @@ def write_mutated_file(
 
 def readers(seeds: Path) -> dict[str, Callable[[Path], object]]:
     """What each kind of file is read by, as the commands do."""
-    from apps.capture_validation import check_capture
     from capture.source_opening import open_source
     from export.player import Player
+    from instant_avatar.capture_validation import check_capture
     from preprocess.body.parametric_body import load_body_model, read_shaped_body
     from preprocess.cameras.camera_file import read_cameras
     from preprocess.capture_session import CaptureInputs
@@ -222,7 +222,7 @@ def batches(seeds: Path, files: int, seed: int) -> list[dict[str, Any]]:
 
 def package_of(film: Path, scratch: Path) -> Path:
     """An avatar of the film, as small as one gets."""
-    from apps import ingest
+    from instant_avatar import ingest
 
     run = scratch / "run"
     code = ingest.main([str(film), "--out", str(run), "--seconds", "6", "--threads", "1"])

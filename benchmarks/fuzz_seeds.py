@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 
 from capture.source_opening import open_source
+from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.body.parametric_body import load_body_model, write_shaped_body
 from preprocess.masks.mask_files import open_masks
-from studio.shoot import ShootConfig, film_capture
 
 ROWS, SIDE = 6, 64
 

@@ -1,4 +1,4 @@
 """What a measurement was made on, and the root of the checkout."""
 
-from apps.cli.hardware import ROOT as ROOT
-from apps.cli.hardware import Hardware as Hardware
+from instant_avatar.cli.hardware import ROOT as ROOT
+from instant_avatar.cli.hardware import Hardware as Hardware

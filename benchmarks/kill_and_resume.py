@@ -37,7 +37,7 @@ class ResumedRun(NamedTuple):
 
 def ingest_command(capture: Path, run: Path, *more: str) -> list[str]:
     """ia-ingest on a small capture."""
-    words = [sys.executable, "-m", "apps.ingest", str(capture), "--out", str(run)]
+    words = [sys.executable, "-m", "instant_avatar.ingest", str(capture), "--out", str(run)]
     return [*words, "--seconds", str(SECONDS), *more]
 
 

@@ -16,13 +16,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from apps.cli.console import Console
-from apps.run.run_folder import RunFolder
 from avatar.training.train import warm_up
 from benchmarks.hardware import ROOT
 from benchmarks.measurements import Measurement
 from benchmarks.sample_training import open_sample
 from capture.source_opening import open_source
+from instant_avatar.cli.console import Console
+from instant_avatar.run.run_folder import RunFolder
 from preprocess.body.body_pose import Motion
 from preprocess.poses.pose_file import read_motion, write_motion
 
@@ -86,8 +86,8 @@ def resident_bytes() -> int:
 def main() -> None:
     """Learns, and prints what was resident at two frames, and how many were read."""
 
-    from apps.run.session_start import new_trainer
-    from apps.run.training_session import TrainingSession
+    from instant_avatar.run.session_start import new_trainer
+    from instant_avatar.run.training_session import TrainingSession
 
     capture, run = Path(sys.argv[1]), RunFolder(path=Path(sys.argv[2]))
     recording = open_sample(capture)

@@ -19,7 +19,6 @@ from unittest import mock
 
 import numpy as np
 
-from apps.run.session_start import new_trainer
 from avatar.avatar_model import Avatar
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.evaluation.image_metrics import composite_on_white, psnr
@@ -34,6 +33,7 @@ from benchmarks.sample_training import open_sample
 from benchmarks.stopwatch import limit_threads
 from export.build import export_avatar
 from export.player import Player, premultiply
+from instant_avatar.run.session_start import new_trainer
 from preprocess.body.body_pose import Motion
 from preprocess.poses.pose_file import read_motion
 

@@ -21,7 +21,6 @@ from pathlib import Path
 
 import tyro
 
-from apps.cli.command_line import run_command
 from avatar.training import checkpoint
 from avatar.training.trainer import Trainer
 from benchmarks.hardware import ROOT, Hardware
@@ -35,6 +34,7 @@ from benchmarks.player_fidelity import (
 )
 from benchmarks.sample_training import film_sample
 from benchmarks.stopwatch import limit_threads
+from instant_avatar.cli.command_line import run_command
 
 SIZE_PX = 540
 FRAMES = 120
@@ -121,7 +121,7 @@ def train_or_load(
 ) -> Trainer:
     """Load the trainer that ia-ingest left in a folder; train it first if there is none."""
     if not (run / "checkpoint").exists():
-        command = [sys.executable, "-m", "apps.ingest", str(capture), "--out", str(run)]
+        command = [sys.executable, "-m", "instant_avatar.ingest", str(capture), "--out", str(run)]
         command += ["--seconds", str(SECONDS), "--overwrite"]
         command += [] if frames is None else ["--frames", f"0:{frames}"]
         command += [] if size is None else ["--size", str(size)]

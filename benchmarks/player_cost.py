@@ -13,8 +13,6 @@ from pathlib import Path
 
 import numpy as np
 
-from apps.animation.player_checks import PlayerTiming, benchmark_player
-from apps.run.snapshot_writer import write_package_snapshot
 from avatar.training.trainer import Trainer
 from benchmarks.hardware import ROOT
 from benchmarks.measurements import Measurement
@@ -22,6 +20,8 @@ from benchmarks.player_fidelity import ComparedView
 from export.bake.bake_tables import ExportRefused
 from export.package.player_tables import QUALITY_TIERS
 from export.player import Player
+from instant_avatar.animation.player_checks import PlayerTiming, benchmark_player
+from instant_avatar.run.snapshot_writer import write_package_snapshot
 
 MB = 1e6
 

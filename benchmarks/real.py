@@ -29,8 +29,8 @@ from benchmarks.real_scores import (
     rest_joint_distance_cm,
     score_novel_poses,
 )
+from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.body.parametric_body import load_body_model
-from studio.shoot import ShootConfig, film_capture
 
 Figures = dict[str, float | None]
 """Values by what was measured, in the order of the table; None where there is none."""
@@ -87,7 +87,15 @@ class IngestRun:
             command: Of ia-ingest, without --out.
             out: Folder of the run; an older one is replaced.
         """
-        words = [sys.executable, "-m", "apps.ingest", *command, "--out", str(out), "--overwrite"]
+        words = [
+            sys.executable,
+            "-m",
+            "instant_avatar.ingest",
+            *command,
+            "--out",
+            str(out),
+            "--overwrite",
+        ]
         print(f"ia-ingest {shlex.join(words[3:])}", file=sys.stderr, flush=True)
         began, self.preparing_core_s = time.perf_counter(), None
         with subprocess.Popen(words, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:

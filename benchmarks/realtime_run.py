@@ -30,7 +30,13 @@ class RealtimeRun(NamedTuple):
 
 def run_realtime(capture: Path, run: Path, *more: str) -> RealtimeRun:
     """Runs ia-ingest --realtime and watches its folder."""
-    command = [sys.executable, "-m", "apps.ingest", str(capture / "video.mp4"), "--realtime"]
+    command = [
+        sys.executable,
+        "-m",
+        "instant_avatar.ingest",
+        str(capture / "video.mp4"),
+        "--realtime",
+    ]
     command += ["--poses", str(capture / "poses.npz"), "--out", str(run), "--overwrite", *more]
     began, there_after = time.perf_counter(), float("nan")
     with subprocess.Popen(command, cwd=ROOT, stdout=sys.stderr) as process:

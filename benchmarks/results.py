@@ -21,12 +21,12 @@ from typing import Any, Literal, final
 import cv2
 import tyro
 
-from apps.cli.command_line import INTERRUPTED, run_command
 from benchmarks.hardware import ROOT
 from benchmarks.results_page import BEGIN, END, ComparedSample, results_lines
 from capture.atomic_files import write_text_atomically
 from capture.input_error import InputError
-from studio.shoot import ShootConfig, film_capture
+from instant_avatar.cli.command_line import INTERRUPTED, run_command
+from instant_avatar.studio.shoot import ShootConfig, film_capture
 
 ORDER = ("anim-nerf", "neural-body", "snarf", "instant-ngp", "ours")
 """Methods, in the order of the tables."""

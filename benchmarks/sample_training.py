@@ -11,9 +11,9 @@ from avatar.rig import Rig
 from avatar.training.frame_stream import TrainingFrame, prepare_stream
 from avatar.training.train import Trainer
 from avatar.training.trainer import cosine_decay
+from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.open_capture import open_capture
-from studio.shoot import ShootConfig, film_capture
 
 
 class LoadedTrainer(NamedTuple):

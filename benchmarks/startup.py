@@ -55,7 +55,7 @@ def measure_peak_memory(capture: Path, run: Path) -> Iterator[Measurement]:
 
 def run_ingest(capture: Path, run: Path) -> dict[str, Any]:
     """Runs ia-ingest; its report."""
-    command = [sys.executable, "-m", "apps.ingest", str(capture / "video.mp4")]
+    command = [sys.executable, "-m", "instant_avatar.ingest", str(capture / "video.mp4")]
     command += ["--poses", str(capture / "poses.npz"), "--out", str(run), "--overwrite"]
     command += ["--seconds", str(MEMORY_SECONDS)]
     subprocess.run(command, cwd=ROOT, stdout=sys.stderr, check=False)

@@ -157,7 +157,14 @@ def bare_film(capture: Path, folder: Path) -> Path:
 
 def track(film: Path, folder: Path) -> dict[str, Any]:
     """Runs ia-track; poses.npz and masks/ are in `folder` then. Returns the grades."""
-    words = [sys.executable, "-m", "apps.track", str(film), "--out", str(folder / "poses.npz")]
+    words = [
+        sys.executable,
+        "-m",
+        "instant_avatar.track",
+        str(film),
+        "--out",
+        str(folder / "poses.npz"),
+    ]
     done = subprocess.run([*words, "--no-film", "--overwrite"], cwd=ROOT, check=False)
     if done.returncode not in (0, 1):
         sys.exit(f"ia-track ended with exit code {done.returncode}.")

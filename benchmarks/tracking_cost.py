@@ -15,8 +15,8 @@ from typing import Any, final
 
 import cv2
 
-from apps.run.person_tracking import fit_tracked_video
 from capture.source_opening import open_source
+from instant_avatar.run.person_tracking import fit_tracked_video
 from preprocess.capture_session import CaptureInputs
 from preprocess.masks.mask_refinement import MaskRefiner
 from preprocess.plugins import make_tracker

@@ -16,7 +16,6 @@ from pathlib import Path
 
 import tyro
 
-from apps.cli.command_line import run_command
 from avatar.rig import Rig
 from benchmarks.builds import build_marks
 from benchmarks.correspondence_lookup import warp_marks
@@ -38,6 +37,7 @@ from benchmarks.training_quality import (
     measure_by_wall_time,
     measure_pose_refinement,
 )
+from instant_avatar.cli.command_line import run_command
 from preprocess.poses.pose_file import read_motion
 
 SIZE_PX = 256

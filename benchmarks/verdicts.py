@@ -18,9 +18,6 @@ from typing import Literal, NamedTuple
 
 import tyro
 
-from apps.cli.console import Console
-from apps.run.final_scoring import score_finally
-from apps.run.session_start import new_trainer
 from avatar.evaluation.all_round_verdict import AllRoundVerdict
 from avatar.evaluation.coverage import Coverage
 from avatar.evaluation.held_out import HeldOutFrame
@@ -35,6 +32,9 @@ from benchmarks.sample_training import film_sample
 from benchmarks.stopwatch import limit_threads
 from export.bake.bake_tables import ExportRefused
 from export.build import export_avatar
+from instant_avatar.cli.console import Console
+from instant_avatar.run.final_scoring import score_finally
+from instant_avatar.run.session_start import new_trainer
 from preprocess.observation import Observation
 
 FRAMES = 60

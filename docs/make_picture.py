@@ -8,11 +8,11 @@ import numpy as np
 import tyro
 from PIL import Image
 
-from apps.animation.clip_file import background_compositor
-from apps.animation.driving_motion import FollowingCamera
 from capture.atomic_files import atomic_file
 from capture.source_opening import open_source
 from export.player import Player
+from instant_avatar.animation.clip_file import background_compositor
+from instant_avatar.animation.driving_motion import FollowingCamera
 from preprocess.cameras.camera_file import read_cameras
 from preprocess.poses.pose_file import read_motion
 

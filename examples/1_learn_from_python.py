@@ -10,11 +10,11 @@ import sys
 from pathlib import Path
 
 try:
-    import apps  # noqa: F401, I001 - sets OpenMP's variables, which torch reads when it is imported
+    import instant_avatar  # noqa: F401, I001 - sets OpenMP's variables, which torch reads when it is imported
 
     from preprocess.open_capture import open_capture
     from preprocess.capture_session import CaptureInputs
-    from studio.shoot import ShootConfig, film_capture
+    from instant_avatar.studio.shoot import ShootConfig, film_capture
     from avatar.config import TrainConfig
     from avatar.events import Evaluated, Finished, Warned
     from avatar.training.frame_stream import prepare_stream

@@ -51,7 +51,7 @@ LICENCE_FILES = ("LICENSE", "ThirdPartyNotices.txt")
 MISSING_MESSAGE = (
     "The browser page needs onnxruntime-web, which is not here: {why}. In a checkout, `make web` "
     "fetches it (npm package onnxruntime-web {version}, 33 MB once), anywhere else "
-    "{python} -m apps.animation.web_server"
+    "{python} -m instant_avatar.animation.web_server"
 )
 """Message of `runtime_files` for a missing file."""
 

@@ -18,12 +18,12 @@ from avatar.training.frame_stream import prepare_stream
 from avatar.training.trainer import Trainer, cosine_decay
 from capture.camera import Camera
 from capture.source import Frame
+from instant_avatar.studio import staging
+from instant_avatar.studio.actor import Actor
+from instant_avatar.studio.staging import static_camera
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.parametric_body import ShapedBody, load_body_model
 from preprocess.observation import Observation
-from studio import staging
-from studio.actor import Actor
-from studio.staging import static_camera
 
 
 @pytest.fixture(scope="session")

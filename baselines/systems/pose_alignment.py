@@ -15,12 +15,12 @@ from jaxtyping import Float, Float32
 from scipy.ndimage import distance_transform_edt
 
 from avatar.evaluation.image_metrics import composite_on_white, ground_truth_on_white
+from instant_avatar.studio.lighting import NO_FACE, rasterize
 from preprocess.body.kinematics import descendant_matrix
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.fitting.capture_fit import correct_pose
 from preprocess.fitting.clip_poses import POSE_SIGMA
 from preprocess.observation import Observation
-from studio.lighting import NO_FACE, rasterize
 
 Renderer = Callable[[Observation], Float32[np.ndarray, "height width 4"]]
 """What draws an observation's pose for its camera: a premultiplied RGBA image in [0, 1]."""

@@ -7,7 +7,7 @@ import pytest
 
 from baselines import compare, comparison_scores
 from baselines.comparison_table import with_better_poses
-from studio.shoot import ShootConfig, film_capture
+from instant_avatar.studio.shoot import ShootConfig, film_capture
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from baselines.systems.pose_alignment import align_pose
+from instant_avatar.studio.actor import Actor
 from preprocess.fitting.capture_fit import correct_pose
 from preprocess.fitting.clip_poses import POSE_SIGMA
-from studio.actor import Actor
 
 
 @pytest.fixture(scope="module")

@@ -381,7 +381,7 @@ def test_the_lite_tier_draws_the_same_avatar_with_fewer_samples(exported, player
 
 @pytest.mark.parametrize(
     "module",
-    ["export.player", "apps.animation.player_checks", "preprocess.tracking.blazepose"],
+    ["export.player", "instant_avatar.animation.player_checks", "preprocess.tracking.blazepose"],
 )
 def test_onnxruntime_keeps_no_record_of_who_plays_what(module, tmp_path):
     code = f"import {module}, onnxruntime, os; print(os.environ['ORT_DISABLE_TELEMETRY'])"

@@ -33,10 +33,10 @@ from avatar.training.frame_stream import TrainingFrame, prepare_stream
 from avatar.training.trainer import Trainer, cosine_decay
 from baselines.instant_avatar.scheme_rendering import render_samples
 from capture.source import Frame
+from instant_avatar.studio import staging
+from instant_avatar.studio.actor import Actor
+from instant_avatar.studio.staging import static_camera
 from preprocess.observation import Observation
-from studio import staging
-from studio.actor import Actor
-from studio.staging import static_camera
 
 # --- a plane that is grazed -------------------------------------------------------------------
 

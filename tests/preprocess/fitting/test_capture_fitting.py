@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.capture_session import CaptureInputs
@@ -18,7 +19,6 @@ from preprocess.fitting.capture_fitting import (
     share_beyond_noise,
 )
 from preprocess.open_capture import open_capture
-from studio.shoot import ShootConfig, film_capture
 
 
 @pytest.fixture(scope="module")

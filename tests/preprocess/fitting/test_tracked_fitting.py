@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.body.body_pose import BodyPose, Motion, RelativeFocalLength
 from preprocess.body.parametric_body import ShapedBody, load_body_model
 from preprocess.capture_session import Capture, CaptureInputs
@@ -25,7 +26,6 @@ from preprocess.open_capture import open_capture
 from preprocess.poses.pose_file import read_motion, write_motion
 from preprocess.tracking.keypoints import CroppedMask, KeypointTrack, PersonKeypoints
 from preprocess.tracking.pose_lift import lift_keypoints
-from studio.shoot import ShootConfig, film_capture
 
 
 def track_points(capture: Capture) -> KeypointTrack:

@@ -21,9 +21,9 @@ import numpy as np
 import pytest
 import torch
 
-from apps.cli.command_line import install_advice
 from benchmarks.fuzz_mutations import mutate_bytes, random_opcodes
 from capture.input_error import InputError
+from instant_avatar.cli.command_line import install_advice
 from preprocess import file_content
 from preprocess.body.parametric_body import load_body_model
 from preprocess.file_content import read_untrusted_file

@@ -8,6 +8,9 @@ import pytest
 from capture.camera import Camera
 from capture.input_error import InputError
 from capture.source import Frame
+from instant_avatar.studio import staging
+from instant_avatar.studio.actor import Actor
+from instant_avatar.studio.staging import portrait_camera
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.body_surface import soft_iou
 from preprocess.tracking.blazepose import (
@@ -16,9 +19,6 @@ from preprocess.tracking.blazepose import (
     _limit_to_body,
 )
 from preprocess.tracking.keypoints import CroppedMask
-from studio import staging
-from studio.actor import Actor
-from studio.staging import portrait_camera
 
 SIZE = (270, 480)
 

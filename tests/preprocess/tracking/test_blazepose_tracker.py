@@ -6,6 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
+from instant_avatar.studio import painted_surfaces, staging
+from instant_avatar.studio.actor import Actor
+from instant_avatar.studio.staging import portrait_camera
 from preprocess.tracking.blazepose import BlazePoseTracker, LastPlace
 from preprocess.tracking.blazepose_networks import (
     BlazePoseDetector,
@@ -17,9 +20,6 @@ from preprocess.tracking.blazepose_networks import (
     refine,
 )
 from preprocess.tracking.video_tracking import ProblemFinder, TrackingProblem
-from studio import painted_surfaces, staging
-from studio.actor import Actor
-from studio.staging import portrait_camera
 
 SIZE = (270, 480)
 KEYPOINTS = [11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28]

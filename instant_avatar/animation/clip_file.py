@@ -1,0 +1,191 @@
+"""Clips: a background behind rendered images, and the files that they are written to."""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image, ImageColor
+
+from capture.atomic_files import atomic_file, atomic_folder
+from capture.image_folder import read_image, write_png
+from capture.input_error import InputError
+from capture.video_writer import H264, VP9, VP9_ALPHA, write_video
+from instant_avatar.cli.shared_options import check_output_file, check_output_folder
+
+TRANSPARENT = "transparent"
+"""Value of --background that keeps alpha."""
+CLIP_SUFFIXES = (".webm", ".mp4", ".gif", ".webp", ".png")
+"""Suffixes of the files that can be written; a name without one is a folder of frames."""
+MAX_GIF_FPS = 50.0
+"""Frame rate above which browsers slow a GIF down."""
+
+Rgba = UInt8[np.ndarray, "height width 4"]
+Rgb = UInt8[np.ndarray, "height width 3"]
+BackgroundBlend = Callable[[Rgba], Rgb]
+"""Composites an image with straight alpha over a background."""
+
+
+def background_compositor(color_or_path: str) -> BackgroundBlend:
+    """Return a function that composites images with straight alpha over a background.
+
+    Args:
+        color_or_path: A color ("white", "#203040", "rgb(10, 20, 30)"), or the path of an image, of
+            which the center is shown.
+    """
+    try:
+        color = np.array(ImageColor.getrgb(color_or_path)[:3], dtype=np.uint8)
+    except ValueError:
+        color = None
+    if color is not None:
+        return lambda rgba: _composite_over(rgba, np.broadcast_to(color, (*rgba.shape[:2], 3)))
+    path = Path(color_or_path)
+    if not path.is_file():
+        raise InputError(
+            f"--background {color_or_path} is neither a color (white, #203040), nor {TRANSPARENT}, "
+            "nor an existing image."
+        )
+    image, _ = read_image(path)
+    cropped = lru_cache(1)(lambda width, height: _crop_to_cover(image, width, height))
+    return lambda rgba: _composite_over(rgba, cropped(rgba.shape[1], rgba.shape[0]))
+
+
+def _composite_over(rgba: Rgba, behind: Rgb) -> Rgb:
+    alpha = rgba[..., 3:].astype(np.uint16)
+    mixed = rgba[..., :3] * alpha + behind * (255 - alpha) + 127
+    return (mixed // 255).astype(np.uint8)
+
+
+def _crop_to_cover(
+    image: UInt8[np.ndarray, "_ _ 3"], width: int, height: int
+) -> UInt8[np.ndarray, "height width 3"]:
+    rows, columns = image.shape[:2]
+    scale = max(width / columns, height / rows)
+    wide, high = max(width, round(columns * scale)), max(height, round(rows * scale))
+    interpolation = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_LINEAR
+    scaled = cv2.resize(image, (wide, high), interpolation=interpolation)
+    left, top = (wide - width) // 2, (high - height) // 2
+    return scaled[top : top + height, left : left + width]
+
+
+def check_clip_path(path: Path, inputs: Iterable[Path], *, overwrite: bool) -> None:
+    """Check that a clip can be written."""
+    if path.suffix.lower() in CLIP_SUFFIXES:
+        check_output_file(path, "--out", inputs, overwrite=overwrite)
+    elif path.suffix and not path.is_dir():
+        raise InputError(
+            f"{path} ends in {path.suffix!r}, but a clip must end in {', '.join(CLIP_SUFFIXES)}; "
+            "a name without a suffix is a folder for PNG frames."
+        )
+    else:
+        check_output_folder(path, "--out", inputs)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClipFormat:
+    """How a clip is written.
+
+    Attributes:
+        description: What is written, and where it plays, for the user.
+        write: Takes the path, images of one size (RGB, or RGBA with straight alpha) and the frame
+            rate; returns the number of images written.
+    """
+
+    description: str
+    write: Callable[[Path, Iterator[Rgb | Rgba], float], int]
+
+
+def clip_format(path: Path, *, transparent: bool) -> ClipFormat:
+    """Return the format that the suffix of a path selects."""
+    suffix = path.suffix.lower()
+    if suffix == ".mp4" and transparent:
+        raise InputError(
+            "--background transparent: an .mp4 has no transparency; .webp, .webm, .gif and a "
+            "folder of frames have."
+        )
+    if suffix in (".mp4", ".webm"):
+        codec = H264 if suffix == ".mp4" else VP9_ALPHA if transparent else VP9
+        return ClipFormat(description=codec.description, write=partial(write_video, codec=codec))
+    if suffix == ".gif":
+        description = "a GIF of 256 colors per frame" + ", binary transparency" * transparent
+        return ClipFormat(description=description, write=_write_gif)
+    if suffix == ".webp":
+        return ClipFormat(description="animated WebP", write=_write_webp)
+    if suffix == ".png":
+        return ClipFormat(description="PNG", write=_write_image)
+    return ClipFormat(description="PNG frames", write=_write_frames)
+
+
+def write_clip(
+    path: Path,
+    images: Iterable[Rgba],
+    *,
+    fps: float,
+    blend: BackgroundBlend | None,
+    replace: bool | None = None,
+) -> int:
+    """Encode images as a clip, whole or not at all.
+
+    Args:
+        path: File or folder to write.
+        images: With straight alpha, all of one size; at least one.
+        fps: Frames per second.
+        blend: The background; None keeps alpha.
+        replace: Whether an existing file may be replaced, as in `atomic_file`.
+
+    Returns:
+        The number of frames written.
+    """
+    encoding = clip_format(path, transparent=blend is None)
+    is_file = path.suffix.lower() in CLIP_SUFFIXES
+    with atomic_file(path, replace=replace) if is_file else atomic_folder(path) as part:
+        shown = (image if blend is None else blend(image) for image in images)
+        return encoding.write(part, iter(shown), fps)
+
+
+def _write_image(path: Path, images: Iterator[Rgb | Rgba], fps: float) -> int:
+    write_png(path, next(images))
+    return 1
+
+
+def _write_frames(folder: Path, images: Iterator[Rgb | Rgba], fps: float) -> int:
+    count = 0
+    for image in images:
+        write_png(folder / f"{count:04d}.png", image)
+        count += 1
+    return count
+
+
+def _write_gif(path: Path, images: Iterator[Rgb | Rgba], fps: float) -> int:
+    """Write a palette per frame: 46 dB on white, against 38 dB with one palette for all."""
+    frames = [Image.fromarray(_binarize_alpha(image)) for image in images]
+    disposal = 2 if frames[0].mode == "RGBA" else 0
+    return _save_animation(path, frames, min(fps, MAX_GIF_FPS), tick_ms=10, disposal=disposal)
+
+
+def _binarize_alpha(image: Rgb | Rgba) -> Rgb | Rgba:
+    if image.shape[2] == 3:
+        return image
+    opaque = image[..., 3:] > 127
+    return np.where(opaque, image | np.array([0, 0, 0, 255], np.uint8), np.uint8(0))
+
+
+def _write_webp(path: Path, images: Iterator[Rgb | Rgba], fps: float) -> int:
+    frames = [Image.fromarray(image) for image in images]
+    return _save_animation(path, frames, fps, tick_ms=1, quality=90, method=3)
+
+
+def _save_animation(
+    path: Path, frames: list[Image.Image], fps: float, *, tick_ms: int, **options: Any
+) -> int:
+    """Save frames whose durations are whole ticks, which together keep the frame rate."""
+    ends = np.round(1000.0 / tick_ms / fps * np.arange(1 + len(frames)))
+    durations_ms = [max(1, int(ticks)) * tick_ms for ticks in np.diff(ends)]
+    if len(frames) > 1:
+        options |= {"duration": durations_ms, "loop": 0}
+    frames[0].save(path, save_all=True, append_images=frames[1:], **options)
+    return len(frames)

@@ -1,0 +1,181 @@
+"""The output folder of a batch, local or behind a URL: avatars, and the results of all captures."""
+
+import json
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import final
+
+from capture.atomic_files import (
+    OutputFileList,
+    atomic_folder,
+    check_replaceable_folder,
+    write_text_atomically,
+)
+from capture.input_error import InputError
+from instant_avatar.batching.capture_discovery import BatchCapture
+from instant_avatar.batching.ingest_attempt import PACKAGE_NAME, Attempt, AttemptRecord
+from instant_avatar.batching.remote_files import (
+    RemoteFileError,
+    is_url,
+    list_files,
+    open_remote,
+    read_text,
+)
+from instant_avatar.cli.console import Console
+from instant_avatar.run.run_folder import claim_folder
+
+RESULTS_NAME = "results.jsonl"
+"""A line for each capture that has ended, the newest last."""
+FAILED_NAME = "_failed"
+"""Folder with the logs of captures without an avatar."""
+SAVE_INTERVAL_S = 30.0
+"""Interval at which the results are sent to a URL, where nothing can be appended, seconds."""
+
+
+def folder_of(name: str, status: str) -> str:
+    """Return the folder of a capture's files, relative to --out."""
+    return name if status == "done" else f"{FAILED_NAME}/{name}"
+
+
+@final
+class BatchFolder:
+    """The output folder of a batch.
+
+    Attributes:
+        place: Path or URL.
+        records: All results, in the order of their ends.
+    """
+
+    def __init__(self, place: str) -> None:
+        """Name the folder; `claim` creates it."""
+        self.place = place.rstrip("/")
+        self.path = None if is_url(place) else Path(place)
+        self.records: list[AttemptRecord] = []
+        self._latest: dict[str, AttemptRecord] = {}
+        self._packages: frozenset[str] = frozenset()
+        self._saved_at = 0.0
+
+    @contextmanager
+    def claim(self, console: Console) -> Iterator[None]:
+        """Create the folder, lock it if it is local, and read the results, during a block.
+
+        Raises:
+            CommandExit: If another batch is writing here.
+            InputError: If it holds files of another program.
+        """
+        with ExitStack() as held:
+            if self.path is not None:
+                marker = OutputFileList(self.path)
+                if self.path.exists() and any(self.path.iterdir()) and not marker.exists():
+                    raise InputError(
+                        f"{self.path} holds files that ia-batch did not write. Name a folder that "
+                        "is empty or new (--out)."
+                    )
+                held.enter_context(claim_folder(self.path, console))
+                marker.create()
+                held.callback(marker.remove_if_empty)
+            self._read()
+            try:
+                yield
+            finally:
+                if self.path is None:
+                    self._save()
+
+    def settled(self, capture: BatchCapture, *, again: bool) -> AttemptRecord | None:
+        """Return the result that stands for a capture; None if it is to be learnt.
+
+        Args:
+            capture: With the fingerprints of its files and options.
+            again: Whether it is learnt if it was refused or has failed before.
+
+        Raises:
+            InputError: If files of another program lie where it would be written.
+        """
+        latest = self._latest.get(capture.name)
+        if latest is not None and latest.key == (capture.input_key, capture.options_key):
+            is_there = capture.name in self._packages
+            if is_there if latest.status == "done" else not again:
+                return latest
+        if self.path is not None:
+            check_replaceable_folder(self.path / capture.name)
+            check_replaceable_folder(self.path / FAILED_NAME / capture.name)
+        return None
+
+    def place_attempt(self, attempt: Attempt) -> AttemptRecord:
+        """Write the files of an attempt, then its line in the results, which is returned."""
+        record, name = attempt.record, attempt.record.capture
+        folder = folder_of(name, record.status)
+        if self.path is not None:
+            with atomic_folder(self.path / folder) as part:
+                for file, content in attempt.files.items():
+                    (part / file).parent.mkdir(parents=True, exist_ok=True)
+                    (part / file).write_bytes(content)
+            if record.status == "done":
+                OutputFileList(self.path / FAILED_NAME / name).remove_all()
+        else:
+            for file in sorted(attempt.files, key=PACKAGE_NAME.__eq__):  # the package is the last
+                self._send(f"{folder}/{file}", attempt.files[file])
+        latest = self._latest.get(name)
+        if latest is not None and latest.key == record.key:
+            record = replace(record, attempt=latest.attempt + 1)
+        self.records.append(record)
+        self._latest[name] = record
+        if self.path is not None:
+            with (self.path / RESULTS_NAME).open("a", encoding="utf-8") as results:
+                results.write(_line(record))
+        elif time.monotonic() - self._saved_at > SAVE_INTERVAL_S:
+            with suppress(RemoteFileError):  # the next time sends it
+                self._save()
+        return record
+
+    def write_text(self, name: str, text: str) -> None:
+        """Write a text file into the folder, whole or not at all."""
+        if self.path is None:
+            self._send(name, text.encode())
+        else:
+            write_text_atomically(self.path / name, text, replace=True)
+
+    def _read(self) -> None:
+        """Read the results, and which packages are there."""
+        results = f"{self.place}/{RESULTS_NAME}"
+        if not list_files(results):
+            return
+        text = read_text(results)
+        self.records = list(_read_records(text))
+        self._latest = {record.capture: record for record in self.records}
+        if text.strip() and not self.records:
+            raise InputError(
+                f"{results} is not what ia-batch wrote, so it is not replaced. Move it elsewhere, "
+                "or name another folder (--out)."
+            )
+        packages = (path for path in list_files(self.place) if path.endswith(f"/{PACKAGE_NAME}"))
+        self._packages = frozenset(path.split("/")[-2] for path in packages)
+        if not text.endswith("\n"):  # its last line was cut short
+            self._save()
+
+    def _save(self) -> None:
+        """Write all results."""
+        self._saved_at = time.monotonic()
+        self.write_text(RESULTS_NAME, "".join(map(_line, self.records)))
+
+    def _send(self, name: str, content: bytes) -> None:
+        """Write a file behind a URL."""
+        with open_remote(f"{self.place}/{name}") as (system, path):
+            system.makedirs(path.rsplit("/", 1)[0], exist_ok=True)
+            system.pipe_file(path, content)
+
+
+def _line(record: AttemptRecord) -> str:
+    return json.dumps(vars(record), allow_nan=False) + "\n"
+
+
+def _read_records(text: str) -> Iterator[AttemptRecord]:
+    """Yield the records of a results file; lines that were cut short are skipped."""
+    known = {each.name for each in fields(AttemptRecord)}
+    for line in text.splitlines():
+        with suppress(ValueError, TypeError, AttributeError):
+            content = json.loads(line)
+            yield AttemptRecord(**{key: content[key] for key in known & content.keys()})

@@ -1,0 +1,236 @@
+"""One attempt to learn one capture: ia-ingest in a process of its own, and what is left of it."""
+
+import faulthandler
+import json
+import os
+import signal
+import time
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, TextIO
+
+from rich.console import Console as RichConsole
+
+from capture.process_metrics import peak_memory_mb
+from instant_avatar.batching.batch_arguments import BatchArguments
+from instant_avatar.batching.capture_discovery import BatchCapture
+from instant_avatar.batching.remote_files import fetch_files, is_url
+from instant_avatar.cli.command_line import (
+    BAD_INPUT,
+    DONE,
+    NO_AVATAR,
+    CommandExit,
+    describe_failure,
+    parse_arguments,
+)
+from instant_avatar.cli.console import Console
+from instant_avatar.cli.hardware import describe_machine
+from instant_avatar.run.ingest_arguments import IngestArguments
+
+LOG_NAME = "ingest.log"
+"""What ia-ingest printed."""
+ANIMATION_NAME = "turning.webp"
+"""The animation of the report."""
+PACKAGE_NAME = "avatar.iavatar"
+"""The avatar."""
+KEPT_FILES = (
+    PACKAGE_NAME, ANIMATION_NAME, "report.json", "report.html", "cameras.npz", "poses.npz",
+    "tracking/poses.npz", "tracking/grade.json",
+)  # fmt: skip
+"""Files of a run that are brought back."""
+STATUSES = {DONE: "done", BAD_INPUT: "refused"}
+"""Status of a capture by the exit code of ia-ingest; all others are failures."""
+GRACE_S = 60.0
+"""Time after --limit in which an attempt may end by itself before its process is ended, seconds."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class AttemptRecord:
+    """A line of results.jsonl.
+
+    Attributes:
+        capture: Name of the capture.
+        video: Where it lies.
+        attempt: Number of the line for this input with these options, from 1.
+        status: "done", "refused" (bad input, never tried again) or "failed".
+        exit_code: Of ia-ingest; null if it was killed or lost.
+        cause: Why there is no avatar; empty if there is one.
+        input: Fingerprint of the capture's files.
+        options: Fingerprint of its options.
+        started, ended: Time of day, seconds since 1970.
+        wall_s: Seconds that the last attempt took.
+        core_s: CPU seconds of its process and the children of it.
+        peak_memory_mb: Most memory of its process.
+        machine: Host, processor, cores, memory, the cores that were asked for, and Ray's node.
+        figures: Quality and cost from report.json.
+    """
+
+    capture: str
+    video: str
+    attempt: int = 1
+    status: str
+    exit_code: int | None
+    cause: str
+    input: str
+    options: str
+    started: float
+    ended: float
+    wall_s: float = 0.0
+    core_s: float = 0.0
+    peak_memory_mb: float = 0.0
+    machine: dict[str, Any] = field(default_factory=dict)
+    figures: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """Fingerprints of files and options."""
+        return self.input, self.options
+
+
+@dataclass(frozen=True, kw_only=True)
+class Attempt:
+    """A result, and the files of a capture by relative name."""
+
+    record: AttemptRecord
+    files: dict[str, bytes] = field(default_factory=dict)
+
+
+class AttemptFailure(Exception):  # noqa: N818 - of an attempt, which may be made again
+    """An attempt that has failed for other reasons than bad input."""
+
+    def __init__(self, attempt: Attempt) -> None:
+        """Carry what is left of it."""
+        super().__init__(attempt)
+        self.attempt = attempt
+
+    def __str__(self) -> str:
+        """Return the cause."""
+        return self.attempt.record.cause
+
+
+def record_of(
+    capture: BatchCapture, exit_code: int | None, cause: str, **more: Any
+) -> AttemptRecord:
+    """Return the line of a capture that ended now with an exit code."""
+    ended = time.time()
+    return AttemptRecord(
+        capture=capture.name,
+        video=capture.video,
+        status="failed" if exit_code is None else STATUSES.get(exit_code, "failed"),
+        exit_code=exit_code,
+        cause=cause,
+        input=capture.input_key,
+        options=capture.options_key,
+        ended=ended,
+        **{"started": ended, **more},
+    )
+
+
+def learn_capture(capture: BatchCapture, arguments: BatchArguments, scratch: str | None) -> Attempt:
+    """Fetch a capture, run ia-ingest on it in this process, and collect what it wrote.
+
+    Args:
+        capture: What to learn.
+        arguments: Of the batch.
+        scratch: Folder for temporary files; None for that of the machine.
+
+    Raises:
+        AttemptFailure: If there is no avatar although the input is good.
+    """
+    cores = arguments.cores_of(capture)
+    for library in ("OMP", "NUMBA", "MKL"):  # they look once, when they are loaded
+        os.environ[f"{library}_NUM_THREADS"] = str(cores)
+    started, core_s = time.time(), sum(os.times()[:4])
+    with TemporaryDirectory(prefix="ia-batch-", dir=scratch) as folder:
+        run, log = Path(folder, capture.name), Path(folder, LOG_NAME)
+        with log.open("w", encoding="utf-8") as text:
+            code, cause = _ingest(capture, run, text, cores, arguments.limit)
+        files = {LOG_NAME: log.read_bytes()} | _collect(run, checkpoint=arguments.checkpoints)
+    record = record_of(
+        capture,
+        code,
+        cause,
+        started=started,
+        wall_s=round(time.time() - started, 2),
+        core_s=round(sum(os.times()[:4]) - core_s, 2),
+        peak_memory_mb=round(peak_memory_mb(), 1),
+        machine=describe_machine() | {"used_cores": cores},
+        figures=read_figures(files.get("report.json", b"")),
+    )
+    attempt = Attempt(record=record, files=files)
+    if record.status == "failed":
+        raise AttemptFailure(attempt)
+    return attempt
+
+
+def _ingest(
+    capture: BatchCapture, run: Path, log: TextIO, cores: int, limit_s: float
+) -> tuple[int, str]:
+    """Run ia-ingest; return its exit code, and why there is no avatar."""
+    try:
+        with _time_limit(limit_s, log):
+            from instant_avatar.ingest import ingest  # heavy, and of the threads that were just set
+
+            local = fetch_files(filter(is_url, capture.places()), capture.sources, run.parent)
+            words = [local.get(capture.video, capture.video), "--threads", str(cores)]
+            for option, path in capture.paths.items():
+                words += [option, local.get(path, path)]
+            words += [*capture.options, "--out", str(run)]
+            arguments = parse_arguments(IngestArguments, "ia-ingest", words)
+            return ingest(arguments, Console(RichConsole(file=log, soft_wrap=True))), ""
+    except Exception as error:
+        failure = describe_failure(error)
+        if failure is not None:
+            return failure
+        traceback.print_exc(file=log)
+        return NO_AVATAR, f"{type(error).__name__}: {error}"
+
+
+@contextmanager
+def _time_limit(seconds: float, log: TextIO) -> Iterator[None]:
+    """Raise `CommandExit` in a block that takes too long; end the process if that fails."""
+
+    def stop(signal_number: int, frame: object) -> None:
+        raise CommandExit(f"took longer than {seconds:g} s (--limit)", NO_AVATAR)
+
+    if seconds:
+        signal.signal(signal.SIGALRM, stop)
+        signal.setitimer(signal.ITIMER_REAL, seconds)
+        faulthandler.dump_traceback_later(seconds + GRACE_S, exit=True, file=log)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        faulthandler.cancel_dump_traceback_later()
+
+
+def _collect(run: Path, *, checkpoint: bool) -> dict[str, bytes]:
+    """Read the files of a run that are brought back."""
+    paths = [run / name for name in KEPT_FILES]
+    paths += sorted((run / "checkpoint").rglob("*")) if checkpoint else []
+    return {str(path.relative_to(run)): path.read_bytes() for path in paths if path.is_file()}
+
+
+def read_figures(report: bytes) -> dict[str, Any]:
+    """Return quality and cost from the content of report.json; empty without one."""
+    if not report:
+        return {}
+    content = json.loads(report)
+    held = content["held_out_refined"] or content["held_out"]
+    return {
+        "verdict": content["verdict"],
+        "psnr": held["psnr"],
+        "psnr_given": content["held_out"]["psnr"],
+        "ssim": held["ssim"],
+        "frames": content["frames"]["used"],
+        "steps": content["training"]["steps"],
+        "training_s": content["training"]["wall_seconds"],
+        "contention_s": content["training"]["cpu_contention_seconds"],
+        "package_bytes": (content["package"] or {}).get("bytes"),
+        "seen": (content["coverage"] or {}).get("seen"),
+        "tracked": content["tracking"] is not None,
+    }

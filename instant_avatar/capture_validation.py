@@ -1,0 +1,398 @@
+"""Validation of a capture, for ia-check, and in part before a run starts: IoU, mistakes, advice."""
+
+import shlex
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float32
+
+from capture.camera import same_aspect_ratio
+from capture.input_error import InputError
+from capture.live_sources import camera_address
+from instant_avatar.cli.console import Console
+from instant_avatar.cli.shared_options import (
+    capture_name,
+    format_frame_range,
+    option_words,
+    unused_path,
+)
+from preprocess.alignment.capture_geometry import CaptureGeometry, sanity_warnings
+from preprocess.alignment.correction_search import (
+    MIN_GAIN,
+    CaptureObjective,
+    CorrectionResult,
+    find_corrections,
+)
+from preprocess.alignment.corrections import undo_pose_delay
+from preprocess.alignment.keypoint_objective import (
+    KeypointObjective,
+    TrackedImage,
+    track_images,
+)
+from preprocess.alignment.silhouette_objective import (
+    GOOD_IOU,
+    SAMPLED_FRAMES,
+    USABLE_IOU,
+    SilhouetteObjective,
+    mask_warnings,
+    mean_score,
+    sample_masks,
+)
+from preprocess.body.body_surface import SkinPoints
+from preprocess.capture_session import Capture, CaptureInputs
+from preprocess.masks.mask_files import Masks
+from preprocess.observation import associate_cameras, associate_masks
+from preprocess.open_capture import open_capture
+from preprocess.poses.plausibility import implausibility_reason
+
+QUICK_FRAMES = 8
+"""Frames checked before a run starts."""
+GOOD_KEYPOINT_SCORE = 0.5
+"""Score of the key points from which poses without masks match the images: half of them are within
+4 % of the person's height."""
+NO_KNOWN_MISTAKE = (
+    "No known mistake explains this. Poses or masks may belong to another video or person, or "
+    "tracking may have failed. Recompute them from this video."
+)
+"""Diagnosis if no correction helps."""
+MIN_EXCESS = 1.3
+"""Area of masks by the body's from which they hold more than the person."""
+MIN_COVERED = 0.85
+"""Share of the body that such masks cover."""
+QUICK_OFFSETS = (1, -1, 2, -2)
+"""Delays of the poses, in frames, that are tested even if poses and masks match."""
+QUICK_GAIN = 0.75 * MIN_GAIN
+"""Gain in mean IoU of such a delay that is looked into: inexact poses gain 0.01 by chance."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CaptureValidation:
+    """Outcome of validating a capture.
+
+    Attributes:
+        recording: The capture.
+        hypothesis: Its poses and cameras as stored.
+        images: Images in which the person was tracked.
+        objective: Masks of some frames and key points of some images.
+        diagnosis: Corrections tested and found.
+        refusal: Why ia-ingest would refuse the capture; None if it would not.
+        anomalies: Sentences about implausible numbers.
+        mask_iou: Mean IoU of body and masks as ia-ingest would read them; None without masks.
+    """
+
+    recording: Capture
+    hypothesis: CaptureGeometry
+    images: tuple[TrackedImage, ...]
+    objective: CaptureObjective
+    diagnosis: CorrectionResult
+    refusal: str | None
+    anomalies: tuple[str, ...]
+    mask_iou: float | None
+
+    @property
+    def causes(self) -> tuple[str, ...]:
+        """Names of the mistakes found, most important first."""
+        return tuple(dict.fromkeys(cure.cause for cure in self.diagnosis.corrections))
+
+    @property
+    def verdict(self) -> str:
+        """Verdict: `good`, `warn` or `unusable`."""
+        if self.refusal is not None or (self.mask_iou is not None and self.mask_iou < USABLE_IOU):
+            return "unusable"
+        if self.mask_iou is None:
+            well = (self.keypoint_score(self.hypothesis) or 0.0) >= GOOD_KEYPOINT_SCORE
+        else:
+            well = self.mask_iou >= GOOD_IOU
+        explained = not self.causes or self.is_auto_corrected
+        return "good" if well and explained and not self.anomalies else "warn"
+
+    @property
+    def is_usable_after_fix(self) -> bool:
+        """Whether the corrected capture can be trained on."""
+        if self.objective.masks is None:
+            return (self.keypoint_score(self.diagnosis.corrected) or 0.0) >= GOOD_KEYPOINT_SCORE
+        return self.corrected_iou >= USABLE_IOU
+
+    @property
+    def unexplained(self) -> str:
+        """What may be wrong if no correction helps."""
+        masks = self.objective.masks
+        if masks is None or masks.are_boxes:
+            return NO_KNOWN_MISTAKE
+        covered, areas = masks.excess(self.hypothesis)
+        if covered < MIN_COVERED or areas < MIN_EXCESS:
+            return NO_KNOWN_MISTAKE
+        return (
+            f"The masks show {areas:.1f} times the body's area, and the body lies within them: "
+            "another person or a thing that touches this person is in the masks, or clothes are "
+            "very wide. Give masks of this person alone (--masks)."
+        )
+
+    @property
+    def is_auto_corrected(self) -> bool:
+        """Whether ia-ingest corrects everything that is wrong automatically."""
+        masks = self.recording.masks
+        return self.causes == ("mask_polarity",) and masks is not None and masks.inverted
+
+    @property
+    def agreement(self) -> str:
+        """Sentences on how masks, key points and body agree as stored."""
+        score = self.keypoint_score(self.hypothesis)
+        if self.objective.masks is None:
+            return (
+                "There are no masks, and no person was found in the images."
+                if score is None
+                else "There are no masks (ia-ingest estimates them from poses and images). Score "
+                f"of the tracked key points: {score:.2f} (0.7 to 0.9 is usual)."
+            )
+        video = any(each.is_of_video for each in self.diagnosis.corrections)
+        but = " The masks do not match the images." if video else ""
+        return f"IoU of body and masks: {self.stored_iou:.2f}.{but}"
+
+    @property
+    def expected_improvement(self) -> str:
+        """Sentence on the scores after correction; empty without causes."""
+        if not self.causes:
+            return ""
+        scores, of_video = [], [each.is_of_video for each in self.diagnosis.corrections]
+        if self.objective.masks is not None and not all(of_video):
+            scores.append(f"IoU after correction: {self.corrected_iou:.2f}")
+        now, after = map(self.keypoint_score, (self.hypothesis, self.diagnosis.corrected))
+        if now is not None and (any(of_video) or not scores):
+            scores.append(f"Score of the tracked key points: {after:.2f} instead of {now:.2f}")
+        return f"{'. '.join(scores)}."
+
+    @property
+    def stored_iou(self) -> float:
+        """IoU of body and masks as stored; NaN without masks."""
+        return self._iou(self.hypothesis)
+
+    @property
+    def corrected_iou(self) -> float:
+        """IoU of body and masks after all corrections; NaN without masks."""
+        return self._iou(self.diagnosis.corrected)
+
+    def _iou(self, geometry: CaptureGeometry) -> float:
+        masks = self.objective.masks
+        return float("nan") if masks is None else mean_score(masks.frame_scores(geometry))
+
+    def keypoint_score(self, geometry: CaptureGeometry) -> float | None:
+        """How well tracked key points match the body, in [0, 1]; None if no person was found."""
+        keypoints = self.objective.keypoints
+        return None if keypoints is None else mean_score(keypoints.frame_scores(geometry))
+
+
+def check_capture(inputs: CaptureInputs) -> CaptureValidation:
+    """Open a capture, with its video rotated if that explains an error, and validate it.
+
+    Raises:
+        InputError: If a part is missing or unreadable.
+    """
+    try:
+        return check_opened_capture(*_open_inputs(inputs))
+    except InputError as error:
+        with suppress(InputError):
+            rotated = open_capture(replace(inputs, transposed=True), skip_checks=True)
+            found = check_opened_capture(rotated, str(error))
+            if any(each.is_of_video for each in found.diagnosis.corrections):
+                return found
+        raise
+
+
+def check_opened_capture(
+    recording: Capture, polarity_error: str | None = None
+) -> CaptureValidation:
+    """Validate an opened capture.
+
+    Args:
+        recording: The capture.
+        polarity_error: Why the masks' polarity is unknown; None if it is known.
+
+    Raises:
+        InputError: If a part is unreadable.
+    """
+    hypothesis = _stored_hypothesis(recording)
+    source, masks = recording.source, recording.masks
+    refused = implausibility_reason(recording.motion) or polarity_error
+    try:
+        recording.check()
+    except InputError as error:
+        refused = refused or str(error)
+    sampled = _sample_masks(recording) if masks is not None or source.has_alpha else None
+    images = track_images(source)
+    objective = CaptureObjective(
+        masks=sampled, keypoints=KeypointObjective.of(images, recording.shaped)
+    )
+    count = source.frame_count or len(recording.motion)
+    chosen = source.selection
+    frames = [chosen.start + chosen.step * number for number in range(count)]
+    diagnosis = find_corrections(
+        hypothesis, objective, recording.shaped.joints[0],
+        frames=count, mask_count=0 if masks is None else masks.count,
+    )  # fmt: skip
+    upright = replace(hypothesis, masks_inverted=False)
+    return CaptureValidation(
+        recording=recording, hypothesis=hypothesis, images=images, objective=objective,
+        diagnosis=diagnosis, refusal=refused,
+        mask_iou=None if sampled is None else mean_score(sampled.frame_scores(upright)),
+        anomalies=(
+            *sanity_warnings(hypothesis, frames), *mask_warnings(sampled, source.size_px[1])
+        ),
+    )  # fmt: skip
+
+
+def passes_quick_check(recording: Capture) -> bool:
+    """Check a few masks within a few hundredths of a second.
+
+    Poses that are one or two frames late are detected as well.
+    """
+    if recording.live is not None or not (recording.masks or recording.source.has_alpha):
+        return True  # nothing to compare with
+    try:
+        masks = _sample_masks(recording, QUICK_FRAMES)
+    except InputError:  # these masks are empty; reading all of them reports that
+        return True
+    hypothesis = replace(_stored_hypothesis(recording), masks_inverted=False)
+    now = mean_score(masks.frame_scores(hypothesis))
+    shifts = [
+        mean_score(masks.frame_scores(undo_pose_delay(offset).apply(hypothesis)))
+        for offset in QUICK_OFFSETS
+    ]
+    return now >= GOOD_IOU and now >= max(shifts) - QUICK_GAIN
+
+
+def mask_lookup(
+    recording: Capture, masks: Masks
+) -> Callable[[int, tuple[int, int]], Float32[np.ndarray, "height width"]]:
+    """Return a function from a frame number, also beyond the video's, and a size to the mask.
+
+    The function raises InputError where there is no such mask.
+    """
+    row_of = _mask_row_lookup(recording)
+
+    def alpha(number: int, size_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
+        row = row_of(number)
+        if not 0 <= row < masks.count:
+            raise InputError(f"There is no mask for frame {number} in {masks.path}.")
+        return masks.alpha(row, size_px)
+
+    return alpha
+
+
+def _mask_row_lookup(recording: Capture) -> Callable[[int], int]:
+    """Return a function from a frame number to its mask; in order if counts differ."""
+    masks = recording.masks
+    try:
+        return associate_masks(masks, recording.source)
+    except InputError:
+        if masks is None or not same_aspect_ratio(masks.size_px, recording.source.size_px):
+            raise
+        count, path = masks.count, masks.path
+
+    def in_order(index: int) -> int:
+        if index >= count:
+            raise InputError(f"There is no mask for frame {index} in {path}.")
+        return index
+
+    return in_order
+
+
+def _sample_masks(recording: Capture, count: int = SAMPLED_FRAMES) -> SilhouetteObjective:
+    mask_row = _mask_row_lookup(recording)
+    camera_row = associate_cameras(recording.cameras, recording.source)
+    return sample_masks(
+        recording.source, recording.masks, mask_row, camera_row, SkinPoints.of(recording.shaped),
+        count=count, excluded_frames=recording.cameras.frames_without_camera,
+    )  # fmt: skip
+
+
+def _stored_hypothesis(recording: Capture) -> CaptureGeometry:
+    """Return poses, cameras and mask polarity as stored in the files."""
+    hypothesis = CaptureGeometry.of(recording.motion, recording.cameras, recording.source)
+    turned = recording.masks is not None and recording.masks.inverted
+    return replace(hypothesis, masks_inverted=turned)
+
+
+def _open_inputs(inputs: CaptureInputs) -> tuple[Capture, str | None]:
+    """Open the capture; also return why the masks' polarity is unknown, if it is."""
+    try:
+        return open_capture(inputs, skip_checks=True), None
+    except InputError as error:
+        if inputs.invert_masks is not None:
+            raise
+        return open_capture(replace(inputs, invert_masks=False), skip_checks=True), str(error)
+
+
+def check_command(inputs: CaptureInputs, *, fix: bool = True) -> str:
+    """Return the ia-check command line for the user's inputs, ready for a shell.
+
+    Args:
+        inputs: Inputs as the user named them.
+        fix: Whether to write a corrected copy to a new folder.
+    """
+    named = ("poses", "masks", "cameras", "body", "person")
+    options = option_words({name: getattr(inputs, name) for name in named})
+    words = ["ia-check", str(inputs.video), *options]
+    if inputs.invert_masks is not None:
+        words.append("--mask-invert" if inputs.invert_masks else "--no-mask-invert")
+    if inputs.frames is not None and inputs.frames != slice(None):
+        words.append(f"--frames={format_frame_range(inputs.frames)}")
+    if fix:
+        beside = inputs.video if inputs.video.name else inputs.video.absolute()
+        free = unused_path(beside.with_name(f"{capture_name(beside)}-corrected"))
+        words += ["--fix", str(free)]
+    return shlex.join(words)
+
+
+def preflight_check(
+    recording: Capture, inputs: CaptureInputs, console: Console, *, force: bool
+) -> None:
+    """Check a few masks; diagnose the capture only if they and the poses disagree.
+
+    Args:
+        recording: The capture; live sources are not checked.
+        inputs: Inputs as the user named them, for the suggested command.
+        console: Shows warnings.
+        force: Whether to warn of an unusable capture instead of refusing it.
+
+    Raises:
+        InputError: If the capture is unusable.
+    """
+    if passes_quick_check(recording):
+        return
+    with console.status("poses and masks disagree; diagnosing"):
+        found = check_opened_capture(recording)
+    causes, iou = set(found.causes) - {"mask_polarity"}, found.mask_iou or 0.0
+    unusable = found.verdict == "unusable"
+    if not (unusable or causes or iou < GOOD_IOU):
+        return
+    expected = f" ({GOOD_IOU} or more expected)" if unusable else ""
+    message = f"{found.agreement}{expected} {_explain(found)} {_suggest_command(found, inputs)}"
+    if unusable and not force:
+        raise InputError(f"{message} To train anyway, pass --force.")
+    console.warning(message)
+
+
+def correction_hint(inputs: CaptureInputs) -> str:
+    """Suggest a correction for a capture that could not be opened; empty if none is known."""
+    if inputs.live or camera_address(inputs.video) is not None:
+        return ""
+    with suppress(InputError):
+        found = check_capture(inputs)
+        return f"{_explain(found)} {_suggest_command(found, inputs)}" if found.causes else ""
+    return ""
+
+
+def _explain(check: CaptureValidation) -> str:
+    if not check.causes:
+        return check.unexplained
+    words = "; and ".join(each.description for each in check.diagnosis.corrections)
+    return f"Probable cause: {words}. {check.expected_improvement}".strip()
+
+
+def _suggest_command(check: CaptureValidation, inputs: CaptureInputs) -> str:
+    """Suggest the command that corrects the capture, or that shows it."""
+    aim = "correct" if check.causes else "inspect"
+    return f"To {aim} it: {check_command(inputs, fix=bool(check.causes))}"

@@ -1,0 +1,238 @@
+"""Command lines of all commands: parsing, Ctrl-C, exit codes, and one message for each failure.
+
+The first Ctrl-C requests a stop, the second one quits.
+"""
+
+import errno
+import inspect
+import os
+import re
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
+from itertools import zip_longest
+from typing import Any, TypeVar
+
+import tyro
+from rich.console import Console as RichConsole
+from rich.markup import escape
+
+from capture.input_error import InputError
+from instant_avatar.cli.console import Console, StderrConsole
+
+DONE, NO_AVATAR, BAD_INPUT, RESOURCE_UNAVAILABLE, INTERRUPTED = 0, 1, 2, 3, 130
+"""Exit codes; 1: trained, but the avatar is not usable (failed, or nothing to draw)."""
+
+
+@contextmanager
+def handle_signals(handlers: dict[signal.Signals, Callable[[int, Any], object]]) -> Iterator[None]:
+    """Handle signals by functions during a block; they reach the main thread only."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def stop_on_interrupt(
+    console: Console, closing_message: str = "saving the checkpoint"
+) -> Iterator[threading.Event]:
+    """Yield an event that the first Ctrl-C sets; the second raises KeyboardInterrupt.
+
+    On other threads than the main one the event is never set.
+    """
+    stop = threading.Event()
+
+    def first(signal_number: int, frame: object) -> None:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        stop.set()
+        console.info(f"Stopping; {closing_message}. Press Ctrl-C again to quit immediately.")
+
+    with handle_signals({signal.SIGINT: first}):
+        yield stop
+
+
+@contextmanager
+def exit_on_interrupt(
+    console: Console, program: str, cleanup: Callable[[], None] = lambda: None
+) -> Iterator[None]:
+    """Exit the process immediately on Ctrl-C during this block.
+
+    For imports, kernel compilation and native threads, where an exception in the main thread would
+    turn into other errors or a crash.
+    """
+
+    def leave(signal_number: int, frame: object) -> None:
+        cleanup()
+        console.info_before_exit(f"{program}: stopped by Ctrl-C.")
+        os._exit(INTERRUPTED)
+
+    with handle_signals({signal.SIGINT: leave}):
+        yield
+
+
+LEARN_PACKAGES = frozenset({"torch", "numba", "onnx"})
+"""Large packages of the extra [learn], which playing does not need."""
+SMALL_PACKAGES = frozenset({"trimesh", "pycolmap", "fast_simplification"})
+"""Small packages of the extra [learn], which can be installed alone."""
+
+
+def install_advice(error: ModuleNotFoundError) -> str | None:
+    """Return what to install for a missing package; None if the module is not an optional one."""
+    package = (error.name or "").split(".")[0]
+    if package in LEARN_PACKAGES:
+        return (
+            f"{package} is not installed: this installation plays avatars, tracks people, checks "
+            "captures and exports meshes, but cannot train. To train: pip install "
+            f"'{DISTRIBUTION}[learn]'"
+        )
+    if package in SMALL_PACKAGES:
+        return f"{package} is not installed. Install it: pip install {package}"
+    return None
+
+
+DISK_FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+"""Disk full, quota exceeded, or file too large."""
+PATH_ERRNOS = frozenset(
+    {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.EISDIR}
+    | {errno.ENAMETOOLONG, errno.ELOOP, errno.EEXIST}
+)
+"""Paths that cannot be read or written."""
+DEVICE_BUSY_PHRASES = ("out of memory", "busy or unavailable", "not enough memory")
+"""Phrases of torch for a device without memory or in use."""
+
+
+class CommandExit(Exception):  # noqa: N818 - an exit, not always an error
+    """Ends the command with a message and an exit code."""
+
+    def __init__(self, message: str, code: int) -> None:
+        """Set the message for the user and the exit code."""
+        super().__init__(message)
+        self.code = code
+
+
+def run_command(program: str, work: Callable[[], int]) -> int:
+    """Run a command; turn failures of user and machine into one message and an exit code.
+
+    No usable avatar is 1, bad input or a missing package 2, a full disk or a busy device 3, Ctrl-C
+    and SIGTERM 130. Bugs keep their traceback.
+    """
+    interrupted = threading.Event()
+
+    def interrupt(signal_number: int, frame: object) -> None:
+        interrupted.set()
+        raise KeyboardInterrupt
+
+    terminate = {signal.SIGTERM: lambda *_: signal.raise_signal(signal.SIGINT)}
+    with handle_signals({signal.SIGINT: interrupt, **terminate}):
+        try:
+            return work()
+        except BaseException as error:
+            failure = describe_failure(error)
+            if failure is None and interrupted.is_set():  # an import made another error of it
+                failure = INTERRUPTED, "stopped by Ctrl-C."
+            if failure is None:
+                raise
+    code, message = failure
+    StderrConsole().print(f"[bold red]{program}:[/] {escape(message)}", highlight=False)
+    return code
+
+
+def describe_failure(error: BaseException) -> tuple[int, str] | None:
+    """Return exit code and message of what user or machine has caused; None for a bug."""
+    if isinstance(error, CommandExit):
+        return error.code, str(error)
+    if isinstance(error, InputError):
+        return BAD_INPUT, str(error)
+    if isinstance(error, ModuleNotFoundError):
+        advice = install_advice(error)
+        return None if advice is None else (BAD_INPUT, advice)
+    failure = None
+    if isinstance(error, KeyboardInterrupt):
+        failure = INTERRUPTED, "stopped by Ctrl-C."
+    elif isinstance(error, OSError):
+        failure = _system_failure(error)
+    elif isinstance(error, RuntimeError | MemoryError):
+        message = str(error).strip() or "out of memory"
+        is_busy = any(phrase in message.lower() for phrase in DEVICE_BUSY_PHRASES)
+        if is_busy or isinstance(error, MemoryError):
+            reason = message.splitlines()[0]
+            failure = (
+                RESOURCE_UNAVAILABLE,
+                f"the device is out of memory or busy ({reason}). Try a smaller --size.",
+            )
+    if failure is None:
+        return None
+    return failure[0], " ".join([failure[1], *getattr(error, "__notes__", [])])
+
+
+def _system_failure(error: OSError) -> tuple[int, str] | None:
+    reason = f"{error.strerror}: {error.filename}" if error.filename else error.strerror
+    if is_disk_full(error):
+        return RESOURCE_UNAVAILABLE, f"the disk is full ({reason}). Free some space."
+    if error.errno == errno.EBUSY:
+        return RESOURCE_UNAVAILABLE, f"a device is busy ({reason})."
+    if error.errno in PATH_ERRNOS:
+        return BAD_INPUT, f"cannot read or write ({reason}). Choose another path."
+    return None
+
+
+def is_disk_full(error: OSError) -> bool:
+    """Whether a write failed because the disk is full."""
+    return error.errno in DISK_FULL_ERRNOS
+
+
+DISTRIBUTION = "instant-avatar-stream"
+"""Name of the installed package."""
+
+Arguments = TypeVar("Arguments")
+
+
+def parse_arguments(
+    arguments_type: type[Arguments], program: str, argv: Sequence[str] | None = None
+) -> Arguments:
+    """Parse the arguments of a command; --help and --version print and exit.
+
+    Args:
+        arguments_type: A dataclass; its docstrings are the --help.
+        program: Name of the command.
+        argv: Words of the command line; None for those of the process.
+
+    Raises:
+        SystemExit: With 0 after --help or --version, with 2 if the words cannot be parsed.
+    """
+    argv = sys.argv[1:] if argv is None else list(argv)
+    if "--version" in argv:
+        print(f"{program} ({DISTRIBUTION}) {_installed_version()}")  # noqa: T201 - the answer
+        raise SystemExit(0)
+    if {"-h", "--help"} & set(argv):  # tyro would not wrap paragraphs
+        about = f"{inspect.getdoc(arguments_type)}\n\n--version prints the version and exits.\n"
+        paragraphs = re.sub(r"(?<=\S)\n(?=\w)", " ", about)
+        RichConsole(highlight=False, markup=False).print(paragraphs)
+    return tyro.cli(arguments_type, prog=program, args=argv, description="")
+
+
+def _installed_version() -> str:
+    """Return the version of the installed package."""
+    try:
+        return version(DISTRIBUTION)
+    except PackageNotFoundError:
+        return "(checkout, not installed)"
+
+
+def fill_optional_value(argv: Sequence[str], flag: str, value: int | float) -> list[str]:
+    """Insert a default number after a flag that no number follows."""
+    words: list[str] = []
+    for word, following in zip_longest(argv, argv[1:], fillvalue=""):
+        words.append(word)
+        if word == flag and not re.fullmatch(r"-?[\d.]+|nan", following):
+            words.append(f"{value:g}")
+    return words

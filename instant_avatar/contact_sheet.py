@@ -1,0 +1,135 @@
+"""Contact sheet: outlines of mask and body over frames, as stored and corrected."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from capture.atomic_files import OutputFileList, atomic_file
+from capture.camera import same_aspect_ratio
+from capture.input_error import InputError
+from instant_avatar.capture_validation import CaptureValidation, mask_lookup
+from preprocess.alignment.capture_geometry import FULL_WINDOW, CaptureGeometry
+from preprocess.alignment.keypoint_objective import TrackedImage
+from preprocess.alignment.silhouette_objective import components_touching, spaced_indices
+from preprocess.body.body_surface import MeshSilhouette, soft_iou
+
+COLUMNS = 6
+"""Frames per row."""
+MASK_COLOR, BODY_COLOR = (255, 255, 255), (255, 120, 0)
+KEYPOINT_COLOR, PAPER_COLOR, INK_COLOR = (0, 220, 220), (245, 245, 245), (40, 40, 40)
+"""RGB colors of the sheet."""
+LABEL_PX = 26
+"""Height of a row's label."""
+
+Rgb = UInt8[np.ndarray, "height width 3"]
+AlphaMask = Float32[np.ndarray, "height width"]
+
+
+def write_contact_sheet(
+    path: Path, check: CaptureValidation, *, replace: bool | None = None, listed: bool = False
+) -> bool:
+    """Draw a few frames with the outlines of mask (white) and body (orange) and their IoU.
+
+    Tracked key points are cyan. A second row shows the corrected capture, if there are corrections.
+
+    Args:
+        path: Image to write.
+        check: The validated capture.
+        replace: Whether an existing file may be replaced, as in `atomic_file`.
+        listed: Whether to list the sheet in its folder, so that a later one may replace it.
+
+    Returns:
+        Whether any frame could be drawn.
+
+    Raises:
+        OSError: If the image cannot be written.
+    """
+    if not check.images:
+        return False
+    rows = [_draw_row(check, check.hypothesis, "as stored", check.stored_iou)]
+    if check.causes:
+        corrected = check.diagnosis.corrected
+        rows.append(_draw_row(check, corrected, "corrected", check.corrected_iou))
+    width = max(row.shape[1] for row in rows)
+    paper = [np.full((len(row), width - row.shape[1], 3), PAPER_COLOR, np.uint8) for row in rows]
+    sheet = np.concatenate([np.hstack(pair) for pair in zip(rows, paper, strict=True)])
+    if listed:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        OutputFileList(path.parent).create()
+    with atomic_file(path, replace=replace) as part:
+        code = cv2.imencode(path.suffix.lower() or ".png", np.ascontiguousarray(sheet[..., ::-1]))
+        part.write_bytes(code[1].tobytes())
+    return True
+
+
+def _draw_row(check: CaptureValidation, geometry: CaptureGeometry, title: str, iou: float) -> Rgb:
+    """Draw a row of frames."""
+    body = MeshSilhouette(check.recording.shaped)
+    masks = check.recording.masks
+    mask_of = None if masks is None else mask_lookup(check.recording, masks)
+    chosen = [check.images[place] for place in spaced_indices(len(check.images), COLUMNS)]
+    seen = geometry.in_video_frames(check.recording.source.frames_in_file)
+    cells = [_draw_cell(image, geometry, seen, body, mask_of) for image in chosen]
+    label = np.full((LABEL_PX, sum(c.shape[1] for c in cells), 3), PAPER_COLOR, np.uint8)
+    score = "body outline (no masks)" if np.isnan(iou) else f"IoU {iou:.2f}"
+    _draw_text(label, f"{title}: {score}", 6)
+    return np.concatenate([label, np.concatenate(cells, axis=1)])
+
+
+def _draw_cell(
+    image: TrackedImage,
+    geometry: CaptureGeometry,
+    seen: CaptureGeometry,
+    body: MeshSilhouette,
+    mask_of: Callable[[int, tuple[int, int]], AlphaMask] | None,
+) -> Rgb:
+    """Draw one frame with both outlines.
+
+    Args:
+        image: The frame.
+        geometry: Poses, cameras and video transform.
+        seen: The same in the video's own frame numbers (`CaptureGeometry.in_video_frames`).
+        body: The person.
+        mask_of: From a frame number and a size to the mask; None without masks.
+    """
+    video = geometry.video_transform
+    picture = image.thumbnail.copy()
+    for point in image.image_px[image.confidence > 0.0] / image.size_px * picture.shape[1::-1]:
+        cv2.circle(picture, tuple(point.round().astype(int).tolist()), 2, KEYPOINT_COLOR, -1)
+    picture = video.reorient(picture)
+    size = picture.shape[1], picture.shape[0]
+    row, label = seen.row_for_frame(image.index), str(image.index)
+    drawn, alpha = None, image.alpha
+    if row is None:
+        label += ": no pose"
+    elif same_aspect_ratio(size, seen.size_px):
+        drawn = body.draw_pose(seen.motion[row], seen.camera_at(image.index, size))
+        _draw_outline(picture, drawn.astype(np.float32), BODY_COLOR)
+    if mask_of is not None and video.window == FULL_WINDOW:
+        try:
+            alpha = mask_of(video.first_frame + image.index, size)
+        except InputError:  # this frame has none
+            alpha = None
+    if alpha is not None:
+        alpha = np.float32(1.0) - alpha if geometry.masks_inverted else alpha
+        if geometry.keeps_person_only and drawn is not None:
+            alpha = components_touching(alpha, drawn)
+        _draw_outline(picture, alpha, MASK_COLOR)
+        label += "" if drawn is None else f": {soft_iou(drawn, alpha):.2f}"
+    _draw_text(picture, label, 4)
+    return picture
+
+
+def _draw_outline(picture: Rgb, alpha: AlphaMask, color: tuple[int, int, int]) -> None:
+    shape = (alpha > 0.5).astype(np.uint8)
+    outlines, _ = cv2.findContours(shape, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(picture, outlines, -1, color, 2, cv2.LINE_AA)
+
+
+def _draw_text(picture: Rgb, text: str, x: int) -> None:
+    y = LABEL_PX - 8
+    for color, thick in ((PAPER_COLOR, 3), (INK_COLOR, 1)):
+        cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.5, color, thick, cv2.LINE_AA)

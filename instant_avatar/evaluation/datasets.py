@@ -1,0 +1,375 @@
+"""Subjects of public data sets: which frames are trained on, and which are scored.
+
+PeopleSnapshot, InstantAvatar's protocol (Jiang et al. 2023, Tab. 1), which follows Anim-NeRF (Chen
+et al. 2021): train on frames of one turn for a minute, score whole frames of another turn on white,
+in poses fitted to them with the avatar frozen. The data set is available from its authors on
+request. Subjects are read in the folders that InstantAvatar's preprocessing writes, or as they are
+distributed: camera.pkl, masks.hdf5, reconstructed_poses.hdf5 and a video.
+
+NeuMan: frames of a moving camera. A subject (seattle, citron, parkinglot, bike, jogging, lab) has
+images/, COLMAP's sparse/, and segmentations/ (black on the person). Poses are those that HUGS
+(Kocabas et al. 2024) published with it: 4d_humans/smpl_optimized_aligned_scale.npz holds SMPL in
+the COLMAP world, `scale` units per meter, and 4d_humans/sam_segmentations its masks, which are
+preferred. test_split.txt and train_split.txt list names of images; without them the rule by which
+NeuMan's code makes them is applied: about every fifth frame is left out of training, and the first
+half of those is the test.
+"""
+
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from capture.atomic_files import atomic_folder
+from capture.image_folder import list_images, write_png
+from capture.input_error import InputError
+from capture.source_opening import open_source
+from instant_avatar.cli.console import Console
+from preprocess.cameras.camera_file import CameraTrack, write_cameras
+from preprocess.cameras.colmap_model import find_colmap_model, read_colmap_model
+from preprocess.cameras.named_camera import NamedCamera
+from preprocess.file_content import read_npz, read_untrusted_file
+from preprocess.masks.mask_files import Masks, open_masks
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplitFrames:
+    """The frames of one split.
+
+    Attributes:
+        folder: Capture folder.
+        poses: Pose file; None for the one in the folder.
+        frames: Frames of the folder, START:STOP:STEP counted from 0.
+    """
+
+    folder: Path
+    poses: Path | None = None
+    frames: str = "::"
+
+
+@dataclass(frozen=True, kw_only=True)
+class DatasetSubject:
+    """A subject of a data set, found in a folder.
+
+    Attributes:
+        name: Name of its folder.
+        open_splits: Returns the training and the test frames. Frames that no capture folder holds
+            are written below the given folder first, once.
+        size_px: Longer side of the images that are compared; None for the original size.
+        paper: Scores in a paper, by metric; empty without any.
+    """
+
+    name: str
+    open_splits: Callable[[Path, Console], tuple[SplitFrames, SplitFrames]]
+    size_px: int | None = None
+    paper: dict[str, float] = field(default_factory=dict)
+
+
+def _write_splits(
+    folder: Path,
+    splits: Mapping[str, Sequence[int]],
+    write_frames: Callable[[str, Path, Sequence[int]], Iterable[int]],
+    console: Console,
+) -> tuple[SplitFrames, SplitFrames]:
+    """Write the capture folders "train" and "test" of a subject; those that exist stay.
+
+    Args:
+        folder: Folder above them.
+        splits: Frame numbers of "train" and of "test".
+        write_frames: Writes the frames of a split into a folder, with poses and cameras, and yields
+            their numbers while it does.
+        console: Shows progress.
+    """
+    for name, numbers in splits.items():
+        if (folder / name).is_dir():  # written whole or not at all
+            continue
+        with (
+            atomic_folder(folder / name) as part,
+            console.progress(f"writing {folder / name}", float(len(numbers))) as bar,
+        ):
+            for made in ("images", "masks"):
+                (part / made).mkdir()
+            done = 0
+            for done, number in enumerate(write_frames(name, part, numbers), start=1):
+                bar.update(float(done), f"frame {number}")
+            if done != len(numbers):
+                raise InputError(
+                    f"Only {done} of {len(numbers)} frames of {folder / name} were found; is the "
+                    "video complete?"
+                )
+    return SplitFrames(folder=folder / "train"), SplitFrames(folder=folder / "test")
+
+
+def _require_rows(count: int, numbers: Sequence[int], path: Path, what: str) -> None:
+    """Check that a file has a row for each frame."""
+    if count <= max(numbers):
+        raise InputError(
+            f"{path} holds {count} {what}, but the protocol needs that of frame {max(numbers)}; is "
+            "it complete?"
+        )
+
+
+SPLITS = {
+    "female-3-casual": ("0:446:4", "446:648:4"),
+    "female-4-casual": ("0:336:4", "335:524:4"),
+    "male-3-casual": ("0:456:4", "456:676:4"),
+    "male-4-casual": ("0:660:6", "660:873:6"),
+}
+"""Training and test frames of the paper's subjects, START:STOP:STEP counted from 0."""
+PAPER = {
+    "female-3-casual": {"psnr": 27.90, "ssim": 0.9722, "lpips_alex01": 0.0249},
+    "female-4-casual": {"psnr": 28.92, "ssim": 0.9692, "lpips_alex01": 0.0180},
+    "male-3-casual": {"psnr": 29.65, "ssim": 0.9730, "lpips_alex01": 0.0192},
+    "male-4-casual": {"psnr": 27.97, "ssim": 0.9649, "lpips_alex01": 0.0346},
+}
+"""InstantAvatar's scores after a minute, at 540 px on white, in fitted poses."""
+LONGER_SIDE_PX = 540
+"""Longer side of the paper's images: half of the video's."""
+TRAIN_POSES, TEST_POSES = Path("poses/anim_nerf_train.npz"), Path("poses/anim_nerf_test.npz")
+"""Anim-NeRF's poses, one row per listed frame; the capture's own replace missing ones."""
+CAMERA_KEYS = ("camera_f", "camera_c", "camera_k", "width", "height")
+"""What is read of camera.pkl: focal lengths, principal point, OpenCV's distortion, size."""
+Lens = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "k"]]
+"""Intrinsic matrix and OpenCV's distortion."""
+
+
+def find_people_snapshot(folder: Path) -> list[DatasetSubject]:
+    """Find the paper's subjects in a folder, which may be a subject itself."""
+    subjects = []
+    for name in SPLITS:
+        for place in (folder / name, folder):
+            if place.resolve().name == name and place.is_dir():
+                opening = _open_raw if _is_raw(place) else _open_prepared
+                subjects.append(
+                    DatasetSubject(
+                        name=name,
+                        open_splits=partial(opening, name, place),
+                        size_px=LONGER_SIDE_PX,
+                        paper=PAPER[name],
+                    )
+                )
+                break
+    return subjects
+
+
+def _is_raw(folder: Path) -> bool:
+    """Whether a folder has the layout in which the data set is distributed."""
+    return (folder / "camera.pkl").is_file() and not (folder / "images").is_dir()
+
+
+def _open_prepared(
+    name: str, place: Path, _into: Path, _console: Console
+) -> tuple[SplitFrames, SplitFrames]:
+    """Name the frames of a folder that InstantAvatar's preprocessing wrote."""
+    train, test = (
+        SplitFrames(folder=place, poses=_existing(place / poses), frames=frames)
+        for poses, frames in zip((TRAIN_POSES, TEST_POSES), SPLITS[name], strict=True)
+    )
+    return train, test
+
+
+def _open_raw(
+    name: str, place: Path, into: Path, console: Console
+) -> tuple[SplitFrames, SplitFrames]:
+    """Write the protocol's frames of the original files: undistorted, at half the resolution."""
+    splits = {
+        split: range(*map(int, frames.split(":")))
+        for split, frames in zip(("train", "test"), SPLITS[name], strict=True)
+    }
+    return _write_splits(into / name, splits, partial(_write_raw_frames, place), console)
+
+
+def _write_raw_frames(place: Path, split: str, part: Path, numbers: Sequence[int]) -> Iterator[int]:
+    """Write evenly spaced frames with binary masks, poses and the camera; yield their numbers."""
+    camera, lens = _read_camera(place / "camera.pkl")
+    np.savez(part / "cameras.npz", **camera)
+    given = place / (TRAIN_POSES if split == "train" else TEST_POSES)
+    if not given.is_file():
+        path = place / "reconstructed_poses.hdf5"
+        with _open_hdf5(path, ("pose", "trans", "betas")) as stored:
+            poses = {key: stored[key][()] for key in ("pose", "trans", "betas")}
+        _require_rows(len(poses["pose"]), numbers, path, "poses")
+        rows = {"thetas": poses["pose"][numbers], "transl": poses["trans"][numbers]}
+        np.savez(part / "poses.npz", **rows, betas=poses["betas"].reshape(-1))
+    else:
+        (part / "poses.npz").write_bytes(given.read_bytes())
+    with _open_hdf5(place / "masks.hdf5", ("masks",)) as file:
+        _require_rows(len(file["masks"]), numbers, place / "masks.hdf5", "masks")
+        yield from _write_images(place, part, numbers, file["masks"], lens)
+
+
+def _write_images(
+    place: Path, part: Path, numbers: Sequence[int], masks: Any, lens: Lens
+) -> Iterator[int]:
+    """Write undistorted frames and masks of half the size; yield their numbers."""
+    wanted = slice(numbers[0], numbers[-1] + 1, numbers[1] - numbers[0])
+    for frame in open_source(place, frames=wanted).frames():
+        size = frame.size_px[0] // 2, frame.size_px[1] // 2
+        mask = np.asarray(masks[frame.index], dtype=np.float32)
+        if mask.shape != frame.rgb.shape[:2]:
+            raise InputError(
+                f"{place / 'masks.hdf5'} holds masks of {mask.shape[1]}x{mask.shape[0]} px, the "
+                f"video has {frame.size_px[0]}x{frame.size_px[1]}."
+            )
+        picture, mask = (cv2.undistort(each, *lens) for each in (frame.rgb, mask))
+        picture, mask = (cv2.resize(e, size, interpolation=cv2.INTER_AREA) for e in (picture, mask))
+        name = f"{frame.index:04d}.png"
+        write_png(part / "images" / name, picture)
+        write_png(part / "masks" / name, np.where(mask >= 0.5, 255, 0).astype(np.uint8))
+        yield frame.index
+
+
+def _read_camera(path: Path) -> tuple[dict[str, Any], Lens]:
+    """Read camera.pkl: contents of cameras.npz, and the matrix and distortion of the lens."""
+    stored = read_untrusted_file(path)
+    missing = [key for key in CAMERA_KEYS if not isinstance(stored, dict) or key not in stored]
+    if missing:
+        raise InputError(f"{path} lacks {', '.join(missing)}; expected PeopleSnapshot's camera.")
+    arrays = {key: np.asarray(value, dtype=np.float64).ravel() for key, value in stored.items()}
+    for key in ("camera_rt", "camera_t"):
+        if key in arrays and np.abs(arrays[key]).max(initial=0.0) > 1e-6:
+            raise InputError(f"`{key}` in {path} moves the camera; expected zeros.")
+    (fx, fy), (cx, cy) = arrays["camera_f"], arrays["camera_c"]
+    intrinsic = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    size = {key: int(arrays[key][0]) for key in ("width", "height")}
+    return {"intrinsic": intrinsic, "extrinsic": np.eye(4), **size}, (intrinsic, arrays["camera_k"])
+
+
+def _open_hdf5(path: Path, keys: tuple[str, ...]) -> Any:
+    """Open an HDF5 file of plain arrays."""
+    try:
+        import h5py
+    except ImportError as cause:
+        raise InputError(
+            f"{path} needs h5py: pip install 'instant-avatar-stream[datasets]'."
+        ) from cause
+    try:
+        file = h5py.File(path, "r")
+        missing = [key for key in keys if key not in file]
+    except OSError as cause:
+        raise InputError(f"{path} is missing, or no HDF5 file that can be read.") from cause
+    if missing:
+        raise InputError(f"{path} lacks {', '.join(missing)}; is it PeopleSnapshot's?")
+    return file
+
+
+def _existing(path: Path) -> Path | None:
+    return path if path.is_file() else None
+
+
+POSES = Path("4d_humans/smpl_optimized_aligned_scale.npz")
+MASK_FOLDERS = {Path("4d_humans/sam_segmentations"): False, Path("segmentations"): True}
+"""Masks in the order of preference, and whether the person is black in them."""
+POSE_KEYS = ("global_orient", "body_pose", "transl", "betas", "scale")
+NOT_TRAINED_EVERY = 5
+"""One frame of these is not trained on."""
+
+
+def find_neuman(folder: Path) -> list[DatasetSubject]:
+    """Find subjects in a folder, which may be a subject itself."""
+    inside = sorted(folder.iterdir()) if folder.is_dir() else []
+    return [
+        DatasetSubject(name=place.resolve().name, open_splits=partial(_open_subject, place))
+        for place in (folder, *inside)
+        if (place / "sparse").is_dir() and (place / POSES).is_file()
+    ]
+
+
+def split_by_rule(count: int) -> tuple[list[int], list[int]]:
+    """Return training and test frames of NeuMan's rule; the rest are validation frames."""
+    step = int(1 / max(1, count // NOT_TRAINED_EVERY) * count)  # rounded as NeuMan's code does
+    left_out = list(range(count))[step // 2 :: step]
+    train = sorted(set(range(count)) - set(left_out))
+    return train, left_out[: len(left_out) // 2]
+
+
+def _open_subject(place: Path, into: Path, console: Console) -> tuple[SplitFrames, SplitFrames]:
+    """Write both splits with cameras and poses in meters."""
+    model = find_colmap_model(place / "sparse")
+    if model is None:
+        raise InputError(f"{place / 'sparse'} holds no COLMAP model (cameras and images).")
+    cameras = read_colmap_model(model)
+    splits = _read_splits(place, [Path(each.name or "").name for each in cameras])
+    write = partial(_write_frames, place, cameras)
+    return _write_splits(into / place.resolve().name, splits, write, console)
+
+
+def _read_splits(place: Path, names: list[str]) -> dict[str, Sequence[int]]:
+    """Return the rows of "train" and "test" in the list of all names."""
+    files = {split: place / f"{split}_split.txt" for split in ("train", "test")}
+    if not all(path.is_file() for path in files.values()):
+        splits = dict(zip(files, split_by_rule(len(names)), strict=True))
+    else:
+        row, splits = {name: k for k, name in enumerate(names)}, {}
+        for split, path in files.items():
+            listed = [Path(line.strip()).stem for line in path.read_text().splitlines()]
+            unknown = [name for name in listed if name and name not in row]
+            if unknown:
+                raise InputError(f"{path} lists {unknown[0]}, which has no camera in sparse/.")
+            splits[split] = [row[name] for name in listed if name]
+    if not all(splits.values()):
+        raise InputError(f"{place} has {len(names)} frames, too few for a training and a test set.")
+    return dict(splits)
+
+
+def _write_frames(
+    place: Path, cameras: list[NamedCamera], _split: str, part: Path, rows: Sequence[int]
+) -> Iterator[int]:
+    """Write frames of the camera's order; yield their rows."""
+    stored = read_npz(place / POSES, POSE_KEYS)
+    missing = [key for key in POSE_KEYS if key not in stored]
+    if missing:
+        raise InputError(f"{place / POSES} lacks {', '.join(missing)}.")
+    _require_rows(len(stored["transl"]), rows, place / POSES, "poses")
+    scales = np.broadcast_to(stored["scale"].reshape(-1), len(stored["transl"]))
+    if not (np.isfinite(scales).all() and scales.min() > 0.0):
+        raise InputError(f"`scale` in {place / POSES} is not positive.")
+    unit, chosen = float(np.median(scales)), [cameras[row].camera for row in rows]
+    centers = np.stack([camera.center_world for camera in chosen])
+    tracks = np.stack([camera.camera_from_world for camera in chosen])
+    tracks[:, :3, 3] /= unit
+    scaled = (replace(each, camera_from_world=t) for each, t in zip(chosen, tracks, strict=True))
+    write_cameras(part / "cameras.npz", CameraTrack(cameras=tuple(scaled), source="sparse"))
+    # a person of another scale at another distance: the same image from this frame's camera
+    away = (stored["transl"][rows] - centers) / scales[rows][:, None]
+    np.savez(
+        part / "poses.npz",
+        global_orient=stored["global_orient"][rows].reshape(len(rows), 3),
+        body_pose=stored["body_pose"][rows].reshape(len(rows), 69),
+        transl=centers / unit + away,
+        betas=np.median(stored["betas"].reshape(-1, stored["betas"].shape[-1]), axis=0),
+    )
+    yield from _copy_images(place, cameras, part, rows)
+
+
+def _copy_images(
+    place: Path, cameras: list[NamedCamera], part: Path, rows: Sequence[int]
+) -> Iterator[int]:
+    images = {path.stem: path for path in list_images(place / "images")}
+    folder = next((place / each for each in MASK_FOLDERS if (place / each).is_dir()), None)
+    if folder is None:
+        raise InputError(f"{place} holds no segmentations/.")
+    masks = open_masks(folder, invert=MASK_FOLDERS[folder.relative_to(place)])
+    for row in rows:
+        name = Path(cameras[row].name or "").name
+        if name not in images:
+            raise InputError(f"{place / 'images'} lacks {name}, which has a camera in sparse/.")
+        shutil.copyfile(images[name], part / "images" / images[name].name)
+        alpha = masks.alpha(_mask_row(masks, name, row), cameras[row].camera.size_px)
+        write_png(part / "masks" / f"{name}.png", (alpha * 255.0).round().astype(np.uint8))
+        yield row
+
+
+def _mask_row(masks: Masks, name: str, row: int) -> int:
+    """Return the row of a frame's mask: by its name, or else in order."""
+    names = [Path(each).stem for each in masks.names or ()]  # also 00000.png.npy
+    if name in names:
+        return names.index(name)
+    _require_rows(masks.count, [row], masks.path, "masks")
+    return row

@@ -1,0 +1,149 @@
+"""Arguments of ia-evaluate; the text under each field is its --help."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from capture.input_error import InputError
+from instant_avatar.cli.shared_options import check_output_file, parse_frame_range
+from preprocess.capture_session import CaptureInputs
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluateArguments:
+    """Score avatars as a table (Markdown): renderer and player against real frames.
+
+    Try it:
+
+        ia-evaluate run                              a run's own held-out frames
+        ia-evaluate run other/run --json table.json  several, with their mean
+        ia-evaluate run --on another/capture         the same person in another video
+        ia-evaluate run/avatar.iavatar --on capture --frames 100:200:5      the player alone
+        ia-evaluate run --card run.html              a page with conditions, scores and pictures
+        ia-evaluate PeopleSnapshot --out evaluation --body SMPL_MALE.pkl    the paper's protocol
+        ia-evaluate neuman/dataset --out evaluation --body SMPL_NEUTRAL.pkl    NeuMan's
+
+    A dataset is a folder with subjects of PeopleSnapshot (as distributed, or in InstantAvatar's
+    layout: male-3-casual, …) or of NeuMan (seattle, …). Each subject is trained on the protocol's
+    training frames for --seconds and scored on its test frames, on white and black, next to the
+    paper's scores (docs/evaluation.md). Subjects that were trained before are not trained again.
+
+    Images are compared on white, in the capture's poses ("given") and in poses fitted to each frame
+    with the avatar frozen ("fitted", as in the paper).
+
+    LPIPS needs torchmetrics (pip install 'instant-avatar-stream[lpips]') and torchvision's weights
+    of AlexNet and VGG-16, which are not downloaded here; without them the table says n/a.
+
+    Exit codes: 0 done; 2 bad input; 3 disk full; 130 Ctrl-C, after a table of the scored frames.
+    """
+
+    targets: Annotated[
+        Positional[tuple[Path, ...]], arg(metavar="RUN|AVATAR|DATASET", help_behavior_hint="")
+    ] = ()
+    """Folders written by ia-ingest, .iavatar packages, or folders of PeopleSnapshot or NeuMan."""
+    on: Annotated[Path | None, arg(metavar="CAPTURE", help_behavior_hint="")] = None
+    """Score all frames of this video or capture folder instead of the run's held-out frames."""
+    background: Annotated[tuple[Literal["white", "black"], ...], arg(help_behavior_hint="")] = ()
+    """Backgrounds behind the person, one or both (default: white; both for a dataset)."""
+    lpips: Annotated[tuple[Literal["alex01", "alex", "vgg"], ...], arg(help_behavior_hint="")] = (
+        "alex01",
+        "alex",
+        "vgg",
+    )
+    """LPIPS as published tables compute it: AlexNet fed [0, 1] (PeopleSnapshot), AlexNet fed
+    [-1, 1] (NeuMan), VGG fed [-1, 1] (ZJU-MoCap; five seconds of CPU per image of 540 px)."""
+    lpips_weights: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    """Folder with alexnet-owt-7be5be79.pth and vgg16-397923af.pth (default: torch's cache)."""
+    poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Poses of --on, as in ia-ingest (default: those in the capture folder)."""
+    masks: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    """Masks of --on, as in ia-ingest (default: those in the capture folder)."""
+    cameras: Annotated[str | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Cameras of --on, as in ia-ingest (default: those in the capture folder)."""
+    body: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Body file that the avatars were trained with, if not the embedded body."""
+    frames: str = "::"
+    """Frames of --on to use: START:STOP:STEP, counted from 0."""
+    size: Annotated[int | None, arg(metavar="PX", help_behavior_hint="")] = None
+    """Longer side of the images (default: as in training, else the original size)."""
+    fitted: Annotated[bool, arg(help_behavior_hint="")] = True
+    """Score poses fitted to the frames as well."""
+    player: Annotated[bool, arg(help_behavior_hint="")] = True
+    """Score each tier of the package's player as well."""
+    seconds: float = 60.0
+    """Training time per subject of a dataset."""
+    steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Training steps per subject of a dataset, instead of --seconds."""
+    out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    """Folder for the runs of a dataset, and for its frames under captures/ (default: runs/NAME,
+    named after the dataset)."""
+    json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Write conditions and the scores of every frame to this file."""
+    markdown: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Write the table to this file as well."""
+    card: Annotated[Path | None, arg(metavar="FILE|DIR", help_behavior_hint="")] = None
+    """Write a page with conditions, scores and pictures: this .html file, or card.html in this
+    folder."""
+    dance: Annotated[tuple[Path, ...], arg(metavar="FILE", help_behavior_hint="")] = ()
+    """Motions that the page of --card shows the packages in, 6 s of each at most."""
+    overwrite: Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")] = False
+    """Replace the files that --json, --markdown and --card name, if they exist."""
+
+    @property
+    def page(self) -> Path | None:
+        """The file of --card."""
+        if self.card is None or self.card.suffix == ".html":
+            return self.card
+        return self.card / "card.html"
+
+    def validate(self) -> None:
+        """Check ranges, combinations and output files; an `InputError` names the option."""
+        if not self.targets:
+            raise InputError("Pass a run, a package or a dataset: ia-evaluate run (see --help).")
+        if self.lpips_weights is not None and not self.lpips_weights.is_dir():
+            raise InputError(f"--lpips-weights is {self.lpips_weights}, which is no folder.")
+        if self.size is not None and self.size < 16:
+            raise InputError(f"--size is {self.size}, but must be at least 16 pixels.")
+        if not 0.0 < self.seconds < float("inf"):
+            raise InputError(f"--seconds is {self.seconds}, but must be positive.")
+        if self.steps is not None and self.steps < 1:
+            raise InputError(f"--steps is {self.steps}, but must be at least 1.")
+        parse_frame_range(self.frames)
+        named = ("poses", "masks", "cameras")
+        of_capture = [f"--{name}" for name in named if getattr(self, name) is not None]
+        of_capture += ["--frames"] * (self.frames != "::")
+        if of_capture and self.on is None:
+            raise InputError(f"{', '.join(of_capture)} require a capture: pass it with --on.")
+        if self.dance and self.card is None:
+            raise InputError("--dance needs a page to be shown on: pass --card FILE.")
+        for path in (*self.targets, *self.dance):
+            if not path.exists():
+                raise InputError(
+                    f"{path} does not exist; expected a run, a package or a data set, or for "
+                    "--dance a file of poses."
+                )
+        outputs = {"--json": self.json, "--markdown": self.markdown, "--card": self.page}
+        for flag, path in outputs.items():
+            if path is not None:
+                check_output_file(path, flag, self._inputs(), overwrite=self.overwrite)
+
+    def _inputs(self) -> list[Path]:
+        """Return files that are read and must not be written to."""
+        packages = [path for path in self.targets if path.is_file()]
+        if self.on is not None:
+            return [*packages, *self.capture_inputs(self.on).input_paths()]
+        return packages if self.body is None else [*packages, self.body]
+
+    def capture_inputs(self, video: Path) -> CaptureInputs:
+        """Return the inputs of the capture in --on."""
+        return CaptureInputs(
+            video=video,
+            poses=self.poses,
+            masks=self.masks,
+            cameras=self.cameras,
+            body=self.body,
+            frames=parse_frame_range(self.frames),
+            refine_masks=False,
+        )

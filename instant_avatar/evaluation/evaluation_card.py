@@ -1,0 +1,78 @@
+"""The evaluation's page: conditions, scores, learning curve and pictures."""
+
+from collections.abc import Sequence
+from importlib.metadata import version
+
+from avatar.evaluation.perceptual import Lpips
+from instant_avatar.cli.hardware import Hardware
+from instant_avatar.evaluation.frame_scoring import LARGEST_SHOWN_ERROR, choose_shown
+from instant_avatar.evaluation.score_table import AvatarEvaluation, table_cells
+from instant_avatar.report.page_rendering import render_template
+from instant_avatar.report.report_figures import curve_svg
+from instant_avatar.report.report_schema import CurvePoint
+
+POSES = {
+    "given": "given (of the capture, as fitted before training)",
+    "fitted": "fitted (to each scored frame, with its exposure; the avatar is frozen)",
+}
+"""What the kinds of poses are."""
+
+
+def evaluation_conditions(evaluations: Sequence[AvatarEvaluation], lpips: Lpips) -> dict[str, str]:
+    """Return what the scores depend on, by name."""
+    here, rows = Hardware.here(), [row for each in evaluations for row in each.rows]
+    sizes = dict.fromkeys("{}x{}".format(*each.size) for each in evaluations if each.size)
+    package = f"instant-avatar-stream {version('instant-avatar-stream')}"
+    conditions = {
+        "poses": "; ".join(POSES[poses] for poses in dict.fromkeys(row.poses for row in rows)),
+        "background": " and ".join(dict.fromkeys(row.background for row in rows)),
+        "resolution": f"{', '.join(sizes)} px",
+    }
+    for each in evaluations:
+        scored = max(len(row.scores) for row in each.rows)
+        conditions[f"frames of {each.name}"] = f"{scored} of {each.capture}"
+        conditions[f"training of {each.name}"] = _describe_training(each)
+    return conditions | {
+        "PSNR, SSIM": f"{package}: values in [0, 1]; SSIM on RGB, Gaussian of 11 pixels, σ 1.5",
+        "LPIPS": lpips.describe(),
+        "machine": f"{here.processor}, {here.cores} cores, {here.memory_gb} GB, load {here.load}",
+        "software": here.software,
+        "commit": here.commit,
+        "date": here.date,
+    }
+
+
+def evaluation_page(evaluations: Sequence[AvatarEvaluation], conditions: dict[str, str]) -> str:
+    """Return the self-contained page."""
+    return render_template(
+        "evaluation.html",
+        title=f"Evaluation of {', '.join(each.name for each in evaluations)}",
+        conditions=conditions,
+        table=table_cells(evaluations),
+        evaluations=[
+            {
+                "name": each.name,
+                "curve": curve_svg(learning_curve(each)),
+                "shown": choose_shown(each.shown),
+                "dances": each.dances,
+            }
+            for each in evaluations
+        ],
+        largest_error=LARGEST_SHOWN_ERROR,
+    )
+
+
+def learning_curve(evaluation: AvatarEvaluation) -> list[CurvePoint]:
+    """Return the learning curve in a run's report; empty without one."""
+    points = [] if evaluation.report is None else evaluation.report.get("curve", [])
+    return [CurvePoint.from_checkpoint(point) for point in points]
+
+
+def _describe_training(evaluation: AvatarEvaluation) -> str:
+    if evaluation.report is None:
+        return "not known here"
+    training, machine = evaluation.report["training"], evaluation.report["machine"]
+    return (
+        f"{training['wall_seconds']:.1f} s wall clock, {training['cpu_seconds']:.1f} core-seconds, "
+        f"{training['steps']} steps, device {machine['device']}, threads: {machine['threads']}"
+    )

@@ -1,0 +1,259 @@
+"""Score avatars on frames: the volume renderer, in given and fitted poses, and the player."""
+
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import Any, final
+
+from avatar.evaluation.held_out import HeldOutFrame
+from avatar.evaluation.perceptual import Lpips
+from avatar.render import render
+from avatar.training import checkpoint
+from avatar.training.held_out_pose_fitting import fit_test_poses
+from avatar.training.trainer import Trainer
+from export.player import Player, premultiply
+from instant_avatar.animation.driving_motion import load_driving_motion
+from instant_avatar.cli.console import Console
+from instant_avatar.evaluation.evaluate_arguments import EvaluateArguments
+from instant_avatar.evaluation.evaluation_frames import (
+    EvaluationFrames,
+    capture_frames,
+    read_report,
+)
+from instant_avatar.evaluation.frame_scoring import (
+    FrameRenderer,
+    PremultipliedImage,
+    ShownFrame,
+    score_picture,
+)
+from instant_avatar.evaluation.score_table import AvatarEvaluation, ScoreRow
+from instant_avatar.report.page_rendering import data_uri
+from instant_avatar.report.report_writer import motion_animation
+from instant_avatar.run.run_folder import RunFolder
+from preprocess.observation import Observation
+
+BEST_TIER = "hq"
+"""Tier that every package has."""
+FIT_BATCH_FRAMES = 25
+"""Number of frames whose poses are fitted together."""
+VOLUME_RENDERER = "renderer"
+"""What the rows of the volume renderer are drawn by."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class EvaluationSession:
+    """One call of ia-evaluate.
+
+    Attributes:
+        arguments: As given.
+        console: Shows progress.
+        stop: Set by Ctrl-C; ends scoring early.
+        lpips: LPIPS with the weights that were found.
+    """
+
+    arguments: EvaluateArguments
+    console: Console
+    stop: threading.Event
+    lpips: Lpips
+
+    def evaluate_package(self, package: Path, frames: EvaluationFrames) -> AvatarEvaluation:
+        """Score the player alone."""
+        return self._evaluate(str(package), frames, None, package, ("white",))
+
+    def evaluate_run(
+        self,
+        name: str,
+        run: RunFolder,
+        frames: EvaluationFrames,
+        *,
+        backgrounds: tuple[str, ...] = ("white",),
+        paper: dict[str, float] | None = None,
+    ) -> AvatarEvaluation:
+        """Score renderer and player of a run.
+
+        Args:
+            name: Name of the avatar in the table.
+            run: The run.
+            frames: Frames to score.
+            backgrounds: Backgrounds behind the person, if the user names none.
+            paper: Scores in the paper, if the subject is in it.
+        """
+        with self.console.status(f"loading {run.checkpoint}"):
+            trainer = checkpoint.load(run.checkpoint)[0]
+        report = read_report(run) if run.report_json.is_file() else None
+        package = run.package if run.package.is_file() else None
+        return self._evaluate(name, frames, trainer, package, backgrounds, report, paper)
+
+    def frames_of_capture(self, run: RunFolder, size_px: int | None = None) -> EvaluationFrames:
+        """Open the capture of --on for the person of a run, if the run is known."""
+        arguments = self.arguments
+        assert arguments.on is not None
+        person = run.body_file if run.body_file.is_file() else None
+        inputs = arguments.capture_inputs(arguments.on)
+        return capture_frames(inputs, person, arguments.size or size_px)
+
+    def _evaluate(
+        self,
+        name: str,
+        frames: EvaluationFrames,
+        trainer: Trainer | None,
+        package: Path | None,
+        backgrounds: tuple[str, ...],
+        report: dict[str, Any] | None = None,
+        paper: dict[str, float] | None = None,
+    ) -> AvatarEvaluation:
+        """Score all renderers on all frames, or on those before `stop` is set."""
+        renderers = self._renderers(frames, trainer, package)
+        scorer = FrameScorer(
+            renderers,
+            trainer if self.arguments.fitted else None,
+            self.arguments.background or backgrounds,
+            self.lpips,
+            keeps_pictures=self.arguments.card is not None,
+        )
+        with self.console.progress(f"scoring {name}", float(frames.count or 0)) as bar:
+            done, rest = 0, iter(frames)
+            while group := list(islice(rest, FIT_BATCH_FRAMES)):
+                for observation in group:
+                    if self.stop.is_set():
+                        break
+                    scorer.score_frame(observation)
+                    done += 1
+                    bar.update(float(done), f"frame {observation.frame.index}, {done} scored")
+                if self.stop.is_set():
+                    break
+                if scorer.fits_poses:
+                    bar.update(float(done), f"fitting poses to {len(group)} frames")
+                    scorer.score_fitted(group)
+        return AvatarEvaluation(
+            name=name,
+            capture=str(frames.recording.paths.video),
+            size=scorer.size_px,
+            rows=scorer.rows,
+            shown=scorer.shown,
+            dances={} if package is None else self._dances(package),
+            report=report,
+            paper=paper,
+        )
+
+    def _renderers(
+        self, frames: EvaluationFrames, trainer: Trainer | None, package: Path | None
+    ) -> dict[str, FrameRenderer]:
+        """Return what draws given poses, by name: the volume renderer, and a player per tier."""
+        renderers: dict[str, FrameRenderer] = {}
+        if trainer is not None:
+            renderers[VOLUME_RENDERER] = partial(_render_volume, trainer)
+        if package is None or not (self.arguments.player or trainer is None):
+            return renderers
+        if frames.recording.cameras[0].distortion:
+            self.console.warning(
+                "The player renders pinhole images; this lens has distortion, so it is not scored."
+            )
+            return renderers
+        for tier in (BEST_TIER, *Player.load(package).manifest.tiers):
+            if f"player {tier}" not in renderers:
+                renderers[f"player {tier}"] = partial(_play, Player.load(package, tier=tier))
+        return renderers
+
+    def _dances(self, package: Path) -> dict[str, str]:
+        """Draw the motions of --dance."""
+        if not self.arguments.dance or self.stop.is_set():
+            return {}
+        player, drawn = Player.load(package), dict[str, str]()
+        for path in self.arguments.dance:
+            with self.console.status(f"drawing {path}"):
+                motion = load_driving_motion(path, player.manifest.rest_joints, self.console)
+                drawn[path.stem] = data_uri(motion_animation(player, motion))
+        return drawn
+
+
+@final
+class FrameScorer:
+    """Scores the frames of one avatar.
+
+    Attributes:
+        rows: Scores by renderer, poses and background.
+        size_px: Width and height of the images; None before the first.
+        shown: Frames with their renderings, of the fitted poses or else of the first row.
+    """
+
+    def __init__(
+        self,
+        renderers: dict[str, FrameRenderer],
+        fitted: Trainer | None,
+        backgrounds: tuple[str, ...],
+        lpips: Lpips | None = None,
+        *,
+        keeps_pictures: bool = False,
+    ) -> None:
+        """Prepare the rows of the table.
+
+        Args:
+            renderers: What draws given poses, by name.
+            fitted: Holds the avatar to which poses are fitted; None not to fit any.
+            backgrounds: Names of `BACKGROUNDS`.
+            lpips: LPIPS; None to leave it out.
+            keeps_pictures: Whether `shown` is filled.
+        """
+        self._renderers, self._trainer, self._lpips = renderers, fitted, lpips
+        ways = [(name, "given") for name in renderers]
+        if fitted is not None:
+            ways.insert(1, (VOLUME_RENDERER, "fitted"))
+        self._rows = {
+            way: [ScoreRow(renderer=way[0], poses=way[1], background=each) for each in backgrounds]
+            for way in ways
+        }
+        self._shown_way = None
+        if keeps_pictures and ways:
+            self._shown_way = ways[0] if fitted is None else ways[1]
+        self.rows = [row for rows in self._rows.values() for row in rows]
+        self.size_px: tuple[int, int] | None = None
+        self.shown: list[ShownFrame] = []
+
+    @property
+    def fits_poses(self) -> bool:
+        """Whether fitted poses are scored."""
+        return self._trainer is not None
+
+    def score_frame(self, observation: Observation) -> None:
+        """Score all renderers in a frame's given pose."""
+        self.size_px = observation.camera.size_px
+        for name, draw in self._renderers.items():
+            self._score((name, "given"), observation, draw)
+
+    def score_fitted(self, observations: Sequence[Observation]) -> None:
+        """Score the volume renderer in poses and exposures that are fitted to frames."""
+        trainer = self._trainer
+        assert trainer is not None
+        frames = [HeldOutFrame(observation=each) for each in observations]
+        for frame in fit_test_poses(trainer, frames):
+            draw = partial(_render_volume, trainer, frame=frame)
+            self._score((VOLUME_RENDERER, "fitted"), frame.observation, draw)
+
+    def _score(self, way: tuple[str, str], observation: Observation, draw: FrameRenderer) -> None:
+        started = time.process_time()
+        picture = draw(observation)
+        cpu_ms = 1000.0 * (time.process_time() - started)
+        for row in self._rows[way]:
+            score = score_picture(observation, picture, row.background, self._lpips, cpu_ms=cpu_ms)
+            row.scores.append(score)
+        if way == self._shown_way:
+            row = self._rows[way][0]
+            shown = ShownFrame.of(observation, picture, row.background, row.scores[-1])
+            self.shown.append(shown)
+
+
+def _render_volume(
+    trainer: Trainer, observation: Observation, frame: HeldOutFrame | None = None
+) -> PremultipliedImage:
+    """Render a pose, in the exposure of a held-out frame if there is one."""
+    picture = render(trainer.avatar, observation.pose, observation.camera, shaded=True)
+    return picture if frame is None else frame.expose(picture)
+
+
+def _play(player: Player, observation: Observation) -> PremultipliedImage:
+    return premultiply(player.render(observation.pose, observation.camera))

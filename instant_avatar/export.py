@@ -1,0 +1,233 @@
+"""ia-export: write the current state of a run as a package, or an avatar as a mesh."""
+
+import shutil
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from capture.atomic_files import atomic_file
+from capture.camera import Camera
+from capture.input_error import InputError
+from export.gltf import SkeletonAnimation, encode_glb
+from export.package.manifest import Manifest
+from export.package.package_file import read_package
+from export.skinned_mesh import SkinnedMesh, extract_mesh
+from instant_avatar.animation.driving_motion import demo_motion, load_driving_motion, pose_rate
+from instant_avatar.cli.command_line import (
+    DONE,
+    NO_AVATAR,
+    CommandExit,
+    parse_arguments,
+    run_command,
+)
+from instant_avatar.cli.console import Console
+from instant_avatar.cli.shared_options import check_output_file
+from instant_avatar.run.run_folder import RunFolder
+from preprocess.body.body_pose import BodyPose, Motion
+
+if TYPE_CHECKING:  # torch is loaded after --help has been answered
+    from avatar.rig import Rig
+
+CHECK_VIEWS = 4
+"""Synthetic views that validate a package without frames."""
+VIEW_PX = 256
+"""Width and height of a synthetic view."""
+MIN_TRIANGLES = 500
+"""Least --triangles; below it a hand is a lump."""
+DISTANCE_HEIGHTS = 3.5
+"""Distance of the camera, in heights of the person."""
+PERSON_HEIGHT_SHARE = 0.8
+"""Height of the person as a fraction of the image height."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExportArguments:
+    """Write the newest checkpoint of a run, or a package, to a file.
+
+    Try it while ia-ingest is training, or after it was killed:
+
+        ia-export run --out now.iavatar
+
+        ia-play now.iavatar --poses dance.npz
+
+    For Blender, game engines and other programs, a mesh with skeleton, weights and a motion:
+
+        ia-export run/avatar.iavatar --to glb --poses dance.npz --out dance.glb
+
+    The run continues undisturbed; nothing in its folder is changed unless --out names it. A mesh is
+    opaque with a hard silhouette: ia-play renders the avatar in full quality.
+
+    Exit codes: 0 done; 1 nothing to draw yet; 2 bad input; 3 disk full; 130 Ctrl-C.
+    """
+
+    run: Annotated[Positional[Path], arg(metavar="RUN|AVATAR")]
+    """Folder written by ia-ingest (--out), with checkpoint/; for meshes also a package."""
+    to: Literal["iavatar", "glb", "ply", "obj"] = "iavatar"
+    """Format: package for ia-play; binary glTF 2.0; or a static mesh with vertex colors as PLY or
+    OBJ (canonical pose, no skeleton)."""
+    out: Annotated[Path, arg(metavar="FILE", help_behavior_hint="(required)")]
+    """File to write, whole or not at all."""
+    poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Motion for --to glb, as in ia-play (default: a turn)."""
+    person: Annotated[str | None, arg(metavar="ID", help_behavior_hint="")] = None
+    """Person ID in the pose file (default: the longest track)."""
+    triangles: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Number of triangles of a mesh, for game engines and phones; a .glb then has a texture
+    (default: some 300,000, with vertex colors). 20,000 are enough for most."""
+    overwrite: Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")] = False
+    """Replace the file that --out names, if it exists."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    given = parse_arguments(ExportArguments, "ia-export", argv)
+    return run_command("ia-export", lambda: export(given, Console()))
+
+
+def export(arguments: ExportArguments, console: Console) -> int:
+    """Write a package or a mesh.
+
+    Raises:
+        InputError: If there is no readable checkpoint, or no folder to write to.
+        OSError: If the disk is full.
+        CommandExit: If there is nothing to draw.
+    """
+    if arguments.out.suffix.lower() != f".{arguments.to}":
+        raise InputError(f"--out is {arguments.out}, but must end in .{arguments.to}.")
+    if not arguments.out.resolve().parent.is_dir():
+        raise InputError(
+            f"--out is {arguments.out}, but the folder {arguments.out.resolve().parent} does not "
+            "exist."
+        )
+    inputs = [
+        path for path in (arguments.run, arguments.poses) if path is not None and path.is_file()
+    ]
+    check_output_file(arguments.out, "--out", inputs, overwrite=arguments.overwrite)
+    if arguments.poses is not None and arguments.to != "glb":
+        raise InputError(f"--poses requires --to glb; a .{arguments.to} holds no motion.")
+    if arguments.triangles is not None and arguments.to == "iavatar":
+        raise InputError("--triangles requires --to glb, ply or obj; a package has none.")
+    if arguments.triangles is not None and arguments.triangles < MIN_TRIANGLES:
+        raise InputError(
+            f"--triangles is {arguments.triangles}, but must be at least {MIN_TRIANGLES}."
+        )
+    if arguments.run.is_file() and arguments.to != "iavatar":
+        _export_mesh(arguments, arguments.run, console)
+    else:
+        with tempfile.TemporaryDirectory() as folder:
+            package = Path(folder) / "avatar.iavatar"
+            _export_package(arguments.run, package, console, fine_tune=arguments.to == "iavatar")
+            if arguments.to != "iavatar":
+                _export_mesh(arguments, package, console)
+            else:
+                with atomic_file(arguments.out, replace=arguments.overwrite) as part:
+                    shutil.copyfile(package, part)
+    console.print_artifact("mesh" if arguments.to != "iavatar" else "package", arguments.out)
+    return DONE
+
+
+def _export_mesh(arguments: ExportArguments, package: Path, console: Console) -> None:
+    """Write a mesh of a package in the format of --to, whole or not at all."""
+    held = read_package(package)
+    motion = demo_motion()
+    if arguments.poses is not None:
+        joints = held.manifest.rest_joints
+        motion = load_driving_motion(arguments.poses, joints, console, person=arguments.person)
+    to_glb, out = arguments.to == "glb", arguments.out
+    with console.status("extracting the surface"):
+        mesh = extract_mesh(
+            held.tables["hq"],
+            triangles=arguments.triangles,
+            textured=to_glb and arguments.triangles is not None,
+        )
+        if to_glb:
+            content = _encode_animated(mesh, held.manifest, motion, out.stem)
+        else:
+            content = _encode_static(mesh, arguments.to)
+    with atomic_file(out, replace=arguments.overwrite) as part:
+        part.write_bytes(content)
+    console.info(f"{len(mesh.positions):,} vertices, {len(mesh.faces):,} triangles.")
+
+
+def _encode_animated(mesh: SkinnedMesh, manifest: Manifest, motion: Motion, name: str) -> bytes:
+    rows = tuple(int(row) for row in np.flatnonzero(motion.valid))
+    animation = SkeletonAnimation.of(motion, rows, pose_rate(motion), manifest.rest_joints[0])
+    return encode_glb(mesh, manifest, animation, name=name)
+
+
+def _encode_static(mesh: SkinnedMesh, kind: str) -> bytes:
+    """Encode the canonical pose; colors are sRGB, as programs take a PLY's to be."""
+    import trimesh  # missing in an installation of the player alone
+
+    options: dict[str, Any] = {
+        "ply": {"vertex_normal": True},
+        "obj": {"include_normals": True},
+    }[kind]
+    solid = trimesh.Trimesh(
+        vertices=mesh.positions,
+        faces=mesh.faces,
+        vertex_normals=mesh.normals,
+        vertex_colors=mesh.colors,
+        process=False,
+    )
+    content = solid.export(file_type=kind, **options)
+    return content if isinstance(content, bytes) else str(content).encode()
+
+
+def _export_package(folder: Path, out: Path, console: Console, *, fine_tune: bool = True) -> None:
+    """Write a package of a run's checkpoint, fine-tuned unless it only becomes a mesh."""
+    if folder.is_file():
+        raise InputError(
+            f"{folder} is a file, but must be a folder written by ia-ingest. A package can be "
+            "converted with --to glb, --to ply and --to obj."
+        )
+    run = RunFolder(path=folder)
+    if not run.has_checkpoint():
+        raise InputError(
+            f"No checkpoint in {run.checkpoint}; expected a folder written by ia-ingest, which "
+            "saves the first checkpoint five seconds after the first frame."
+        )
+    with console.status("loading the checkpoint"):
+        from avatar.training import checkpoint
+        from instant_avatar.run.snapshot_writer import write_package_snapshot
+
+        trainer, _ = checkpoint.load(run.checkpoint)
+    with console.progress("writing the package", 1.0) as bar:
+        shots = synthetic_views(trainer.avatar.rig)
+        taken = write_package_snapshot(
+            trainer, out, shots, curve_point=None, fine_tune=fine_tune, progress=bar.set_share
+        )
+    if taken.export_report is None:
+        raise CommandExit(taken.refusal or "nothing was written.", NO_AVATAR)
+    for warning in taken.export_report.warnings:
+        console.warning(warning)
+    console.info(f"Trained on {trainer.frames_seen} frames for {trainer.wall_seconds:.1f} s.")
+
+
+def synthetic_views(rig: "Rig") -> list[tuple[BodyPose, Camera]]:
+    """Return poses of the built-in motion, seen from the front: a checkpoint holds no frames."""
+    motion = demo_motion(frames=CHECK_VIEWS)
+    low, high = rig.seeds.min(axis=0).astype(float), rig.seeds.max(axis=0).astype(float)
+    distance = DISTANCE_HEIGHTS * (high[1] - low[1])
+    focal = PERSON_HEIGHT_SHARE * VIEW_PX * DISTANCE_HEIGHTS
+    axes = np.diag([1.0, -1.0, -1.0])
+    camera_from_world = np.eye(4)
+    camera_from_world[:3, :3] = axes
+    camera_from_world[:3, 3] = [0.0, 0.0, distance] - axes @ (0.5 * (low + high))
+    camera = Camera(
+        focal_px=(focal, focal),
+        center_px=(VIEW_PX / 2, VIEW_PX / 2),
+        size_px=(VIEW_PX, VIEW_PX),
+        camera_from_world=camera_from_world,
+    )
+    return [(motion[row], camera) for row in range(CHECK_VIEWS)]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

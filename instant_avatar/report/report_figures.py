@@ -1,0 +1,161 @@
+"""Figures as SVG: the learning curve, and the body from four sides by how well it was seen."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import final
+
+import numpy as np
+from jaxtyping import Float, Int
+from markupsafe import Markup
+from scipy.spatial import KDTree
+
+from avatar.evaluation.coverage import MIN_WELL_SEEN_COSINE, Coverage
+from avatar.evaluation.skin_patches import pose_patches
+from avatar.rig import canonical_rotations
+from instant_avatar.report.page_rendering import render_template
+from instant_avatar.report.report_schema import CurvePoint
+from preprocess.body.body_pose import BodyPose
+from preprocess.body.body_surface import visible_points
+from preprocess.body.parametric_body import ShapedBody
+
+SVG_WIDTH, SVG_HEIGHT = 720, 320
+"""Size of the plot with its margins, in SVG units."""
+LEFT, RIGHT, TOP, BOTTOM = 46, 16, 26, 48
+"""Margins of the plot, for its labels, in SVG units."""
+TICK_SECONDS = (0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 30.0, 60.0, 300.0)
+"""Distances of the ticks of the time axis, of which the first that gives at most 8 is used."""
+SCORE_LABELS = {"psnr_mask": ("masked", "inside the mask"), "psnr": ("whole", "whole image")}
+"""CSS class and label of each score of the curve."""
+
+
+def curve_svg(curve: Sequence[CurvePoint]) -> Markup:
+    """Plot held-out PSNR over training time: whole image, and inside the mask.
+
+    Each video has its own line, because its held-out frames cannot be compared with another's.
+    Return an empty string if nothing was scored.
+    """
+    curve = [point for point in curve if point.psnr is not None]
+    values = [
+        value for point in curve for value in (point.psnr, point.psnr_mask) if value is not None
+    ]
+    if not values:
+        return Markup("")
+    low, high = 5 * int(min(values) // 5), 5 * int(max(values) // 5 + 1)
+    end = max(max(point.wall_seconds for point in curve), 1e-6)
+    step = next((step for step in TICK_SECONDS if end / step <= 8.0), TICK_SECONDS[-1])
+
+    def x(seconds: float) -> float:
+        return round(LEFT + (SVG_WIDTH - LEFT - RIGHT) * seconds / end, 1)
+
+    def y(decibels: float) -> float:
+        return round(TOP + (SVG_HEIGHT - TOP - BOTTOM) * (high - decibels) / (high - low), 1)
+
+    def dots(score: str, video: int) -> list[tuple[float, float, str]]:
+        return [
+            (
+                x(point.wall_seconds),
+                y(value),
+                f"{point.wall_seconds:.1f} s: {value:.2f} dB {SCORE_LABELS[score][1]}, mean over "
+                f"{len(point.frames)} held-out frames",
+            )
+            for point in curve
+            if point.video == video and (value := getattr(point, score)) is not None
+        ]
+
+    starts = {point.video: x(point.wall_seconds) for point in reversed(curve)}
+    return render_template(
+        "curve.svg",
+        width=SVG_WIDTH,
+        height=SVG_HEIGHT,
+        left=LEFT,
+        right=SVG_WIDTH - RIGHT,
+        top=TOP,
+        grid=[(y(decibels), decibels) for decibels in range(low, high + 1, 5)],
+        ticks=[(x(step * k), f"{step * k:g}") for k in range(int(end / step) + 1)],
+        videos=[(at, video) for video, at in sorted(starts.items()) if len(starts) > 1],
+        lines=[
+            (kind, dots(score, video))
+            for score, (kind, _) in SCORE_LABELS.items()
+            for video in sorted(starts)
+            if dots(score, video)
+        ],
+    )
+
+
+VIEW_AXES = {"front": (0, 1.0), "left": (2, -1.0), "back": (0, -1.0), "right": (2, 1.0)}
+"""Axis of the body, and its sign, that points right in each view."""
+DOT_SPACING_CM = 2.7
+"""Distance of neighboring dots, centimeters."""
+MAX_PATCH_DISTANCE_CM = 3.2
+"""Distance to the nearest visible patch beyond which a dot lies off the body, centimeters."""
+GAP_CM = 14.0
+"""Gap between two views, centimeters."""
+MARGIN_CM = 4.0
+"""Margin around the map, centimeters."""
+LEVELS = ("never", "slant", "well")
+"""CSS classes of a dot: unseen, seen at a grazing angle, seen frontally."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _MapView:
+    """One view: dots on a hexagonal grid, y down, and the visible skin patch nearest to each."""
+
+    positions_cm: Float[np.ndarray, "dots 2"]
+    patches: Int[np.ndarray, "dots"]
+
+
+@final
+class CoverageMap:
+    """Coverage of one person in the A-pose from four sides, as dots."""
+
+    def __init__(self, shaped: ShapedBody, coverage: Coverage) -> None:
+        """Assign skin patches to dots; `svg` draws their state at any time."""
+        pose = replace(BodyPose.rest(), joint_rotations=canonical_rotations())
+        points, normals = pose_patches(coverage.patches, shaped.with_pose(pose).world_from_rest())
+        self._coverage, self._views, left = coverage, dict[str, _MapView](), 0.0
+        for name, (axis, sign) in VIEW_AXES.items():
+            right = np.zeros(3)
+            right[axis] = sign
+            to_eye = np.cross(right, [0.0, 1.0, 0.0])
+            plane, facing = np.column_stack([points @ right, points[:, 1]]), normals @ to_eye
+            free = visible_points(plane, -(points @ to_eye), facing)
+            shown = np.flatnonzero(free & (facing > 0.0))
+            top_left = np.array([plane[shown, 0].min(), points[:, 1].max()])
+            places = 100.0 * (plane[shown] - top_left) * [1.0, -1.0]
+            dots = _hexagonal_grid(places.max(axis=0))
+            distance_cm, nearest = map(np.asarray, KDTree(places).query(dots))
+            on_body = distance_cm < MAX_PATCH_DISTANCE_CM
+            self._views[name] = _MapView(
+                positions_cm=(dots[on_body] + [left, 0.0]).round(1), patches=shown[nearest[on_body]]
+            )
+            left += float(places[:, 0].max()) + GAP_CM
+
+    def svg(self) -> Markup:
+        """Draw the coverage in its current state; the CSS classes in `LEVELS` give the colors."""
+        level = np.digitize(self._coverage.cosines, [1e-6, MIN_WELL_SEEN_COSINE])
+        everything = np.concatenate([view.positions_cm for view in self._views.values()])
+        width, height = everything.max(axis=0).tolist()
+        views = [
+            (
+                name,
+                round(float(view.positions_cm[:, 0].min() + view.positions_cm[:, 0].max()) / 2, 1),
+                {
+                    kind: view.positions_cm[level[view.patches] == k].tolist()
+                    for k, kind in enumerate(LEVELS)
+                },
+            )
+            for name, view in self._views.items()
+        ]
+        return render_template(
+            "body_map.svg", views=views, width=width, height=height, margin=MARGIN_CM
+        )
+
+
+def _hexagonal_grid(size_cm: Float[np.ndarray, "2"]) -> Float[np.ndarray, "grid 2"]:
+    """Return the points of a hexagonal grid that covers a rectangle from its top left."""
+    x, y = np.meshgrid(
+        np.arange(-DOT_SPACING_CM, size_cm[0] + DOT_SPACING_CM, DOT_SPACING_CM),
+        np.arange(-DOT_SPACING_CM, size_cm[1] + DOT_SPACING_CM, 0.866 * DOT_SPACING_CM),
+    )
+    x[1::2] += 0.5 * DOT_SPACING_CM
+    return np.stack([x.ravel(), y.ravel()], axis=1)

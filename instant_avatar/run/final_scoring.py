@@ -1,0 +1,351 @@
+"""Scores after the last step: held-out frames of this video, and of those before it.
+
+A few whole images are scored, as long as time allows. The scores of the other frames are estimates
+from 4,096 of their pixels, without SSIM: they cost a sixth, and all frames in part tell more about
+the mean than a few of them in whole. Scores of earlier videos measure forgetting; key frames of
+theirs are replayed against it.
+"""
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple, final
+
+import numpy as np
+from jaxtyping import UInt8
+
+from avatar.avatar_model import Avatar
+from avatar.evaluation.all_round_verdict import AllRoundVerdict
+from avatar.evaluation.coverage import Coverage, coverage_advice
+from avatar.evaluation.held_out import (
+    HeldOutFrame,
+    PixelSample,
+    coarse_to_fine_order,
+    score_fine_sample,
+    score_frame,
+    score_rendering,
+)
+from avatar.evaluation.image_metrics import better_verdict, composite_on_white, overall_verdict
+from avatar.evaluation.unfilmed_views import half_transparent_share, render_unfilmed_views
+from avatar.events import HeldOutScore
+from avatar.render import render
+from avatar.training.checkpoint import (
+    EARLIER_VIDEOS_FILE,
+    INDEX_SHIFT_PER_VIDEO,
+    LAST_RUN_FILE,
+    SavedFrames,
+    number_in_video,
+    video_age,
+)
+from avatar.training.held_out_pose_fitting import fit_test_poses
+from avatar.training.trainer import Trainer
+from instant_avatar.cli.console import Console
+from instant_avatar.report.report_schema import (
+    CurvePoint,
+    ForgettingStats,
+    finite_mean,
+    format_psnr,
+)
+from instant_avatar.run.run_folder import RunFolder
+from instant_avatar.run.snapshot_writer import PackageSnapshot
+from instant_avatar.run.stream_meter import StreamMeter
+
+SCORING_LIMIT_S = 12.0
+"""Wall time that final scoring and pose fitting aim for."""
+WHOLE_IMAGES_SHARE = 0.2
+"""Share of that time after which frames in given poses are no longer scored as whole images."""
+MIN_WHOLE_IMAGES = 3
+"""Frames that are scored as whole images, whatever it takes."""
+MAX_WHOLE_IMAGES = 12
+"""Frames that are scored as whole images, at most."""
+UNFILMED_REDUCTION = 2
+"""Factor by which pictures of views that were not filmed are reduced."""
+FRAMES_PER_FIT = 6
+"""Frames whose poses are fitted together; no more are fitted once the time is up."""
+KEPT_RENDERINGS = 6
+"""Renderings that are kept for the report's page."""
+
+WhiteImage = UInt8[np.ndarray, "height width 3"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FinalScores:
+    """Scores after the last step, in the order of the video.
+
+    Attributes:
+        given: Scores in the given poses; SSIM is NaN where not the whole image was scored.
+        sampled: Scores of the same frames by the pixels of the learning curve.
+        fitted: Scores in poses fitted to the frames, of as many frames as time allowed.
+        renderings: A few of the frames as rendered on white, by their index.
+        half_transparent: Share of half-transparent pixels in views that were not filmed, in [0, 1];
+            None if it was not measured.
+    """
+
+    given: tuple[HeldOutScore, ...] = ()
+    sampled: tuple[HeldOutScore, ...] = ()
+    fitted: tuple[HeldOutScore, ...] = ()
+    renderings: dict[int, WhiteImage] = field(default_factory=dict)
+    half_transparent: float | None = None
+
+    def summarize(self, last: CurvePoint, verdict: str | None) -> CurvePoint:
+        """The learning curve's last point with these scores, and the report's verdict."""
+        return replace(
+            last,
+            psnr=finite_mean([score.psnr for score in self.given]),
+            psnr_mask=finite_mean([score.psnr_mask for score in self.given]),
+            verdict=verdict,
+            frames=tuple((score.frame, score.psnr) for score in self.given),
+            pixels=None,
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TrainingResult:
+    """A trained avatar and how it was trained.
+
+    Attributes:
+        trainer: Holds the avatar.
+        held_out: Held-out frames that have arrived.
+        curve: Learning curve, up to the final scores.
+        meter: Timing and counts of the frame stream.
+        coverage: Skin that the training frames show.
+        frames_added: Frames of this capture that were trained on.
+        interrupted: Whether Ctrl-C ended training.
+        package: Outcome of packaging; None before `TrainingSession.bake`.
+        scores: Final scores of the held-out frames; empty before `bake`.
+        earlier_videos: Forgetting of earlier videos, if there were any.
+    """
+
+    trainer: Trainer
+    held_out: list[HeldOutFrame]
+    curve: tuple[CurvePoint, ...]
+    meter: StreamMeter
+    coverage: Coverage
+    frames_added: int
+    interrupted: bool
+    package: PackageSnapshot | None = None
+    scores: FinalScores = field(default_factory=FinalScores)
+    earlier_videos: ForgettingStats | None = None
+
+    @property
+    def is_trained(self) -> bool:
+        """Whether any step was made on any frame."""
+        return self.trainer.steps > 0 and self.frames_added > 0
+
+    def all_round_verdict(self) -> AllRoundVerdict:
+        """The verdict on the avatar from all sides, after `bake`."""
+        scores, exported = self.scores, self.package and self.package.export_report
+        return AllRoundVerdict.of(
+            better_verdict(overall_verdict(scores.given), overall_verdict(scores.fitted)),
+            seen=self.coverage.seen_share,
+            half_transparent=scores.half_transparent,
+            player_psnr=exported.psnr_to_renderer.get("hq") if exported else None,
+            film_advice=coverage_advice(self.coverage),
+        )
+
+
+class _ScoredFrame(NamedTuple):
+    """A frame in its given pose; without a rendering where a sample of it was scored."""
+
+    frame: HeldOutFrame
+    given: HeldOutScore
+    sampled: HeldOutScore
+    rendering: WhiteImage | None
+
+
+def score_finally(
+    trainer: Trainer, held_out: list[HeldOutFrame], console: Console, *, fit_poses: bool
+) -> FinalScores:
+    """Scores the held-out frames in about `SCORING_LIMIT_S`.
+
+    After a given number of steps all are scored, whatever the time: the results of such a run do
+    not depend on the machine.
+
+    Args:
+        trainer: After its last step.
+        held_out: Frames that were never trained on.
+        console: Shows the progress.
+        fit_poses: Whether to score in fitted poses, too.
+    """
+    if not held_out:
+        return FinalScores()
+    limit_s = math.inf if trainer.config.steps else SCORING_LIMIT_S
+    began, scored = time.perf_counter(), list[_ScoredFrame]()
+    with console.progress(f"scoring {len(held_out)} held-out frames", float(len(held_out))) as bar:
+        whole_until = began + WHOLE_IMAGES_SHARE * limit_s
+        for one in _score_in_given_poses(trainer.avatar, held_out, whole_until):
+            scored.append(one)
+            bar.set_count(len(scored))
+    fitted = list[HeldOutScore]()
+    if fit_poses:
+        with console.progress("fitting poses to the held-out frames", 1.0) as bar:
+            fitted += _score_in_fitted_poses(trainer, scored, began + limit_s, bar.set_share)
+    order = np.argsort([one.given.frame for one in scored])
+    shown = [one for one in scored if one.rendering is not None][:KEPT_RENDERINGS]
+    return FinalScores(
+        given=tuple(scored[i].given for i in order),
+        sampled=tuple(scored[i].sampled for i in order),
+        fitted=tuple(sorted(fitted, key=lambda score: score.frame)),
+        renderings={one.given.frame: one.rendering for one in shown if one.rendering is not None},
+        half_transparent=half_transparent_share(
+            render_unfilmed_views(trainer.avatar, reduction=UNFILMED_REDUCTION)
+        ),
+    )
+
+
+def _score_in_given_poses(
+    avatar: Avatar, held_out: list[HeldOutFrame], whole_until: float
+) -> Iterator[_ScoredFrame]:
+    """Scores frames in an order of which every prefix is spread over the video."""
+    for count, frame in enumerate(coarse_to_fine_order(held_out)):
+        late = count >= MIN_WHOLE_IMAGES and time.perf_counter() > whole_until
+        if late or count >= MAX_WHOLE_IMAGES:
+            sampled = PixelSample.of(frame).score(avatar)
+            yield _ScoredFrame(frame, score_fine_sample(avatar, frame), sampled, None)
+            continue
+        seen = frame.observation
+        picture = render(avatar, seen.pose, seen.camera, cells=frame.correspondences, shaded=True)
+        white = np.clip(composite_on_white(picture), 0.0, 1.0)
+        sampled = PixelSample.of(frame).score_rendering(picture)
+        shown = (white * 255.0 + 0.5).astype(np.uint8)
+        yield _ScoredFrame(frame, score_rendering(picture, frame), sampled, shown)
+
+
+def _score_in_fitted_poses(
+    trainer: Trainer,
+    scored: list[_ScoredFrame],
+    until: float,
+    progress: Callable[[float], None],
+) -> Iterator[HeldOutScore]:
+    """Fits frames, a few at a time, and scores them as they were in the given poses."""
+    for first in range(0, len(scored), FRAMES_PER_FIT):
+        if first and time.perf_counter() > until:
+            return
+        some = scored[first : first + FRAMES_PER_FIT]
+        fitted = fit_test_poses(trainer, [one.frame for one in some])
+        for done, (one, frame) in enumerate(zip(some, fitted, strict=True), start=first + 1):
+            score = score_fine_sample if one.rendering is None else score_frame
+            after = score(trainer.avatar, frame)
+            yield after if after.psnr >= one.given.psnr else one.given
+            progress(done / len(scored))
+
+
+@final
+class EarlierVideos:
+    """The videos that an avatar was trained on before this one.
+
+    Their key frames stay in the replay buffer and compete with new ones for its places; their
+    held-out frames measure forgetting.
+    """
+
+    def __init__(self, run: RunFolder, notes: dict[str, Any]) -> None:
+        """Load the frames of earlier videos, if there are any.
+
+        Args:
+            run: Its checkpoint folder holds the frames.
+            notes: Stored with each checkpoint; updated with what an interrupted run needs.
+        """
+        self._run, self._notes = run, notes
+        began = "before" in notes  # otherwise the file is from a run that was killed at its start
+        self._kept = (
+            SavedFrames.load(run.checkpoint / EARLIER_VIDEOS_FILE) if began else SavedFrames([], [])
+        )
+
+    @property
+    def held_out(self) -> list[HeldOutFrame]:
+        """Held-out frames of earlier videos."""
+        return self._kept.held_out
+
+    def start_new_video(self, trainer: Trainer, console: Console) -> None:
+        """Turn the previous video into an earlier one, and score its held-out frames."""
+        self._kept = SavedFrames.load(self._run.checkpoint / LAST_RUN_FILE).as_earlier_video()
+        self._kept.save(self._run.checkpoint / EARLIER_VIDEOS_FILE)
+        trainer.pose_corrections = {
+            index - INDEX_SHIFT_PER_VIDEO: correction
+            for index, correction in trainer.pose_corrections.items()
+        }
+        gains = trainer.exposures.by_frame
+        trainer.exposures.restore(
+            {index - INDEX_SHIFT_PER_VIDEO: gain for index, gain in gains.items()}
+        )
+        if not self._kept.replay_frames:
+            console.warning(
+                "The previous video's run did not finish, so its key frames were not saved: they "
+                "cannot be replayed, and forgetting cannot be measured."
+            )
+        self.restore_key_frames(trainer, console)
+        with console.status(f"scoring {len(self.held_out)} frames of the earlier video"):
+            scores = self._score_earlier_videos(trainer)
+        self._notes["before"] = {
+            "videos": [*earlier_video_names(self._notes), self._previous_video_name()],
+            "frames": trainer.frames_seen,
+            "seconds": trainer.wall_seconds,
+            "steps": trainer.steps,
+            "scores": [vars(each) for each in scores],
+        }
+
+    def restore_key_frames(self, trainer: Trainer, console: Console) -> None:
+        """Put the key frames of earlier videos back into the replay buffer."""
+        if not self._kept.replay_frames:
+            return
+        count = len(self._kept.replay_frames)
+        with console.status(f"preparing {count} frames of the earlier video"):
+            for frame in self._kept.training_frames(trainer.avatar.rig):
+                trainer.add_frame(frame, is_restored=True)
+
+    def measure_forgetting(
+        self, trainer: Trainer, held_out: list[HeldOutFrame], console: Console
+    ) -> ForgettingStats | None:
+        """Save frames for the next video; compare scores of earlier videos, if there are any.
+
+        Args:
+            trainer: After its last step.
+            held_out: Held-out frames of the current video.
+            console: Shows the result.
+
+        Raises:
+            OSError: If the disk is full.
+        """
+        kept = SavedFrames.of(trainer.replay, [*self.held_out, *held_out])
+        kept.save(self._run.checkpoint / LAST_RUN_FILE)
+        if "before" not in self._notes:
+            return None
+        history = self._notes["before"]
+        before = [each["psnr"] for each in history["scores"]]
+        after, videos = self._score_earlier_videos(trainer), earlier_video_names(self._notes)
+        drops = [was - now.psnr for was, now in zip(before, after, strict=True)]
+        note = ForgettingStats(
+            videos=videos,
+            frames_trained=history["frames"],
+            wall_seconds=history["seconds"],
+            replayed_key_frames=len(self._kept.replay_frames),
+            frames=tuple(score.frame for score in after),
+            video_of_frame=tuple(
+                len(videos) + 1 - video_age(held.observation.frame.index) for held in self.held_out
+            ),
+            psnr_before=finite_mean(before),
+            psnr_after=finite_mean([score.psnr for score in after]),
+            largest_drop=max([0.0, *drops]) if drops else None,
+        )
+        if note.psnr_after is not None:
+            console.info(
+                f"Held-out frames of the earlier video: {format_psnr(note.psnr_before, None)} "
+                f"before, {format_psnr(note.psnr_after, None)} now."
+            )
+        return note
+
+    def _previous_video_name(self) -> str:
+        """Return the file name of the previous video."""
+        return self._notes.get("name") or Path(self._notes["video"]).name
+
+    def _score_earlier_videos(self, trainer: Trainer) -> tuple[HeldOutScore, ...]:
+        """Score the held-out frames; frame numbers are those of their own video."""
+        scores = (score_frame(trainer.avatar, frame) for frame in self.held_out)
+        return tuple(replace(each, frame=number_in_video(each.frame)) for each in scores)
+
+
+def earlier_video_names(notes: dict[str, Any]) -> tuple[str, ...]:
+    """Return the names of the videos before the current one from a checkpoint's notes."""
+    return tuple(notes.get("before", {}).get("videos", ()))

@@ -1,0 +1,254 @@
+"""Arguments of ia-ingest; the text under each field is its --help."""
+
+import importlib.util
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+from tyro.conf import Positional, arg
+
+from avatar.config import HELD_OUT_STRIDE, NOMINAL_STEPS_PER_S
+from capture.input_error import InputError
+from capture.live_sources import IDLE_TIMEOUT_S, camera_address
+from instant_avatar.cli.shared_options import (
+    CaptureArguments,
+    Flag,
+    capture_name,
+    check_output_file,
+)
+from instant_avatar.run.person_tracking import needs_stream_tracking, open_stream
+from instant_avatar.run.run_folder import RunFolder, is_run_report
+from preprocess.alignment.mask_alignment import MAX_HEIGHT_CM, MIN_HEIGHT_CM
+from preprocess.capture_session import Capture, CaptureInputs
+from preprocess.fitting.capture_fit import load_capture_fit
+from preprocess.open_capture import open_capture
+from preprocess.plugins import segmenter_name
+
+PROGRAM = "ia-ingest"
+"""Name of the command."""
+
+REFERENCE_LONGER_SIDE_PX = 540
+"""Longer side of the images whose detail can be learned in `DEFAULT_SECONDS`, pixels."""
+
+DEFAULT_SECONDS = 60.0
+"""Training time without --seconds, --steps or --realtime."""
+
+MIN_SECONDS = 0.1
+"""Least --seconds; every frame is trained on at least once in any case."""
+
+VIEW_PORT = 8008
+"""Port of the live viewer where --view names none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class IngestArguments(CaptureArguments):
+    """Train an avatar from a video of one person while the video is being read.
+
+    Try it:
+
+        ia-ingest video.mp4 --out run
+
+    `run` then holds avatar.iavatar (play it: ia-play), report.json, report.html (look at it) and
+    checkpoint/. Poses and masks are found in the video by the built-in tracker (ia-track) and are
+    kept in tracking/; those of another tracker are used if they are given:
+
+        ia-ingest video.mp4 --poses poses.npz --masks masks --out run
+
+    Masks and cameras are searched for next to the video, then next to the poses, as masks/ and
+    cameras.npz; a capture folder contains everything.
+
+    Exit codes: 0 done; 1 trained, but the avatar is not usable (verdict "failed" in the report; the
+    package is written if there is anything to draw); 2 bad input; 3 disk full, device or run folder
+    busy (the checkpoint is kept); 130 Ctrl-C, after checkpoint and package, or the frames that were
+    tracked until then, were written.
+    """
+
+    video: Annotated[Positional[Path], arg(metavar="VIDEO")]
+    """Video file, folder of images, or capture folder; camera:0 for a camera, or the address of a
+    stream, as in camera:rtsp://…"""
+    tracker: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    """Another installed tracker to use where no --poses are given (default: blazepose, the built-in
+    one; docs/formats.md)."""
+    height_cm: Annotated[float | None, arg(metavar="CM", help_behavior_hint="")] = None
+    """Height of the person, barefoot. Sets the metric scale of the body, its distance and solved
+    cameras, which images alone cannot determine."""
+    out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    """Folder for the run (default: runs/NAME, named after the video)."""
+    resume: Flag = False
+    """Continue the run in --out: with the same video after an interruption, or with another one."""
+    overwrite: Flag = False
+    """Replace the run in --out, and the file that --json names. Files that ia-ingest did not write
+    are kept."""
+    seconds: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None
+    """Training time in seconds, excluding start-up (default: 60; with --realtime the clip's
+    duration)."""
+    steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Number of training steps instead of --seconds, so that the result does not depend on the
+    speed of the machine. Two cores make about 50 per second. Every frame takes at least one
+    step."""
+    realtime: Flag = False
+    """Simulate a live camera: deliver frames at their timestamps. The avatar is ready when the
+    video ends; extra --seconds continue training after the last frame."""
+    live: Flag = False
+    """VIDEO is a folder to which another program is still writing images; the person is tracked
+    while they come. The run ends with a file named DONE in the folder, after --idle-seconds without
+    a new image, after --seconds, or by Ctrl-C. A camera is live without this flag."""
+    idle_seconds: float = IDLE_TIMEOUT_S
+    """Stop a live source after this many seconds without a new image; also the limit for the first
+    one."""
+    size: Annotated[int | None, arg(metavar="PX", help_behavior_hint="")] = None
+    """Longer side of training images in pixels; never upscaled (default: 540 for 60 s, proportional
+    to the square root of --seconds). The head is learnt in the video's own resolution."""
+    hold_out: Annotated[int, arg(metavar="N", help_behavior_hint="(default: 10)")] = HELD_OUT_STRIDE
+    """Hold out every Nth frame for evaluation; 0 trains on all frames."""
+    refine_poses: Annotated[bool, arg(help_behavior_hint="")] = True
+    """Fit poses, body and focal length to the masks, and optimize the poses during training. With
+    --no-refine-poses all are taken as exact."""
+    refine_masks: Annotated[bool, arg(help_behavior_hint="")] = True
+    """Refine given masks if the pictures have stronger edges beside their borders."""
+    force: Flag = False
+    """Train even if ia-check considers poses and masks unusable."""
+    view: Annotated[int | None, arg(metavar="[PORT]", help_behavior_hint="")] = None
+    """Open a live viewer at http://127.0.0.1:PORT (default 8008): orbit the avatar, see body
+    coverage, pause training, save a package. Requires viser: pip install
+    'instant-avatar-stream[viewer]'. Ctrl-C closes it at the end."""
+    threads: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Threads of the trainer (default: one per core)."""
+    seed: int = 0
+    """Random seed."""
+    json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Write a copy of report.json to this file."""
+
+    def validate(self) -> None:
+        """Check ranges, combinations and output files.
+
+        Raises:
+            InputError: Naming the option.
+        """
+        if self.seconds is not None and not MIN_SECONDS <= self.seconds < float("inf"):
+            raise InputError(
+                f"--seconds is {self.seconds}, but must be at least {MIN_SECONDS:g} "
+                f"({DEFAULT_SECONDS:.0f} give a good avatar)."
+            )
+        if self.steps is not None and self.steps < 1:
+            raise InputError(f"--steps is {self.steps}, but must be at least 1.")
+        if self.steps is not None and self.seconds is not None:
+            raise InputError("--steps and --seconds are mutually exclusive.")
+        if self.size is not None and self.size < 16:
+            raise InputError(f"--size is {self.size}, but must be at least 16 pixels.")
+        if self.threads is not None and self.threads < 1:
+            raise InputError(f"--threads is {self.threads}, but must be at least 1.")
+        if not 0.0 < self.idle_seconds < float("inf"):
+            raise InputError(f"--idle-seconds is {self.idle_seconds}, but must be positive.")
+        if self.capture_inputs().is_live:
+            self._check_live_options()
+        if self.height_cm is not None and not MIN_HEIGHT_CM <= self.height_cm <= MAX_HEIGHT_CM:
+            raise InputError(
+                f"--height-cm is {self.height_cm}, but must lie between {MIN_HEIGHT_CM:.0f} and "
+                f"{MAX_HEIGHT_CM:.0f}."
+            )
+        if self.hold_out < 0 or self.hold_out == 1:
+            raise InputError(f"--hold-out is {self.hold_out}, but must be 0, or at least 2.")
+        if self.seed < 0:
+            raise InputError(f"--seed is {self.seed}, but must be at least 0.")
+        inputs = self.capture_inputs().input_paths()
+        if self.json is not None:
+            check_output_file(self.json, "--json", inputs, overwrite=self.may_replace_json)
+        if self.view is not None and not 0 <= self.view < 1 << 16:
+            raise InputError(f"--view is {self.view}, but must be a port from 0 to 65535.")
+        if self.view is not None and importlib.util.find_spec("viser") is None:
+            raise InputError(
+                "--view requires viser, which is not installed. Install it with: pip install "
+                "'instant-avatar-stream[viewer]' (or: pip install viser). Without --view, "
+                "report.html shows the result afterwards."
+            )
+
+    def _check_live_options(self) -> None:
+        """Refuse what only a recording can have."""
+        if self.realtime:
+            raise InputError(
+                "--realtime simulates a live camera with a recording; this source is live. Drop it."
+            )
+        if self.poses is not None:
+            raise InputError(
+                f"--poses {self.poses}: poses of a live source are tracked while its frames come, "
+                "by the built-in tracker or another installed one (--tracker NAME). Leave --poses "
+                "out, or record the frames and give them with their poses as a recording."
+            )
+        if self.masks is not None and segmenter_name(self.masks) is None:
+            raise InputError(
+                f"--masks {self.masks}: masks of a live source are tracked with its poses, or come "
+                "from an installed segmenter (segmenter:NAME) or the images' alpha channel. Leave "
+                "--masks out."
+            )
+
+    @property
+    def may_replace_json(self) -> bool:
+        """Whether --json may replace a file: with --overwrite, or if it is a report of a run."""
+        return self.overwrite or (self.json is not None and is_run_report(self.json))
+
+    def run_folder(self) -> RunFolder:
+        """Return the folder of the run."""
+        own = capture_name(self.video)
+        if camera_address(self.video) is not None:
+            own = re.sub(r"\W+", "-", str(self.video)).strip("-")
+        return RunFolder(path=self.out or Path("runs") / own)
+
+    def capture_inputs(self) -> CaptureInputs:
+        """Return the inputs to open."""
+        return replace(
+            super().capture_inputs(),
+            live=self.live,
+            tracker=self.tracker,
+            idle_s=self.idle_seconds,
+            refine_masks=self.refine_masks,
+            height_m=None if self.height_cm is None else self.height_cm / 100.0,
+        )
+
+    def open_capture(self) -> Capture:
+        """Open the capture that the arguments name."""
+        run = self.run_folder()
+        resumes = self.resume and run.has_checkpoint() and run.body_file.is_file()
+        if self.tracks_stream:
+            person = run.body_file if resumes else None
+            recording = open_stream(self.capture_inputs(), run.tracked_poses, person)
+            size_px = self.size or trainable_longer_side_px(self.training_seconds(recording))
+            return replace(recording, size_px=size_px)
+        recording = open_capture(self.capture_inputs())
+        if resumes:
+            fit = load_capture_fit(run.fit_file, recording.identity)
+            if fit is None or not fit.fits_body:
+                recording = open_capture(self.capture_inputs(), avatar_body=run.body_file)
+        size_px = self.size or trainable_longer_side_px(self.training_seconds(recording))
+        recording = replace(recording, size_px=size_px)
+        return recording.in_real_time() if self.realtime else recording
+
+    @property
+    def tracks_stream(self) -> bool:
+        """Whether poses are missing and must be tracked while frames come."""
+        return needs_stream_tracking(self.capture_inputs(), realtime=self.realtime)
+
+    def training_seconds(self, recording: Capture) -> float:
+        """Return the training time: as given, else the clip's duration, else a minute.
+
+        With --steps it is nominal: it sets the level of detail, not the end of training.
+        """
+        if self.steps is not None:
+            return self.steps / NOMINAL_STEPS_PER_S
+        if self.seconds is not None:
+            return self.seconds
+        duration_s = recording.source.duration_s
+        return duration_s if self.realtime and duration_s else DEFAULT_SECONDS
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the arguments as report.json stores them."""
+        return {
+            name: str(value) if isinstance(value, Path) else value
+            for name, value in vars(self).items()
+        }
+
+
+def trainable_longer_side_px(seconds: float) -> int:
+    """Return the longer side, in pixels, of images whose detail can be learned in `seconds`."""
+    return max(256, round(REFERENCE_LONGER_SIDE_PX * (seconds / 60.0) ** 0.5))

@@ -1,0 +1,368 @@
+"""Tracks the person of a recording, fits poses, body and camera, and writes them as files."""
+
+import os
+import shutil
+import threading
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from capture.atomic_files import OutputFileList, atomic_file, atomic_folder
+from capture.input_error import InputError
+from capture.source import FrameSource
+from capture.source_opening import open_source
+from instant_avatar.cli.console import Console
+from preprocess.alignment.capture_geometry import CaptureGeometry
+from preprocess.alignment.silhouette_objective import sample_masks
+from preprocess.body.body_pose import Motion
+from preprocess.body.body_surface import SkinPoints
+from preprocess.body.parametric_body import load_body_model
+from preprocess.cameras.camera_orientation import assume_camera
+from preprocess.capture_paths import find_own_masks, find_own_poses
+from preprocess.capture_session import Capture, CaptureInputs
+from preprocess.fitting.capture_fitting import fit_capture, fitted_motion
+from preprocess.masks.mask_files import open_masks
+from preprocess.masks.mask_refinement import MaskRefiner
+from preprocess.observation import associate_cameras, associate_masks
+from preprocess.open_capture import open_capture, open_tracked_stream
+from preprocess.plugins import DEFAULT_TRACKER, PersonTracker, make_tracker, segmenter_name
+from preprocess.poses.pose_file import read_motion, write_motion
+from preprocess.tracking.keypoints import KeypointTrack
+from preprocess.tracking.pose_lift import lift_keypoints
+from preprocess.tracking.tracking_grade import TrackingGrade, grade_tracking
+from preprocess.tracking.video_tracking import TrackedVideo, track_video
+
+GRADED_FRAMES = 60
+"""Frames, evenly spread, whose masks are compared with the body."""
+MAX_PRINTED_STRETCHES = 8
+"""Doubtful stretches that are printed; reports hold all of them."""
+MAX_FRAMES = 600
+"""Most frames that are tracked unless --frames says which; of longer videos every nth."""
+
+SAME_PERSON = 0.15
+"""Mean distance of one person's key points, found twice in a frame, in the person's size."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PersonTracking:
+    """The tracked person of a recording.
+
+    Attributes:
+        capture: The recording with poses, masks, camera and body, fitted to each other.
+        inputs: What opens the same from the files that were written.
+        grade: How good the poses are.
+        interrupted: Whether tracking was stopped before the last frame.
+    """
+
+    capture: Capture
+    inputs: CaptureInputs
+    grade: TrackingGrade
+    interrupted: bool
+
+
+def needs_tracking(inputs: CaptureInputs) -> bool:
+    """Whether a recording comes without poses, so that its person must be tracked."""
+    if inputs.is_live or inputs.poses is not None:
+        return False
+    return inputs.video.exists() and find_own_poses(inputs.video) is None
+
+
+def needs_stream_tracking(inputs: CaptureInputs, *, realtime: bool) -> bool:
+    """Whether the person must be tracked while frames come.
+
+    Args:
+        inputs: What the user named.
+        realtime: Whether a recording is played at its own speed.
+    """
+    return inputs.is_live or (realtime and needs_tracking(inputs))
+
+
+def open_stream(inputs: CaptureInputs, poses: Path, avatar_body: Path | None = None) -> Capture:
+    """Open a stream without poses with this project's tracker; see `open_tracked_stream`.
+
+    Raises:
+        InputError: If it or masks that were named cannot be read, or no person is found in it.
+    """
+    tracker = make_tracker(inputs.tracker or DEFAULT_TRACKER, person_number(inputs.person))
+    return open_tracked_stream(inputs, tracker, MaskRefiner, poses, avatar_body=avatar_body)
+
+
+def limit_frames(inputs: CaptureInputs, source: FrameSource) -> CaptureInputs:
+    """Choose every nth frame of a long recording, unless the user chose some."""
+    count = source.frame_count or 0
+    if inputs.frames is not None or count <= MAX_FRAMES:
+        return inputs
+    return replace(inputs, frames=slice(None, None, -(-count // MAX_FRAMES)))
+
+
+def track_person(
+    inputs: CaptureInputs,
+    poses: Path,
+    console: Console,
+    *,
+    stop: threading.Event | None = None,
+    resume: bool = False,
+) -> PersonTracking:
+    """Track the person, and write poses and masks.
+
+    Masks that were given, or lie beside the video, are used instead of tracked ones (see
+    `masks_to_use`); so are cameras.
+
+    Args:
+        inputs: A recording without poses.
+        poses: File to write; masks are written to the folder masks/ beside it.
+        console: Shows progress.
+        stop: Ends tracking early once it is set; what was found until then is written.
+        resume: Whether `poses` and its masks hold the first frames, after which to go on.
+
+    Raises:
+        InputError: If the recording cannot be read, or no person is found in it.
+        KeyboardInterrupt: If it was stopped before the person was found.
+        OSError: If the files cannot be written.
+    """
+    inputs = limit_frames(inputs, open_source(inputs.video, frames=inputs.frames))
+    source = open_source(inputs.video, frames=inputs.frames)
+    folder = poses.parent / "masks"
+    given = masks_to_use(inputs, folder)
+    own_masks = not source.has_alpha and given is None
+    if given is not None and inputs.masks is None:
+        console.info(f"Using the masks in {given}, which lie beside the video.")
+    _check_parts(source, inputs, given)
+    with atomic_folder(folder) if own_masks else nullcontext() as part:
+        before = _earlier_frames(source, poses, part) if resume else None
+        tracked = _run_networks(source, inputs, part, console, stop, before)
+        for warning in source.warnings:
+            console.warning(warning)
+        if tracked.interrupted:  # the frames after it have no masks
+            inputs = replace(inputs, frames=_frames_up_to(source, max(tracked.frame_times_s)))
+            source = open_source(inputs.video, frames=inputs.frames)
+        with console.status("fitting body and poses to key points and masks"):
+            capture = fit_tracked_video(source, tracked, inputs, part)
+            grade = _grade(capture, tracked.frame_times_s)
+            capture = replace(capture, motion=_without(capture.motion, grade.left_out))
+        with atomic_file(poses) as unfinished:
+            write_motion(unfinished, capture.motion)
+    inputs = replace(inputs, poses=poses, person=None)
+    if own_masks:
+        capture = replace(capture, masks=open_masks(folder, invert=False))
+        if segmenter_name(inputs.masks) is None:  # else it makes the masks to learn from
+            inputs = replace(inputs, masks=folder, invert_masks=False)
+    return PersonTracking(
+        capture=capture, inputs=inputs, grade=grade, interrupted=tracked.interrupted
+    )
+
+
+def _check_parts(source: FrameSource, inputs: CaptureInputs, masks: Path | None) -> None:
+    """Open body, camera and masks that the user named, before minutes of tracking.
+
+    Raises:
+        InputError: If one cannot be used.
+    """
+    load_body_model(inputs.body)
+    assume_camera(inputs.video, inputs.cameras, source)
+    if masks is not None:
+        associate_masks(open_masks(masks, invert=False), source)
+
+
+def _frames_up_to(source: FrameSource, last: int) -> slice:
+    """The wanted frames up to one of them."""
+    return slice(source.selection.start, last + 1, source.selection.step)
+
+
+def masks_to_use(inputs: CaptureInputs, written: Path) -> Path | None:
+    """Masks that the user named, or that lie beside the video; None if they are to be tracked.
+
+    Args:
+        inputs: A recording without poses.
+        written: Folder of tracked masks; older ones in it are replaced, not used.
+    """
+    if segmenter_name(inputs.masks) is not None:
+        return None
+    found = inputs.masks or find_own_masks(inputs.video)
+    if inputs.masks is not None or found is None:
+        return found
+    is_own = next(OutputFileList(found).foreign_files(), None) is None
+    return None if is_own and os.path.realpath(found) == os.path.realpath(written) else found
+
+
+def _run_networks(
+    source: FrameSource,
+    inputs: CaptureInputs,
+    mask_folder: Path | None,
+    console: Console,
+    stop: threading.Event | None,
+    before: TrackedVideo | None,
+) -> TrackedVideo:
+    """Find key points and masks in each frame, or in each after those that were tracked before."""
+    name, person = inputs.tracker or DEFAULT_TRACKER, person_number(inputs.person)
+    tracker, total, chosen = make_tracker(name, person), source.frame_count, source.selection
+    if before is not None and _finds_again(tracker, source, before.keypoints):
+        after = int(before.keypoints.frames[-1]) + chosen.step
+        source = open_source(inputs.video, frames=slice(after, chosen.stop, chosen.step))
+    elif before is not None:  # someone else, from here on
+        tracker, before = make_tracker(name, person), None
+    done = 0 if before is None else len(before.frame_times_s)
+    with console.progress("tracking the person", float(total or 1)) as bar:
+        try:
+            return track_video(
+                source,
+                tracker,
+                MaskRefiner(source.size_px),
+                mask_folder,
+                advance=lambda count: bar.set_count(done + count),
+                stop=stop,
+                before=before,
+            )
+        except InputError:
+            if stop is not None and stop.is_set():  # too early to tell
+                raise KeyboardInterrupt from None
+            raise
+
+
+def _earlier_frames(
+    source: FrameSource, poses: Path, mask_folder: Path | None
+) -> TrackedVideo | None:
+    """What was tracked up to the last frame with the person; its masks are copied.
+
+    None if it is of another size, or masks are missing.
+    """
+    keypoints = read_motion(poses).keypoints
+    if keypoints is None or keypoints.times_s is None or keypoints.size_px != source.size_px:
+        return None
+    last = int(keypoints.frames[-1])
+    times = {number: at for number, at in _even_frame_times(source).items() if number <= last}
+    names = [f"{number:06d}.png" for number in times] if mask_folder is not None else []
+    stored = poses.parent / "masks"
+    if not all((stored / name).is_file() for name in names):
+        return None
+    for name in names:
+        assert mask_folder is not None
+        shutil.copyfile(stored / name, mask_folder / name)
+    times |= dict(zip(keypoints.frames.tolist(), keypoints.times_s.tolist(), strict=True))
+    return TrackedVideo(keypoints=keypoints, frame_times_s=times, interrupted=True)
+
+
+def _finds_again(tracker: PersonTracker, source: FrameSource, keypoints: KeypointTrack) -> bool:
+    """Whether a new tracker takes up the same person in the last frame that was tracked."""
+    last = int(keypoints.frames[-1])
+    frame = next(iter(open_source(source.path, frames=slice(last, last + 1)).frames()), None)
+    found = None if frame is None else tracker(frame.rgb)
+    if found is None:
+        return False
+    apart = np.linalg.norm(found.image_px - keypoints.image_px[-1], axis=1).mean()
+    return bool(apart < SAME_PERSON * np.ptp(keypoints.image_px[-1], axis=0).max())
+
+
+def fit_tracked_video(
+    source: FrameSource, tracked: TrackedVideo, inputs: CaptureInputs, masks: Path | None
+) -> Capture:
+    """The recording with poses lifted from the key points and fitted to them and to the masks.
+
+    Args:
+        source: The recording.
+        tracked: What the networks found in it.
+        inputs: What the user named.
+        masks: Folder of tracked masks; None if others are used.
+
+    Raises:
+        InputError: If the parts cannot be opened.
+    """
+    shaped = load_body_model(inputs.body).with_shape()
+    lifted = lift_keypoints(
+        tracked.keypoints, shaped, assume_camera(inputs.video, inputs.cameras, source)
+    )
+    lifted = replace(lifted, space="camera")
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "poses.npz"
+        write_motion(path, lifted)
+        there = replace(inputs, poses=path, person=None, height_m=None)
+        if masks is not None:
+            there = replace(there, masks=masks, invert_masks=False)
+        capture = open_capture(there, skip_checks=True)
+        fit = fit_capture(capture)
+    if fit is None:
+        return capture
+    return replace(
+        capture,
+        motion=fitted_motion(capture, fit),
+        cameras=fit.scale_focal_lengths(capture.cameras),
+        shaped=fit.shape(capture.shaped),
+    )
+
+
+def _without(motion: Motion, frames: Sequence[int]) -> Motion:
+    """The motion with the poses of some frames marked as not valid."""
+    if motion.frames is None:
+        return motion
+    return replace(motion, valid=motion.valid & ~np.isin(motion.frames, list(frames)))
+
+
+def person_number(person: str | None) -> int | None:
+    """The number in --person, by which persons of a video without poses are named.
+
+    Raises:
+        InputError: If it is none.
+    """
+    if person is not None and not person.isdecimal():
+        raise InputError(
+            f"--person is {person!r}, but the video comes without poses: expected a number counted "
+            "from left to right, from 1."
+        )
+    return None if person is None else int(person)
+
+
+def grade_capture(capture: Capture) -> TrackingGrade | None:
+    """Grade poses that hold the key points that they were made of; None if they do not."""
+    if capture.motion.keypoints is None:
+        return None
+    return _grade(capture, _even_frame_times(capture.source))
+
+
+def _grade(capture: Capture, frame_times_s: Mapping[int, float]) -> TrackingGrade:
+    """Grade tracked poses.
+
+    Args:
+        capture: The recording, with masks and tracked poses.
+        frame_times_s: Time of each frame that was looked at, by its number.
+    """
+    source, keypoints = capture.source, capture.motion.keypoints
+    assert keypoints is not None
+    sampled = sample_masks(
+        source,
+        capture.masks,
+        associate_masks(capture.masks, source),
+        associate_cameras(capture.cameras, source),
+        SkinPoints.of(capture.shaped),
+        count=GRADED_FRAMES,
+        excluded_frames=capture.cameras.frames_without_camera,
+    )
+    scores = sampled.frame_scores(CaptureGeometry.of(capture.motion, capture.cameras, source))
+    return grade_tracking(
+        capture.motion,
+        keypoints,
+        capture.shaped,
+        capture.cameras[0],
+        frame_times_s,
+        {each.index: float(score) for each, score in zip(sampled.samples, scores, strict=True)},
+    )
+
+
+def _even_frame_times(source: FrameSource) -> dict[int, float]:
+    """Times of the wanted frames of a recording with an even rate, by their numbers."""
+    count, chosen = source.frame_count or 0, source.selection
+    step_s = (source.duration_s or 0.0) / max(1, chosen.span(source.frames_in_file))
+    numbers = [chosen.start + chosen.step * place for place in range(count)]
+    return {number: number * step_s for number in numbers}
+
+
+def print_grade(grade: TrackingGrade, console: Console) -> None:
+    """Print the doubtful stretches and the verdict."""
+    for each in grade.stretches[:MAX_PRINTED_STRETCHES]:
+        console.info(f"  doubtful: {each.describe()}")
+    if len(grade.stretches) > MAX_PRINTED_STRETCHES:
+        console.info(f"  … and {len(grade.stretches) - MAX_PRINTED_STRETCHES} more")
+    console.info(grade.describe())

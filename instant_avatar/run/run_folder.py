@@ -1,0 +1,299 @@
+"""Folder of a run: its files, which of them ia-ingest wrote, and the lock of its process."""
+
+import errno
+import json
+import os
+import shlex
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from filelock import BaseFileLock, FileLock, Timeout
+
+from capture.atomic_files import RESERVED_PREFIX, OutputFileList
+from capture.input_error import InputError
+from instant_avatar.cli.command_line import RESOURCE_UNAVAILABLE, CommandExit
+from instant_avatar.cli.console import Console
+from instant_avatar.cli.shared_options import (
+    check_disjoint_from_inputs,
+    check_writable,
+    unused_path,
+)
+
+LOCK_FILE_NAME = f"{RESERVED_PREFIX}lock"
+"""Name of the locked file in a folder."""
+NO_LOCKS_ERRNOS = frozenset({errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP})
+"""Errors of file systems without locks."""
+
+
+@contextmanager
+def claim_folder(folder: Path, console: Console) -> Iterator[None]:
+    """Create and lock a folder during a block; remove the folders it made if they stayed empty.
+
+    After `kill -9` the lock file remains, but not the lock. File systems without locks cause a
+    warning.
+
+    Args:
+        folder: The folder.
+        console: Shows warnings.
+
+    Raises:
+        CommandExit: If another process has locked it.
+    """
+    made = [each for each in (folder, *folder.parents) if not each.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / LOCK_FILE_NAME, timeout=0.0)
+    try:
+        _acquire(lock, folder, console)
+        yield
+    finally:
+        if lock.is_locked:
+            with suppress(OSError):  # Windows, where releasing it removes it
+                Path(lock.lock_file).unlink()
+            lock.release()
+        for each in made:
+            with suppress(OSError):  # not empty
+                each.rmdir()
+
+
+def _acquire(lock: BaseFileLock, folder: Path, console: Console) -> None:
+    try:
+        lock.acquire()
+    except Timeout:
+        raise CommandExit(
+            f"Another command is writing into {folder}. Wait until it ends, or choose another "
+            "folder (--out).",
+            RESOURCE_UNAVAILABLE,
+        ) from None
+    except OSError as error:
+        if error.errno not in NO_LOCKS_ERRNOS:
+            raise
+        console.warning(
+            f"The file system of {folder} has no locks ({error.strerror}): make sure that no other "
+            "command writes into this folder at the same time."
+        )
+
+
+STATE_FILE = "state.pt"
+"""Trainer and avatar, in checkpoint/."""
+CHECKPOINT_FILES = (STATE_FILE, "person.npz", "fit.npz", "frames.tensors", "earlier.tensors")
+"""Files that ia-ingest writes into checkpoint/."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunFolder:
+    """A folder that holds one run of ia-ingest.
+
+    Files that the user puts there stay.
+
+    Attributes:
+        path: The folder.
+    """
+
+    path: Path
+
+    @property
+    def package(self) -> Path:
+        """The package with the avatar."""
+        return self.path / "avatar.iavatar"
+
+    @property
+    def report_json(self) -> Path:
+        """The report for machines."""
+        return self.path / "report.json"
+
+    @property
+    def report_html(self) -> Path:
+        """The report as a page."""
+        return self.path / "report.html"
+
+    @property
+    def animation(self) -> Path:
+        """The avatar in novel poses, as the report shows it."""
+        return self.path / "turning.webp"
+
+    @property
+    def checkpoint(self) -> Path:
+        """The folder from which training can continue."""
+        return self.path / "checkpoint"
+
+    @property
+    def body_file(self) -> Path:
+        """The body of the avatar, for videos that are added later."""
+        return self.checkpoint / "person.npz"
+
+    @property
+    def fit_file(self) -> Path:
+        """What was fitted to the masks of the last video."""
+        return self.checkpoint / "fit.npz"
+
+    @property
+    def cameras(self) -> Path:
+        """Solved cameras."""
+        return self.path / "cameras.npz"
+
+    @property
+    def poses(self) -> Path:
+        """Poses in the world of the solved cameras."""
+        return self.path / "poses.npz"
+
+    @property
+    def tracking(self) -> Path:
+        """Folder of the poses and masks that were tracked in the video, if none were given."""
+        return self.path / "tracking"
+
+    @property
+    def tracked_poses(self) -> Path:
+        """The poses that were tracked in the video."""
+        return self.tracking / "poses.npz"
+
+    @property
+    def tracking_grade(self) -> Path:
+        """Grades of the tracked poses, and what they were tracked for."""
+        return self.tracking / "grade.json"
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """All files that a run may write."""
+        top = (self.package, self.report_json, self.report_html, self.animation)
+        top += (self.cameras, self.poses)
+        return (*top, *(self.checkpoint / name for name in CHECKPOINT_FILES))
+
+    def has_run(self) -> bool:
+        """Whether any file of a run exists."""
+        return any(path.exists() for path in self.files)
+
+    def has_checkpoint(self) -> bool:
+        """Whether training can continue from here."""
+        return (self.checkpoint / STATE_FILE).is_file()
+
+    def check_usable(self, inputs: Iterable[Path], *, resume: bool, overwrite: bool) -> None:
+        """Check that a run can be written here; nothing is created yet.
+
+        Args:
+            inputs: Files and folders that the run reads.
+            resume: Whether to continue an existing run.
+            overwrite: Whether to replace an existing run.
+
+        Raises:
+            InputError: If the path is a file, overlaps an input, holds files of others but no run,
+                or others where a run writes, or cannot be written to.
+        """
+        if resume and overwrite:
+            raise InputError("--resume and --overwrite are mutually exclusive.")
+        if self.path.exists() and not self.path.is_dir():
+            raise InputError(f"{self.path} is a file; --out names the folder that holds the run.")
+        check_disjoint_from_inputs(self.path, "--out", inputs)
+        marker, free = OutputFileList(self.path), shlex.quote(str(unused_path(self.path)))
+        if marker.owns("grade.json"):
+            raise InputError(
+                f"{self.path} holds poses that ia-track wrote. Choose another folder: --out {free}"
+            )
+        foreign = self._foreign_file()
+        if foreign is not None:
+            raise InputError(
+                f"{foreign} was not written by ia-ingest. Move it, or choose an empty or new "
+                f"folder: --out {free}"
+            )
+        if resume and not marker.exists():
+            raise InputError(
+                f"No run to --resume in {self.path}. To start a new run, omit --resume."
+            )
+        check_writable(self.path, "--out")
+
+    @contextmanager
+    def claim(self, console: Console, *, resume: bool, overwrite: bool) -> Iterator[None]:
+        """Create, lock and mark the folder during a block; remove it if it stayed empty.
+
+        Args:
+            console: Shows warnings.
+            resume: Whether to continue an existing run.
+            overwrite: Whether to replace an existing run.
+
+        Raises:
+            InputError: If a run exists and neither flag is given.
+            CommandExit: If another run is writing here.
+        """
+        with claim_folder(self.path, console):
+            if self.has_run() and not (resume or overwrite):
+                raise InputError(
+                    f"{self.path} already holds a run. Continue it (--resume), replace it "
+                    "(--overwrite), or choose another folder (--out)."
+                )
+            OutputFileList(self.path).create()
+            try:
+                yield
+            finally:
+                self.remove_empty_folders()
+
+    def start_run(self, *, resume: bool) -> None:
+        """Mark the folders as ours; remove an older run unless it is resumed.
+
+        Call it once the inputs have been found good.
+
+        Raises:
+            InputError: If foreign files have appeared since `check_usable`.
+        """
+        self.checkpoint.mkdir(parents=True, exist_ok=True)
+        for folder in (self.path, self.checkpoint):
+            OutputFileList(folder).create()
+            OutputFileList(folder).remove_temporaries()
+        for path in () if resume else self.files:
+            self.remove(path)
+
+    def remove(self, path: Path) -> None:
+        """Remove one of the run's files.
+
+        Raises:
+            InputError: If ia-ingest did not write the file.
+        """
+        if not OutputFileList(path.parent).remove(path.name):
+            raise InputError(f"{path} was not written by ia-ingest; it was kept.")
+
+    def describe_remaining_files(self) -> str:
+        """Tell what an interrupted run has left, and how to continue."""
+        files = (self.package, self.report_json, self.report_html, self.cameras, self.poses)
+        names = [path.name for path in files if path.exists()]
+        held = f"{self.path} holds {', '.join(names)}." if names else ""
+        if not self.has_checkpoint() and self.package.exists():
+            return f"{held} Without a checkpoint the avatar can be played but not trained further."
+        if not self.has_checkpoint():
+            return held or f"Nothing was written to {self.path}."
+        return (
+            f"{held} The newest checkpoint is kept in {self.checkpoint}: to continue from it, run "
+            "the same command with --resume instead of --overwrite."
+        ).lstrip()
+
+    def release(self) -> None:
+        """Release a claimed folder where the process is about to exit without unwinding."""
+        (self.path / LOCK_FILE_NAME).unlink(missing_ok=True)
+        self.remove_empty_folders()
+
+    def remove_empty_folders(self) -> None:
+        """Remove folders that nothing was written to."""
+        for folder in (self.checkpoint, self.path):
+            OutputFileList(folder).remove_if_empty()
+            with suppress(OSError):  # not empty, or missing
+                folder.rmdir()
+
+    def _foreign_file(self) -> Path | None:
+        """Return a foreign file that forbids a run here; None if there is none."""
+        if not OutputFileList(self.path).exists():
+            files = sorted(self.path.iterdir()) if self.path.exists() else []
+            return next((f for f in files if not f.name.startswith(RESERVED_PREFIX)), None)
+        for path in (*self.files, self.tracked_poses, self.tracking_grade):
+            if os.path.lexists(path) and not OutputFileList(path.parent).owns(path.name):
+                return path
+        folders = (self.checkpoint, self.tracking)
+        return next((f for f in folders if os.path.lexists(f) and not f.is_dir()), None)
+
+
+def is_run_report(path: Path) -> bool:
+    """Whether a file is a report.json of ia-ingest."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    keys = {"format", "command", "recipe", "machine", "training", "held_out"}
+    return isinstance(content, dict) and keys <= content.keys()

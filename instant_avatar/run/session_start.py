@@ -1,0 +1,280 @@
+"""Start of a training session: threads, kernels, a new, resumed or extended trainer, the viewer."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numba
+import numpy as np
+import torch
+
+from avatar.config import HELD_OUT_STRIDE, TrainConfig
+from avatar.evaluation.all_round_verdict import SEEN
+from avatar.evaluation.coverage import coverage_advice, expected_coverage
+from avatar.rig import Rig
+from avatar.training import checkpoint, train
+from avatar.training.trainer import Trainer
+from capture.input_error import InputError
+from export.bake import proxy_surface
+from instant_avatar.cli.command_line import exit_on_interrupt, stop_on_interrupt
+from instant_avatar.cli.console import Console
+from instant_avatar.cli.hardware import usable_cores
+from instant_avatar.run.final_scoring import EarlierVideos
+from instant_avatar.run.ingest_arguments import PROGRAM, IngestArguments
+from instant_avatar.run.missing_inputs import remove_unused_tracking
+from instant_avatar.run.run_folder import RunFolder
+from instant_avatar.run.training_session import TrainingSession
+from preprocess.capture_session import Capture
+
+
+def set_threads(requested: int | None) -> int:
+    """Set the threads of torch and numba: as requested, else one per usable core.
+
+    Returns:
+        The number of threads; numba cannot exceed the number it started with.
+    """
+    threads = max(1, min(requested or usable_cores(), numba.get_num_threads()))
+    torch.set_num_threads(threads)
+    numba.set_num_threads(threads)
+    return threads
+
+
+if TYPE_CHECKING:  # viser is an optional extra
+    from instant_avatar.run.live_viewer import LiveViewer
+
+EXPECTED_POSES = 60
+"""Poses, evenly spread, that tell what a film will show of the person."""
+JOINT_TOLERANCE_M = 1e-3
+"""Largest difference of rest joints within one body, metres; more is another body."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PreparedTrainer:
+    """A trainer that is ready for the frames of a capture.
+
+    Attributes:
+        trainer: New, or from the run's checkpoint.
+        restore_count: Frames of this video that the trainer was trained on before.
+        notes: Stored with each checkpoint.
+    """
+
+    trainer: Trainer
+    restore_count: int
+    notes: dict[str, Any]
+
+
+def prepare_trainer(
+    arguments: IngestArguments, capture: Capture, run: RunFolder, console: Console
+) -> PreparedTrainer:
+    """Build a new trainer, or load the run's checkpoint to resume it or to add a video.
+
+    Raises:
+        InputError: If the checkpoint cannot be read, or belongs to another body.
+    """
+    if arguments.resume and run.has_checkpoint():
+        prepared = _load_trainer(arguments, capture, run, console)
+    else:
+        if arguments.resume:
+            console.info(f"No checkpoint in {run.path}; starting a new run.")
+        prepared = _new_run(arguments, capture)
+    with console.status("compiling kernels (slow on the first run only)"):
+        train.warm_up(prepared.trainer)
+        proxy_surface.warm_up()
+    _announce_coverage(capture, console)
+    _announce_duration(prepared.trainer, console)
+    return prepared
+
+
+@contextmanager
+def start_session(
+    arguments: IngestArguments, capture: Capture, run: RunFolder, console: Console
+) -> Iterator[TrainingSession]:
+    """Prepare trainer and viewer, start the run, and yield its session.
+
+    Ctrl-C asks the session to stop. A viewer stays open after the block until Ctrl-C.
+
+    Raises:
+        InputError: If the checkpoint cannot be read, or belongs to another body.
+    """
+    with exit_on_interrupt(console, PROGRAM, run.release):
+        start = prepare_trainer(arguments, capture, run, console)
+        viewer = _open_viewer(arguments, capture, run, console)
+    run.start_run(resume=arguments.resume)
+    remove_unused_tracking(arguments, run)
+    try:
+        with stop_on_interrupt(console) as stop:
+            session = TrainingSession(
+                start.trainer, capture, run, console, stop, start.notes,
+                observers=() if viewer is None else (viewer,), restore_count=start.restore_count,
+            )  # fmt: skip
+            yield session
+        if viewer is not None and not stop.is_set():
+            console.info(f"The viewer stays open at {viewer.page.address}. Ctrl-C closes it.")
+            viewer.serve_until_interrupt(session)
+    except (OSError, KeyboardInterrupt) as error:
+        error.add_note(run.describe_remaining_files())
+        raise
+    finally:
+        if viewer is not None:
+            viewer.close()
+
+
+def _open_viewer(
+    arguments: IngestArguments, capture: Capture, run: RunFolder, console: Console
+) -> "LiveViewer | None":
+    """Open the live viewer if --view asks for it."""
+    if arguments.view is None:
+        return None
+    from instant_avatar.run.live_viewer import LiveViewer
+
+    return LiveViewer(capture, run, console, arguments.view)
+
+
+def new_trainer(
+    recording: Capture,
+    *,
+    seconds: float,
+    steps: int | None = None,
+    seed: int,
+    refine_poses: bool,
+    hold_every: int = HELD_OUT_STRIDE,
+) -> Trainer:
+    """Build an untrained trainer for the person, the training budget and the image size."""
+    config = TrainConfig.for_budget(
+        seconds,
+        steps=steps,
+        footprint_m=recording.pixel_footprint_m(),
+        filmed_footprint_m=recording.pixel_footprint_m(as_filmed=True),
+        pose_uncertainty=recording.pose_uncertainty,
+        held_out_stride=hold_every,
+        seed=seed,
+    )
+    config = replace(config, refine_poses=refine_poses)
+    return Trainer(Rig.from_shaped_body(recording.shaped), config)
+
+
+def _new_run(arguments: IngestArguments, capture: Capture) -> PreparedTrainer:
+    trainer = new_trainer(
+        capture,
+        seconds=arguments.training_seconds(capture),
+        steps=arguments.steps,
+        seed=arguments.seed,
+        refine_poses=arguments.refine_poses,
+        hold_every=arguments.hold_out,
+    )
+    notes = {"video": capture.identity, "name": capture.paths.video.name}
+    return PreparedTrainer(trainer=trainer, restore_count=0, notes=notes)
+
+
+def _load_trainer(
+    arguments: IngestArguments, capture: Capture, run: RunFolder, console: Console
+) -> PreparedTrainer:
+    """Load the checkpoint: the same video continues, another one is added."""
+    trainer, notes = checkpoint.load(run.checkpoint)
+    _check_same_body(trainer, capture, run)
+    earlier = EarlierVideos(run, notes)
+    if notes.get("video") == capture.identity:
+        return _resume_video(arguments, capture, trainer, earlier, notes, console)
+    return _add_video(arguments, capture, trainer, earlier, notes, console)
+
+
+def _resume_video(
+    arguments: IngestArguments,
+    capture: Capture,
+    trainer: Trainer,
+    earlier: EarlierVideos,
+    notes: dict[str, Any],
+    console: Console,
+) -> PreparedTrainer:
+    before = notes.get("before", {"frames": 0, "seconds": 0.0, "steps": 0})
+    unit, budget, spent = _budget(arguments, capture, trainer)
+    restore_count = trainer.frames_seen - before["frames"]
+    spent -= before[unit]
+    console.info(f"Resuming after {spent:.0f} {unit} of training.")
+    if spent >= budget:
+        console.warning(
+            f"This run has used {spent:.0f} of {budget:.0f} {unit}; only package and report will "
+            f"be rewritten. Increase --{unit} to continue training."
+        )
+    earlier.restore_key_frames(trainer, console)
+    _extend_budget(trainer, arguments, capture, float(before[unit]))
+    return PreparedTrainer(trainer=trainer, restore_count=restore_count, notes=notes)
+
+
+def _add_video(
+    arguments: IngestArguments,
+    capture: Capture,
+    trainer: Trainer,
+    earlier: EarlierVideos,
+    notes: dict[str, Any],
+    console: Console,
+) -> PreparedTrainer:
+    unit, _, spent = _budget(arguments, capture, trainer)
+    console.info(f"Adding another video to an avatar with {spent:.0f} {unit} of training.")
+    earlier.start_new_video(trainer, console)
+    notes["name"], notes["video"] = capture.paths.video.name, capture.identity
+    _extend_budget(trainer, arguments, capture, spent)
+    return PreparedTrainer(trainer=trainer, restore_count=0, notes=notes)
+
+
+def _budget(
+    arguments: IngestArguments, capture: Capture, trainer: Trainer
+) -> tuple[str, float, float]:
+    """Return the unit of the training budget, the budget, and what the trainer has used of it."""
+    if arguments.steps is None:
+        return "seconds", arguments.training_seconds(capture), trainer.wall_seconds
+    return "steps", float(arguments.steps), float(trainer.steps)
+
+
+def _extend_budget(
+    trainer: Trainer, arguments: IngestArguments, capture: Capture, earlier: float
+) -> None:
+    """Add the budget of this command to what earlier videos have used."""
+    trainer.config = replace(
+        trainer.config,
+        seconds=arguments.training_seconds(capture) + earlier,
+        steps=None if arguments.steps is None else arguments.steps + int(earlier),
+        refine_poses=arguments.refine_poses,
+    )
+
+
+def _check_same_body(trainer: Trainer, capture: Capture, run: RunFolder) -> None:
+    """Refuse poses of another body than the checkpoint's."""
+    difference_m = abs(trainer.avatar.rig.rest_joints - capture.shaped.joints).max()
+    if difference_m > JOINT_TOLERANCE_M:
+        raise InputError(
+            f"The poses use a different body than the avatar in {run.path} (rest joints differ by "
+            f"up to {100.0 * difference_m:.1f} cm), and {run.body_file.name} is missing. Retrain "
+            "with --overwrite."
+        )
+
+
+def _announce_coverage(capture: Capture, console: Console) -> None:
+    """Print what a recording will not show of the person; nothing of one seen from all sides."""
+    frames, selection = capture.geometry().row_frames, capture.source.selection
+    rows = np.flatnonzero(capture.motion.valid & np.isfinite(frames)).tolist()
+    wanted = [row for row in rows if selection.contains(round(frames[row]))]
+    if capture.live is not None or not wanted:
+        return
+    some = wanted[:: -(-len(wanted) // EXPECTED_POSES)]
+    views = ((capture.motion[row], capture.camera_of_pose(row)) for row in some)
+    expected = expected_coverage(capture.shaped, views)
+    if expected.seen_share < SEEN.sharp:
+        console.warning(
+            f"The film shows {expected.seen_share:.0%} of the person's skin; the rest will be "
+            f"completed by what it shows, as a guess. {coverage_advice(expected)}"
+        )
+
+
+def _announce_duration(trainer: Trainer, console: Console) -> None:
+    """Print how long training will take, and roughly what comes after it."""
+    config = trainer.config
+    seconds = max(0.0, config.seconds - trainer.wall_seconds)
+    duration = f"{seconds:.0f} s" if seconds >= 10.0 else f"{seconds:.1g} s"
+    if config.steps:
+        duration = f"{config.steps - trainer.steps} steps"
+    console.info(
+        f"Training for {duration}, then about half a minute for packaging and evaluation on an "
+        "otherwise idle machine."
+    )

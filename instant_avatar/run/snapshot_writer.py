@@ -1,0 +1,213 @@
+"""Write the avatar in its current state: checkpoints while it is trained, and packages."""
+
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from avatar.evaluation.held_out import HeldOutFrame, subsample_evenly
+from avatar.training import checkpoint
+from avatar.training.trainer import Trainer
+from capture.atomic_files import atomic_file
+from export.bake.bake_tables import ExportRefused
+from export.bake.fine_tuning import PosedView
+from export.build import ExportReport, export_avatar
+from export.package.package_file import update_metrics
+from instant_avatar.report.report_schema import CurvePoint
+from instant_avatar.run.run_folder import RunFolder
+from preprocess.body.parametric_body import write_shaped_body
+from preprocess.capture_session import Capture
+from preprocess.observation import shrink_to_longer_side
+
+CHECKPOINT_INTERVAL_S = 5.0
+"""Shortest time between two checkpoints, seconds."""
+CHECKPOINT_COST_SHARE = 0.02
+"""Largest share of the run's CPU time that checkpoints take; where they cost more, they are rarer.
+"""
+
+
+@final
+class CheckpointWriter:
+    """Writes the checkpoints of one run, one at a time.
+
+    The thread that trains copies the state; another one writes it.
+    """
+
+    def __init__(self, run: RunFolder, capture: Capture) -> None:
+        """Writes nothing yet.
+
+        Args:
+            run: Folder of the run.
+            capture: Its body and its fit to the masks are written beside the first checkpoint.
+        """
+        self._run, self._capture, self._body_written = run, capture, False
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
+        self._pending: Future[float] | None = None
+        self._copy_cost_s = self._cpu_interval_s = 0.0
+        self.restart_interval()
+
+    def restart_interval(self) -> None:
+        """Counts the time to the next checkpoint from now."""
+        self._last, self._cpu_last = time.perf_counter(), time.process_time()
+
+    def is_due(self) -> bool:
+        """Whether the last checkpoint is written and old enough.
+
+        Raises:
+            OSError: If the last one could not be written; the one before it is kept.
+        """
+        if self._pending is not None:
+            if not self._pending.done():
+                return False
+            self._take_result()
+        if time.perf_counter() - self._last < CHECKPOINT_INTERVAL_S:
+            return False
+        return time.process_time() - self._cpu_last > self._cpu_interval_s
+
+    def begin(self, trainer: Trainer, notes: dict[str, Any], *, trains_on: bool = True) -> None:
+        """Start to write a checkpoint, after the one before it.
+
+        Args:
+            trainer: In the state to save.
+            notes: Stored with it.
+            trains_on: Whether training goes on meanwhile, so that the state has to be copied.
+
+        Raises:
+            OSError: If the one before could not be written.
+        """
+        self.wait()
+        began = time.thread_time()
+        get_state = checkpoint.detached_state if trains_on else checkpoint.current_state
+        state = get_state(trainer, notes=notes)
+        self._copy_cost_s = time.thread_time() - began
+        self._pending = self._thread.submit(self._write, state)
+        self.restart_interval()
+
+    def wait(self) -> None:
+        """Wait until the last checkpoint is written.
+
+        Raises:
+            OSError: If it could not be; the one before it is kept.
+        """
+        if self._pending is not None:
+            self._take_result()
+
+    def settle(self) -> None:
+        """Wait until nothing is being written; `wait` raises the error, if there was one."""
+        if self._pending is not None:
+            self._pending.exception()
+
+    def _take_result(self) -> None:
+        assert self._pending is not None
+        done, self._pending = self._pending, None
+        self._cpu_interval_s = (self._copy_cost_s + done.result()) / CHECKPOINT_COST_SHARE
+
+    def _write(self, state: dict[str, Any]) -> float:
+        """Write a state, and body and fit beside the first; return the CPU time it took."""
+        began = time.thread_time()
+        checkpoint.write_state(state, self._run.checkpoint)
+        if not self._body_written:
+            with atomic_file(self._run.body_file) as path:
+                write_shaped_body(path, self._capture.shaped)
+            if self._capture.fit is not None:
+                self._capture.fit.save(self._run.fit_file, self._capture.identity)
+            self._body_written = True
+        return time.thread_time() - began
+
+
+VALIDATION_VIEWS = 4
+"""Views that a package is validated with."""
+QUICK_VALIDATION_VIEWS = 2
+"""Views that a quick package is validated with."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PackageSnapshot:
+    """Outcome of writing a package.
+
+    Attributes:
+        export_report: Describes the package; None if it was refused.
+        refusal: Why no package was written; None if one was.
+        ready_at: When the file was complete, on `time.perf_counter`'s clock.
+    """
+
+    export_report: ExportReport | None
+    refusal: str | None
+    ready_at: float
+
+
+def write_package_snapshot(
+    trainer: Trainer,
+    path: Path,
+    views: Sequence[PosedView],
+    *,
+    curve_point: CurvePoint | None,
+    quick: bool = False,
+    fine_tune: bool = True,
+    progress: Callable[[float], None] = lambda _: None,
+) -> PackageSnapshot:
+    """Write the package, whole or not at all; training may continue afterwards.
+
+    Args:
+        trainer: Holds the avatar; not in the middle of a step.
+        path: The `.iavatar` file; an existing one is kept if the package is refused.
+        views: Poses and cameras to validate the package with (`validation_views`).
+        curve_point: Latest scores of held-out frames, stored in the package.
+        quick: Whether to skip the finest detail because the user waits (`prefer_final`).
+        fine_tune: Whether to spend about ten seconds on fine-tuning the bricks.
+        progress: Called with the fraction done, from 0 to 1.
+
+    Raises:
+        OSError: If the disk is full; an existing package is kept.
+    """
+    metrics = {
+        "held_out": None if curve_point is None else asdict(curve_point),
+        "recipe": asdict(trainer.config),
+    }
+    try:
+        exported = export_avatar(
+            trainer.avatar,
+            path,
+            views=views[:QUICK_VALIDATION_VIEWS] if quick else views,
+            metrics=metrics,
+            quick=quick,
+            fine_tune_bricks=fine_tune,
+            progress=progress,
+        )
+    except ExportRefused as error:
+        return PackageSnapshot(export_report=None, refusal=str(error), ready_at=time.perf_counter())
+    return PackageSnapshot(export_report=exported, refusal=None, ready_at=time.perf_counter())
+
+
+def store_scores(snapshot: PackageSnapshot, scores: CurvePoint) -> PackageSnapshot:
+    """Replace the scores in the package that was written, if one was.
+
+    Raises:
+        OSError: If the disk is full; the package is kept as it was.
+    """
+    exported = snapshot.export_report
+    if exported is None:
+        return snapshot
+    size = update_metrics(exported.path, {"held_out": asdict(scores)})
+    return replace(snapshot, export_report=replace(exported, bytes=size))
+
+
+def prefer_final(quick: PackageSnapshot, final: PackageSnapshot) -> PackageSnapshot:
+    """Return the package on disk after a quick one; it was ready when the quick one was."""
+    if quick.export_report is None:
+        return final
+    return quick if final.export_report is None else replace(final, ready_at=quick.ready_at)
+
+
+def validation_views(held_out: list[HeldOutFrame], recording: Capture) -> Sequence[PosedView]:
+    """Return views to validate a package with: held-out frames, else the first valid pose."""
+    seen = [frame.observation for frame in subsample_evenly(held_out, VALIDATION_VIEWS)]
+    if seen:
+        return [(observation.pose, observation.camera) for observation in seen]
+    row = int(np.flatnonzero(recording.motion.valid)[0])
+    size = shrink_to_longer_side(recording.source.size_px, recording.size_px)
+    return [(recording.motion[row], recording.camera_of_pose(row).resize(size))]

@@ -1,0 +1,335 @@
+"""ia-track: find poses, masks and camera of the person in a video, and film them for checking."""
+
+import json
+import os
+import shlex
+import sys
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+from tyro.conf import Positional, arg
+
+from capture.atomic_files import OutputFileList, atomic_file, write_text_atomically
+from capture.input_error import InputError
+from capture.live_sources import camera_address
+from capture.video_writer import VP9, write_video
+from instant_avatar.cli.command_line import (
+    DONE,
+    INTERRUPTED,
+    parse_arguments,
+    run_command,
+    stop_on_interrupt,
+)
+from instant_avatar.cli.console import Console
+from instant_avatar.cli.shared_options import (
+    Flag,
+    capture_name,
+    check_output_file,
+    check_output_folder,
+    format_frame_range,
+    option_words,
+    parse_frame_range,
+    unused_path,
+)
+from instant_avatar.run.person_tracking import masks_to_use, print_grade, track_person
+from instant_avatar.run.run_folder import RunFolder, claim_folder
+from preprocess.body.body_surface import SkinPoints, splat_silhouette
+from preprocess.capture_session import Capture, CaptureInputs
+from preprocess.observation import Observation, shrink_to_longer_side
+
+PROGRAM = "ia-track"
+NOT_GOOD_ENOUGH = 1
+"""Exit code of poses that were written, but are not good enough for an avatar."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrackArguments:
+    """Find poses, masks and camera of the person in a video, and grade them.
+
+    Neural networks (BlazePose) find key points and a mask in each frame; then one body, its poses
+    and the focal length are fitted to all of them. It needs about 60 ms per frame on one core and
+    no graphics card. ia-ingest does the same by itself where no --poses are given; run ia-track to
+    look at the poses first, or to use them elsewhere. Try it:
+
+        ia-track video.mp4 --out tracked/poses.npz
+
+        ia-ingest video.mp4 --poses tracked/poses.npz
+
+    `tracked` then holds poses.npz (SMPL's keys: global_orient, body_pose, transl; and K, the key
+    points, and the body's proportions. The angles belong to the embedded body, model "body24", not
+    to SMPL's shape), masks/, skeleton.webm (look at it) and grade.json.
+
+    It works best on one person, from head to feet in the picture, in a video of a camera that
+    stands still. Hidden limbs are guessed, and fast ones are often wrong.
+
+    Exit codes: 0 the poses are good enough for an avatar; 1 they are not, but were written; 2 bad
+    input, or no person was found; 3 disk full; 130 Ctrl-C, after what was found so far was written.
+    """
+
+    video: Annotated[Positional[Path], arg(metavar="VIDEO")]
+    """Video file, folder of images, or capture folder."""
+    out: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Poses to write, .npz; the rest is written beside it (default: runs/NAME-tracked/poses.npz,
+    named after the video)."""
+    person: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Which person, counted from left to right from 1 in the first frame with that many persons
+    (default: the largest)."""
+    tracker: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    """Another installed tracker to use (default: blazepose, the built-in one; docs/formats.md)."""
+    masks: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    """Masks to use instead of tracked ones, as ia-ingest takes them."""
+    cameras: Annotated[str | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Cameras, as ia-ingest takes them (default: a camera that stands still; its focal length is
+    fitted)."""
+    body: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Your own SMPL body; the poses are then SMPL's (default: the embedded body)."""
+    frames: str = "::"
+    """Frames to use: START:STOP:STEP, counted from 0 (default: all; of a long video every nth, 600
+    at most)."""
+    film: Annotated[bool, arg(help_behavior_hint="")] = True
+    """Draw skeleton.webm."""
+    overwrite: Flag = False
+    """Replace what ia-track wrote there before. Files that it did not write are kept."""
+
+    def poses_path(self) -> Path:
+        """Return the path of the poses."""
+        return self.out or Path("runs") / f"{capture_name(self.video)}-tracked" / "poses.npz"
+
+    def capture_inputs(self) -> CaptureInputs:
+        """Return the inputs to open.
+
+        Raises:
+            InputError: If they cannot be tracked.
+        """
+        if camera_address(self.video) is not None:
+            raise InputError(f"{self.video} is a camera, but ia-track needs a recording.")
+        if self.person is not None and self.person < 1:
+            raise InputError(f"--person is {self.person}, but must be at least 1 (the leftmost).")
+        if self.cameras == "solve":
+            raise InputError(
+                "--cameras solve needs poses first. Track with --cameras static, then run "
+                "ia-ingest with --poses and --cameras solve."
+            )
+        return CaptureInputs(
+            video=self.video,
+            masks=self.masks,
+            cameras=self.cameras,
+            body=self.body,
+            frames=parse_frame_range(self.frames),
+            person=None if self.person is None else str(self.person),
+            tracker=self.tracker,
+        )
+
+    def check_outputs(self) -> None:
+        """Check that the outputs can be written.
+
+        Raises:
+            InputError: If one cannot.
+        """
+        poses, inputs = self.poses_path(), self.capture_inputs()
+        folder, masks = poses.parent, poses.parent / "masks"
+        if poses.suffix.lower() != ".npz":
+            raise InputError(f"--out is {poses}, but must end in .npz.")
+        free = unused_path(Path(os.path.abspath(folder)).with_name("tracked")) / "poses.npz"
+        free = free if folder.is_absolute() else Path(os.path.relpath(free))
+        advice = f"choose another folder: --out {shlex.quote(str(free))}"
+        if RunFolder(path=folder).has_checkpoint():
+            raise InputError(f"{folder} holds a run of ia-ingest; {advice}")
+        written = [poses, self.grade_path(), *([self.film_path()] if self.film else [])]
+        for path in filter(os.path.lexists, written):
+            if path.is_file() and not OutputFileList(folder).owns(path.name):
+                raise InputError(
+                    f"{path} was not written by ia-track and would be replaced. Move it, or "
+                    f"{advice}"
+                )
+            if not self.overwrite:
+                raise InputError(
+                    f"{path} already exists. Pass --overwrite to replace what ia-track wrote "
+                    f"there, or {advice}"
+                )
+        own = {os.path.realpath(each) for each in (*written, masks)}
+        read = [each for each in inputs.input_paths() if os.path.realpath(each) not in own]
+        for path in written:
+            check_output_file(path, "--out", read, overwrite=True, below=False)
+        if masks_to_use(inputs, masks) is None:
+            check_output_folder(masks, "--out")
+
+    def grade_path(self) -> Path:
+        """Return the path of the grades."""
+        return self.poses_path().with_name("grade.json")
+
+    def film_path(self) -> Path:
+        """Return the path of the film."""
+        return self.poses_path().with_name("skeleton.webm")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; return its exit code."""
+    given = parse_arguments(TrackArguments, PROGRAM, argv)
+    return run_command(PROGRAM, lambda: track(given, Console()))
+
+
+def next_command(arguments: TrackArguments, frames: slice | None) -> list[str]:
+    """Return the command that trains on what was tracked in some frames."""
+    named = {
+        "poses": arguments.poses_path(), "masks": arguments.masks, "cameras": arguments.cameras,
+        "body": arguments.body, "frames": None if frames is None else format_frame_range(frames),
+    }  # fmt: skip
+    return ["ia-ingest", str(arguments.video), *option_words(named)]
+
+
+@contextmanager
+def claim_outputs(folder: Path, console: Console) -> Iterator[None]:
+    """Make and lock a folder during a block, in which the files of ia-track are listed.
+
+    Raises:
+        CommandExit: If another command is writing here.
+    """
+    with claim_folder(folder, console):
+        listing = OutputFileList(folder)
+        listing.create()
+        listing.remove_temporaries()
+        try:
+            yield
+        finally:
+            listing.remove_if_empty()
+
+
+def track(arguments: TrackArguments, console: Console) -> int:
+    """Track the person, and write poses, masks, film and grades.
+
+    Raises:
+        InputError: If the video cannot be read, or no person is found in it.
+        OSError: If the disk is full.
+    """
+    inputs, poses = arguments.capture_inputs(), arguments.poses_path()
+    arguments.check_outputs()
+    saving = "writing what was found so far"
+    with claim_outputs(poses.parent, console), stop_on_interrupt(console, saving) as stop:
+        tracking = track_person(inputs, poses, console, stop=stop)
+        text = json.dumps(tracking.grade.as_json(), indent=1) + "\n"
+        write_text_atomically(arguments.grade_path(), text)
+        console.print_artifact("poses", poses)
+        if arguments.film and not stop.is_set():
+            with console.status("drawing the film"):
+                write_skeleton_film(arguments.film_path(), tracking.capture, tracking.grade.doubts)
+            console.print_artifact("look at it", arguments.film_path())
+    print_grade(tracking.grade, console)
+    if tracking.grade.is_good_enough:
+        console.info("Next:")
+        console.info(f"  {shlex.join(next_command(arguments, tracking.inputs.frames))}")
+    if tracking.interrupted:
+        return INTERRUPTED
+    return DONE if tracking.grade.is_good_enough else NOT_GOOD_ENOUGH
+
+
+LONGER_SIDE_PX = 720
+"""Longer side of the film, px."""
+SHORTER_SIDE_PX = 320
+"""Least shorter side of the film, px: smaller frames are enlarged, so that text can be read."""
+LETTER_PX, LINE_PX = 7, 16
+"""Width of a letter and height of a line of text, px."""
+SILHOUETTE_PX = 256
+"""Longer side of the images in which the body's outline is found, px."""
+LEFT_COLOR, RIGHT_COLOR, MIDDLE_COLOR = (255, 150, 40), (60, 190, 255), (240, 240, 240)
+"""RGB colors of the person's left and right limbs, and of trunk and head."""
+MASK_COLOR, BODY_COLOR, DOUBT_COLOR = (255, 255, 255), (255, 120, 0), (255, 60, 60)
+"""RGB colors of the mask's outline, the body's outline, and of doubts."""
+LEFT_JOINTS = frozenset({1, 4, 7, 10, 13, 16, 18, 20, 22})
+"""Joints of SMPL's tree on the person's left."""
+RIGHT_JOINTS = frozenset({2, 5, 8, 11, 14, 17, 19, 21, 23})
+"""Joints of SMPL's tree on the person's right."""
+
+Rgb = UInt8[np.ndarray, "height width 3"]
+
+
+def write_skeleton_film(path: Path, capture: Capture, doubts: Mapping[int, str]) -> int:
+    """Draw skeleton, body and mask over each frame, and why a frame is doubtful.
+
+    Args:
+        path: Video to write, .webm.
+        capture: The video with its tracked poses and masks.
+        doubts: Why frames are doubtful, by their numbers.
+
+    Returns:
+        Number of frames drawn.
+
+    Raises:
+        OSError: If it cannot be written.
+    """
+    source = capture.source
+    count, duration = source.frame_count or 1, source.duration_s
+    fps = min(60.0, max(1.0, count / duration)) if duration else 10.0
+    with atomic_file(path) as part:
+        return write_video(part, _draw_frames(capture, doubts), fps, VP9)
+
+
+def _draw_frames(capture: Capture, doubts: Mapping[int, str]) -> Iterator[Rgb]:
+    skin = SkinPoints.of(capture.shaped)
+    for item in capture.observations():
+        if not isinstance(item, Observation):
+            continue
+        size_px = _film_size_px(item.frame.size_px)
+        picture = cv2.resize(item.frame.rgb, size_px, interpolation=cv2.INTER_AREA)
+        camera = item.camera.resize(size_px)
+        small = item.camera.resize(shrink_to_longer_side(item.camera.size_px, SILHOUETTE_PX))
+        drawn = splat_silhouette(skin.posed(item.pose), small).astype(np.float32)
+        _draw_outline(picture, cv2.resize(item.alpha, size_px) > 0.5, MASK_COLOR)
+        _draw_outline(picture, cv2.resize(drawn, size_px) > 0.5, BODY_COLOR)
+        pixels = camera.project(capture.shaped.with_pose(item.pose).joints())
+        for joint, parent in enumerate(capture.shaped.body.parents):
+            if parent >= 0:
+                _draw_bone(picture, pixels[parent], pixels[joint], _joint_color(joint))
+        doubt = doubts.get(item.frame.index, "")
+        _draw_text(picture, f"{item.frame.time_s:5.1f} s  {doubt}".rstrip(), bool(doubt))
+        yield picture
+
+
+def _film_size_px(size_px: tuple[int, int]) -> tuple[int, int]:
+    """Size of the film of frames of a size; even numbers, as encoders want."""
+    scale = max(1.0, SHORTER_SIDE_PX / min(size_px))
+    scale = min(scale, LONGER_SIDE_PX / max(size_px))
+    width, height = (max(2, 2 * round(scale * side / 2)) for side in size_px)
+    return width, height
+
+
+def _joint_color(joint: int) -> tuple[int, int, int]:
+    if joint in LEFT_JOINTS:
+        return LEFT_COLOR
+    return RIGHT_COLOR if joint in RIGHT_JOINTS else MIDDLE_COLOR
+
+
+def _draw_bone(
+    picture: Rgb, one: np.ndarray, other: np.ndarray, color: tuple[int, int, int]
+) -> None:
+    ends = [tuple(int(v) for v in np.clip(16.0 * end, -1e6, 1e6)) for end in (one, other)]
+    cv2.line(picture, ends[0], ends[1], (20, 20, 20), 5, cv2.LINE_AA, shift=4)
+    cv2.line(picture, ends[0], ends[1], color, 3, cv2.LINE_AA, shift=4)
+
+
+def _draw_outline(picture: Rgb, inside: np.ndarray, color: tuple[int, int, int]) -> None:
+    found, _ = cv2.findContours(inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(picture, found, -1, color, 1, cv2.LINE_AA)
+
+
+def _draw_text(picture: Rgb, text: str, doubtful: bool) -> None:
+    """Write lines at the top, on a dark ground, as many as the width asks for."""
+    letters = max(12, (picture.shape[1] - 12) // LETTER_PX)
+    lines = textwrap.wrap(text, letters)
+    ground = picture[: 6 + LINE_PX * len(lines)]
+    ground[:] = ground // 4
+    color = DOUBT_COLOR if doubtful else MASK_COLOR
+    for row, line in enumerate(lines):
+        at = (6, LINE_PX * (row + 1))
+        cv2.putText(picture, line, at, cv2.FONT_HERSHEY_SIMPLEX, 0.42, color, 1, cv2.LINE_AA)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

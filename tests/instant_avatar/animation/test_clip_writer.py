@@ -1,0 +1,151 @@
+"""What is written of pictures, and with what."""
+
+import av
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from capture.input_error import InputError
+from instant_avatar.animation.clip_file import background_compositor, check_clip_path, write_clip
+
+
+def disc(count, *, height=60, width=80):
+    """A soft orange disc that moves to the right, straight alpha."""
+    y, x = np.mgrid[:height, :width]
+    for number in range(count):
+        away = np.hypot(x - 25.0 - 4.0 * number, y - 30.0)
+        picture = np.zeros((height, width, 4), dtype=np.uint8)
+        picture[..., :3] = [230, 130, 40]
+        picture[..., 3] = np.clip((18.0 - away) * 60.0, 0, 255)
+        yield picture
+
+
+def written(path, pictures, *, blend, fps=25.0):
+    return write_clip(path, pictures, fps=fps, blend=blend)
+
+
+def shown(path):
+    reader, frames = cv2.VideoCapture(str(path)), []
+    while True:
+        ok, picture = reader.read()
+        if not ok:
+            return frames, reader.get(cv2.CAP_PROP_FPS)
+        frames.append(picture[..., ::-1].astype(float))
+
+
+@pytest.mark.parametrize("suffix", [".webm", ".mp4"])
+@pytest.mark.parametrize("color", ["#808080", "#4080c0", "#c8d2dc"])
+def test_a_video_has_the_colors_that_were_drawn(tmp_path, suffix, color):
+    path, blend = tmp_path / f"clip{suffix}", background_compositor(color)
+    assert written(path, disc(6), blend=blend) == 6
+    frames, fps = shown(path)
+    assert len(frames) == 6
+    assert fps == pytest.approx(25.0)
+    for frame, rgba in zip(frames, disc(6), strict=True):
+        expected = blend(rgba).astype(float)
+        assert np.abs((frame - expected).mean(axis=(0, 1))).max() < 3.5
+        assert np.abs((frame[:8] - expected[:8]).mean(axis=(0, 1))).max() < 3.5
+
+
+@pytest.mark.parametrize("suffix", [".webm", ".mp4"])
+def test_odd_sizes_and_odd_rates_are_written(tmp_path, suffix):
+    path = tmp_path / f"clip{suffix}"
+    pictures = disc(5, height=61, width=79)
+    assert written(path, pictures, blend=background_compositor("black"), fps=23.976) == 5
+    frames, fps = shown(path)
+    assert frames[0].shape == (62, 80, 3)
+    assert fps == pytest.approx(23.976, rel=1e-3)
+
+
+def test_an_mp4_is_h264_and_a_webm_is_vp9(tmp_path):
+    for name, codec in (("a.mp4", "h264"), ("a.webm", "vp9")):
+        path = tmp_path / name
+        written(path, disc(3), blend=background_compositor("white"))
+        with av.open(str(path)) as file:
+            stream = file.streams.video[0]
+            assert stream.codec_context.name == codec
+            assert stream.codec_context.pix_fmt == "yuv420p"
+            assert int(stream.codec_context.colorspace) == 1  # BT.709, as it is written
+            first = next(file.decode(stream)).to_ndarray(format="rgb24")
+        assert 255 - first[:8].mean() < 0.5
+
+
+def test_a_webm_keeps_soft_alpha(tmp_path):
+    path = tmp_path / "a.webm"
+    written(path, disc(4), blend=None)
+    decoder, frames = av.CodecContext.create("libvpx-vp9", "r"), []
+    with av.open(str(path)) as file:
+        assert file.streams.video[0].metadata["alpha_mode"] == "1"
+        for packet in file.demux(file.streams.video[0]):
+            frames += decoder.decode(packet)
+    assert len(frames) == 4
+    for frame, rgba in zip(frames, disc(4), strict=True):
+        alpha = frame.to_ndarray(format="rgba")[..., 3].astype(int)
+        assert np.abs(alpha - rgba[..., 3]).mean() < 2.0
+
+
+def test_an_mp4_keeps_no_alpha(tmp_path):
+    with pytest.raises(InputError, match="no transparency"):
+        written(tmp_path / "a.mp4", disc(1), blend=None)
+
+
+def frames_in(path):
+    with Image.open(path) as clip:
+        for number in range(clip.n_frames):
+            clip.seek(number)
+            yield np.asarray(clip.convert("RGBA")).astype(int), clip.info["duration"]
+
+
+def test_a_webp_keeps_soft_alpha_and_its_pace(tmp_path):
+    path = tmp_path / "a.webp"
+    assert written(path, disc(7), blend=None, fps=30.0) == 7
+    shown = list(frames_in(path))
+    assert len(shown) == 7
+    for (frame, _), rgba in zip(shown, disc(7), strict=True):
+        np.testing.assert_array_equal(frame[..., 3], rgba[..., 3])  # WebP's alpha is exact
+        inside = rgba[..., 3] == 255
+        assert np.abs(frame[inside][:, :3] - rgba[inside][:, :3]).mean() < 4.0
+
+
+def test_a_gif_is_clear_where_nothing_is_and_keeps_its_pace(tmp_path):
+    path = tmp_path / "a.gif"
+    assert written(path, disc(7), blend=None, fps=30.0) == 7
+    shown = list(frames_in(path))
+    assert sum(duration for _, duration in shown) == pytest.approx(7 / 30 * 1000, abs=5)
+    for (frame, _), rgba in zip(shown, disc(7), strict=True):
+        np.testing.assert_array_equal(frame[..., 3] > 0, rgba[..., 3] > 127)
+        solid = frame[..., 3] > 0
+        assert np.abs(frame[solid][:, :3] - [230, 130, 40]).max() <= 4
+
+
+def test_a_gif_shows_what_was_drawn(tmp_path, rng):
+    """A palette for each picture: smooth shades stay within a few steps."""
+    path, blend = tmp_path / "a.gif", background_compositor("white")
+    ramp = np.linspace(0, 255, 80)[None, :, None] * np.ones((60, 1, 1))
+    smooth = np.concatenate([ramp, 255 - ramp, np.full_like(ramp, 90), np.full_like(ramp, 255)], 2)
+    written(path, iter([smooth.astype(np.uint8)] * 2), blend=blend)
+    for frame, _ in frames_in(path):
+        assert np.abs(frame[..., :3] - smooth[..., :3]).max() <= 6
+
+
+def test_a_png_is_one_picture_exactly(tmp_path):
+    (picture,) = disc(1)
+    for blend, expected in (
+        (None, picture),
+        (background_compositor("teal"), background_compositor("teal")(picture)),
+    ):
+        path = tmp_path / "a.png"
+        assert written(path, disc(1), blend=blend) == 1
+        with Image.open(path) as image:
+            np.testing.assert_array_equal(np.asarray(image), expected)
+
+
+def test_nothing_but_frames_is_replaced(tmp_path):
+    out = tmp_path / "frames"
+    written(out, disc(1), blend=None)
+    check_clip_path(out, [], overwrite=False)
+    (out / "0001.png").write_bytes(b"mine")
+    for overwrite in (False, True):
+        with pytest.raises(InputError, match=r"holds 0001\.png"):
+            check_clip_path(out, [], overwrite=overwrite)

@@ -1,0 +1,376 @@
+"""The player's command: what it writes, what it refuses, and that it needs no torch."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import onnxruntime
+import pytest
+from PIL import Image
+
+from capture.atomic_files import LIST_NAME as LIST
+from export import player_page
+from export.package.package_file import read_package, write_package
+from export.player import Player
+from instant_avatar import ingest, play
+from instant_avatar.animation.driving_motion import FollowingCamera, demo_motion
+from instant_avatar.animation.player_checks import package_warnings
+from preprocess.body.body_pose import BodyPose
+from preprocess.body.kinematics import rotation_matrices
+from preprocess.poses.pose_file import read_motion
+
+SIZE, ROOT = 96, Path(__file__).parents[3]
+
+
+@pytest.fixture(scope="session")
+def package(run):
+    return run / "avatar.iavatar"
+
+
+@pytest.fixture(scope="session")
+def novel(film):
+    """Twelve poses that the film does not show."""
+    return film / "truth" / "novel" / "poses.npz"
+
+
+def frames_of(video):
+    reader, frames = cv2.VideoCapture(str(video)), []
+    while True:
+        ok, picture = reader.read()
+        if not ok:
+            return frames
+        frames.append(picture)
+
+
+def test_a_folder_gets_frames_with_alpha_and_nothing_else(call_play, package, novel, tmp_path):
+    out = tmp_path / "frames"
+    outcome = call_play(package, "--poses", novel, "--out", out, "--size", SIZE)
+    assert outcome.code == 0
+    assert outcome.out.strip() == str(out)
+    assert sorted(f.name for f in out.iterdir() if f.name != LIST) == [
+        f"{i:04d}.png" for i in range(12)
+    ]
+    player, motion = Player.load(package), read_motion(novel)
+    camera = FollowingCamera.of(player, motion, SIZE)
+    for row in (0, 11):
+        with Image.open(out / f"{row:04d}.png") as picture:
+            assert picture.mode == "RGBA"
+            expected = player.render(motion[row], camera.camera_for(motion[row]))
+            np.testing.assert_array_equal(np.asarray(picture), expected)
+
+
+def test_frames_replace_frames_but_nothing_else(call_play, package, novel, tmp_path):
+    out = tmp_path / "frames"
+    for _ in range(2):
+        assert call_play(package, "--poses", novel, "--out", out, "--size", SIZE).code == 0
+    (out / "notes.txt").write_text("mine")
+    outcome = call_play(package, "--poses", novel, "--out", out, "--size", SIZE)
+    assert outcome.code == 2
+    assert "notes.txt" in outcome.complaint("ia-play")
+    assert len(list(out.iterdir())) == 12 + len({"notes.txt", LIST})
+    assert [file.name for file in tmp_path.iterdir()] == ["frames"]
+
+
+@pytest.mark.parametrize("suffix", [".webm", ".mp4"])
+def test_clips_show_what_the_player_draws(call_play, package, novel, tmp_path, suffix):
+    out = tmp_path / f"clip{suffix}"
+    outcome = call_play(
+        package, "--poses", novel, "--out", out, "--size", SIZE, "--background", "#4080c0"
+    )
+    assert outcome.code == 0
+    frames = frames_of(out)
+    assert len(frames) == 12
+    player, motion = Player.load(package), read_motion(novel)
+    camera = FollowingCamera.of(player, motion, SIZE)
+    rgba = player.render(motion[0], camera.camera_for(motion[0])).astype(np.float64)
+    alpha = rgba[..., 3:] / 255.0
+    expected = rgba[..., :3] * alpha + np.array([64, 128, 192]) * (1.0 - alpha)
+    assert np.abs(frames[0][..., ::-1] - expected).mean() < 6.0
+    assert [file.name for file in tmp_path.iterdir()] == [out.name]
+
+
+def test_a_gif_has_its_pictures_and_its_pace(call_play, package, novel, tmp_path):
+    out = tmp_path / "clip.gif"
+    assert call_play(package, "--poses", novel, "--out", out, "--size", SIZE, "--fps", 20).code == 0
+    with Image.open(out) as clip:
+        assert clip.n_frames == 8  # 12 poses, 30 a second
+        assert clip.info["duration"] == 50
+        assert clip.size == (SIZE, SIZE)
+
+
+def test_odd_sizes_become_even_in_clips(call_play, package, novel, tmp_path):
+    out = tmp_path / "clip.webm"
+    assert call_play(package, "--poses", novel, "--out", out, "--size", "95x63").code == 0
+    assert frames_of(out)[0].shape == (64, 96, 3)
+
+
+def test_a_clip_without_a_name_lies_beside_the_package(call_play, package, novel):
+    outcome = call_play(package, "--poses", novel, "--size", SIZE)
+    assert outcome.code == 0
+    expected = package.parent / "poses.webm"
+    assert outcome.out.strip() == str(expected)
+    assert len(frames_of(expected)) == 12
+    expected.unlink()
+
+
+def test_the_film_s_camera_shows_what_the_film_shows(call_play, package, film, tmp_path):
+    out = tmp_path / "frames"
+    arguments = ["--poses", film / "poses.npz", "--camera", film / "cameras.npz", "--out", out]
+    assert call_play(package, *arguments).code == 0
+    drawn = cv2.imread(str(out / "0000.png"), cv2.IMREAD_UNCHANGED)[..., 3] > 127
+    mask = cv2.imread(str(film / "masks" / "0000.png"), cv2.IMREAD_GRAYSCALE) > 127
+    assert drawn.shape == (64, 64)
+    assert (drawn & mask).sum() / (drawn | mask).sum() > 0.85
+
+
+def test_the_standing_person_takes_four_fifths_of_the_picture(package):
+    player = Player.load(package)
+    motion = demo_motion(2)
+    standing = BodyPose(
+        root_rotation=np.zeros(3),
+        root_translation=np.zeros(3),
+        joint_rotations=player.manifest.canonical_rotations,
+    )
+    camera = FollowingCamera.of(player, motion, 256).camera_for(standing)
+    rows = np.flatnonzero((player.render(standing, camera)[..., 3] > 127).any(axis=1))
+    assert (rows[-1] + 1 - rows[0]) / 256 == pytest.approx(0.8, abs=0.03)
+    assert (rows[-1] + 1 + rows[0]) / 2 == pytest.approx(128, abs=4)
+
+
+def test_the_picture_does_not_depend_on_where_the_tracker_s_world_lies(package, novel, rng):
+    player, motion = Player.load(package), read_motion(novel)
+    pose, pelvis = motion[0], player.manifest.rest_joints[0]
+    turn = rotation_matrices(rng.normal(size=3))
+    turned = turn @ rotation_matrices(pose.root_rotation)
+    axis_angle, _ = cv2.Rodrigues(turned)
+    place = turn @ (pelvis + pose.root_translation) + rng.normal(size=3) - pelvis
+    moved = BodyPose(
+        root_rotation=axis_angle[:, 0],
+        root_translation=place,
+        joint_rotations=pose.joint_rotations,
+    )
+    pictures = []
+    for one in (pose, moved):
+        single = read_motion(novel)
+        single.root_rotations[0] = one.root_rotation
+        camera = FollowingCamera.of(player, single, SIZE)
+        pictures.append(player.render(one, camera.camera_for(one)).astype(int))
+    assert np.abs(pictures[0] - pictures[1]).mean() < 0.5
+
+
+def test_lost_poses_are_left_out(call_play, package, novel, tmp_path, changed):
+    poses = tmp_path / "poses.npz"
+    poses.write_bytes(novel.read_bytes())
+    valid = np.ones(12, dtype=bool)
+    valid[[2, 5]] = False
+    changed(poses, valid=valid)
+    out = tmp_path / "frames"
+    outcome = call_play(package, "--poses", poses, "--out", out, "--size", SIZE)
+    assert outcome.code == 0
+    assert "2 of 12" in outcome.err
+    assert len(list(out.glob("*.png"))) == 10
+
+
+def test_the_benchmark_has_the_keys_that_were_agreed(call_play, package, tmp_path):
+    figures = tmp_path / "bench.json"
+    outcome = call_play(package, "--bench", "--size", SIZE, "--json", figures)
+    assert outcome.code == 0
+    found = json.loads(figures.read_text())
+    assert " ".join(found) == (
+        "format tier size frames pixels_covered cpu_ms_per_frame wall_ms_per_frame load_ms "
+        "reference_ms provider workers pictures_per_second"
+    )
+    assert found["size"] == SIZE
+    assert 0.03 < found["pixels_covered"] < 0.6
+    assert min(found[key] for key in ("cpu_ms_per_frame", "load_ms", "reference_ms")) > 0.0
+
+
+def test_golden_frames_look_the_same_here(call_play, package, tmp_path):
+    outcome = call_play(package, "--verify", "--json", tmp_path / "verdict.json")
+    assert outcome.code == 0
+    assert "golden frame 0: same" in outcome.err
+    assert "verdict: same" in outcome.err
+    assert f"CPUExecutionProvider, onnxruntime {onnxruntime.__version__}" in outcome.err
+    found = json.loads((tmp_path / "verdict.json").read_text())
+    assert found["verdict"] == "same"
+    assert found["provider"] == "CPUExecutionProvider"
+    assert min(frame["close"] for frame in found["frames"]) >= 0.999
+
+
+def test_different_golden_frames_set_the_exit_code(call_play, package, tmp_path):
+    sound = read_package(package)
+    dark = tuple(np.where(frame > 128, frame - 100, frame) for frame in sound.golden[1:])
+    other = tmp_path / "avatar.iavatar"
+    write_package(replace(sound, golden=(sound.golden[0], *dark), graphs=_all(package)), other)
+    outcome = call_play(other, "--verify")
+    assert outcome.code == 2
+    assert "golden frame 0: same" in outcome.err
+    assert "golden frame 1: DIFFERENT" in outcome.err
+    assert "verdict: DIFFERENT" in outcome.err
+
+
+def _all(package):
+    return read_package(package, tier=None).graphs
+
+
+def test_a_provider_that_is_not_there_is_named(call_play, package):
+    for arguments in (["--verify"], ["--bench"], ["--out", "never.webm"]):
+        outcome = call_play(package, *arguments, "--provider", "abacus")
+        assert outcome.code == 2
+        assert "no provider 'abacus' here; it has: " in outcome.complaint("ia-play")
+
+
+def test_warnings_of_the_export_are_repeated_when_played(package):
+    manifest = replace(Player.load(package).manifest, metrics={})
+    assert package_warnings(manifest) == []
+    mark = {"psnr": 6.9, "verdict": "failed"}
+    told = replace(manifest, metrics={"warnings": ["It is fog."], "held_out": mark})
+    fog, failed = package_warnings(told)
+    assert fog == "It is fog."
+    assert "6.9 dB (failed)" in failed
+
+
+@pytest.mark.parametrize("mode", ["--verify", "--bench"])
+def test_warnings_of_the_package_are_printed(call_play, package, tmp_path, mode):
+    sound, path = read_package(package, tier=None), tmp_path / "avatar.iavatar"
+    manifest = replace(sound.manifest, metrics={"warnings": ["It is fog."]})
+    write_package(replace(sound, manifest=manifest), path)
+    more = ["--size", SIZE] if mode == "--bench" else []
+    assert "It is fog." in call_play(path, mode, *more).err
+
+
+def test_an_altered_package_is_refused(call_play, package, novel, tmp_path):
+    content = bytearray(package.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    spoilt = tmp_path / "avatar.iavatar"
+    spoilt.write_bytes(content)
+    outcome = call_play(spoilt, "--poses", novel, "--out", tmp_path / "clip.webm")
+    assert outcome.code == 2
+    outcome.complaint("ia-play")
+    assert [file.name for file in tmp_path.iterdir()] == ["avatar.iavatar"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["--out", "clip.avi"], ".avi"),
+        (["--background", "no-such-color"], "--background"),
+        (["--size", "4"], "--size"),
+        (["--size", "640x"], "--size"),
+        (["--size", "99999x99"], "--size"),
+        (["--speed", "0"], "--speed"),
+        (["--workers", "0"], "--workers"),
+        (["--still", "12"], "0 to 11"),
+        (["--elevation", "91"], "--elevation"),
+        (["--close-up", "nose"], "left_hand"),
+        (["--turntable", "0"], "--turntable"),
+        (["--turntable", "nan"], "--turntable"),
+        (["--background", "x" * 300], "too long"),
+        (["--bench", "--out", "a.webm"], "leave out --out"),
+        (["--bench", "--verify"], "leave out --"),
+        (["--camera", "none.npz", "--orbit", "-20"], "leave out --orbit"),
+        (["--out", "clip.mp4", "--background", "transparent"], "no transparency"),
+        (["--fps", "0"], "--fps"),
+        (["--camera", "none.npz"], "none.npz"),
+        (["--json", "figures.json"], "--bench"),
+    ],
+)
+def test_wrong_wishes(call_play, package, novel, tmp_path, monkeypatch, arguments, word):
+    monkeypatch.chdir(tmp_path)
+    outcome = call_play(package, "--poses", novel, *arguments)
+    assert outcome.code == 2
+    assert word in outcome.complaint("ia-play")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("words", [["--out", "a.webm"], ["--bench"], ["--web", "--out", "page"]])
+def test_poses_in_other_units_are_refused(
+    call_play, package, novel, tmp_path, monkeypatch, changed, words
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(player_page, "runtime_files", dict)
+    with np.load(novel) as given:
+        turned, places = given["body_pose"], given["transl"] + np.array([0.0, 0.0, 3.0])
+    for said, other in (
+        ("degrees given?", {"body_pose": np.rad2deg(turned)}),
+        ("millimetres or centimetres given?", {"transl": 1000.0 * places}),
+    ):
+        shutil.copy(novel, "poses.npz")
+        changed(tmp_path / "poses.npz", **other)
+        outcome = call_play(package, "--poses", "poses.npz", *words)
+        assert outcome.code == 2
+        assert said in outcome.complaint("ia-play")
+        assert [file.name for file in tmp_path.iterdir()] == ["poses.npz"]
+
+
+def test_what_a_proof_would_not_listen_to_is_refused(call_play, package, tmp_path):
+    for words in (["--tier", "lite"], ["--size", "64"], ["--out", tmp_path / "a.webm"]):
+        outcome = call_play(package, "--verify", *words)
+        assert outcome.code == 2
+        assert f"leave out {words[0]}" in outcome.complaint("ia-play")
+
+
+def test_a_folder_or_a_pipe_in_the_packages_place_is_named(call_play, package, tmp_path):
+    said = call_play(package.parent, "--verify").complaint("ia-play")
+    assert f"the package in it is {package}" in said
+    assert "is a folder" in call_play(tmp_path, "--verify").complaint("ia-play")
+    os.mkfifo(tmp_path / "pipe.iavatar")  # it would be waited on for ever
+    assert "is no file" in call_play(tmp_path / "pipe.iavatar", "--verify").complaint("ia-play")
+
+
+@pytest.mark.parametrize("command", [play, ingest])
+def test_missing_arguments_are_named(command, capsys):
+    with pytest.raises(SystemExit) as end:
+        command.main([])
+    assert end.value.code == 2
+    assert "--help" in capsys.readouterr().err
+
+
+def test_things_that_are_not_there(call_play, package, novel, tmp_path):
+    none = tmp_path / "none"
+    assert "--poses" in call_play(package, "--still", 0).complaint("ia-play")
+    assert "none.npz" in call_play(package, "--poses", f"{none}.npz").complaint("ia-play")
+    assert "none.iavatar" in call_play(f"{none}.iavatar", "--poses", novel).complaint("ia-play")
+
+
+def test_a_full_disk_leaves_nothing(package, novel, tmp_path):
+    code = (
+        "import resource, sys\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
+        "from instant_avatar import play\n"
+        "for name in ('clip.webm', 'clip.mp4', 'clip.gif', 'clip.webp', 'frames'):\n"
+        "    print(name, play.main([*sys.argv[1:], '--out', name]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(package), "--poses", str(novel), "--size", "128"],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    ended = done.stdout.splitlines()
+    assert len(ended) == 5, done.stderr
+    assert [line.split()[-1] for line in ended] == ["3"] * 5, ended
+    assert done.stderr.count("the disk is full") == 5
+    assert "Traceback" not in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_playing_needs_no_torch(package, novel, tmp_path):
+    code = (
+        "import sys\n"
+        "from instant_avatar import play\n"
+        "assert play.main(sys.argv[1:]) == 0\n"
+        "assert play.main([sys.argv[1], '--verify']) == 0\n"
+        "sys.exit('torch' in sys.modules)"
+    )
+    arguments = [str(package), "--poses", str(novel), "--size", "64"]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments, "--out", str(tmp_path / "clip.gif")],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,342 @@
+"""The avatar in a browser: served, written to a folder, and driven as a person would."""
+
+import http.client
+import json
+import re
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from capture.input_error import InputError
+from export import player_page
+from export.player import PictureDifference, Player, premultiply
+from instant_avatar.animation.driving_motion import FollowingCamera
+from preprocess.poses.pose_file import read_motion
+from tests.instant_avatar.browser import Browser, chromium, until
+
+SIZE = (900, 700)
+STAGE = (slice(60, 600), slice(4, -4))
+"""Between the page's head and its bar, inside of the ring that marks the focus."""
+
+
+def is_here():
+    try:
+        player_page.runtime_files()
+    except InputError:
+        return False
+    return True
+
+
+with_runtime = pytest.mark.skipif(not is_here(), reason="onnxruntime-web is not here (make web)")
+with_chromium = pytest.mark.skipif(chromium() is None, reason="there is no Chromium here")
+
+
+@pytest.fixture(scope="module")
+def package(run):
+    return run / "avatar.iavatar"
+
+
+@pytest.fixture(scope="module")
+def novel(film):
+    return film / "truth" / "novel" / "poses.npz"
+
+
+@pytest.fixture(scope="module")
+def served(package, novel):
+    """Where ia-play --web says that the page is."""
+    command = [
+        sys.executable,
+        "-m",
+        "instant_avatar.play",
+        str(package),
+        "--poses",
+        str(novel),
+        "--web",
+    ]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    address = process.stdout.readline().strip()
+    yield address
+    process.send_signal(signal.SIGINT)
+    assert process.wait(timeout=30.0) == 0
+    process.stdout.close()
+
+
+@pytest.fixture(scope="module")
+def page(served, tmp_path_factory):
+    """The page, open and playing."""
+    with Browser(tmp_path_factory.mktemp("browser"), size=SIZE) as browser:
+        browser.emulate(scheme="light", size=SIZE)
+        browser.go(served)
+        until(lambda: browser.run("!!window.player"), 120.0)
+        yield browser
+
+
+def drawn(browser):
+    """Where the stage is not empty."""
+    picture = browser.picture()[STAGE].astype(int)
+    return np.abs(picture - picture[0, 0]).max(axis=2) > 24
+
+
+def paused(browser):
+    if browser.run("document.getElementById('play').classList.contains('playing')"):
+        browser.press(" ")
+    until(lambda: not moves(browser), 30.0)
+
+
+def moves(browser):
+    """Whether two looks at the stage, half a second apart, differ."""
+    before = browser.picture()[STAGE]
+    browser.run("new Promise((done) => setTimeout(done, 500))")
+    return bool((browser.picture()[STAGE] != before).any())
+
+
+@with_runtime
+def test_only_this_machine_is_answered(served):
+    port = int(re.fullmatch(r"http://127\.0\.0\.1:(\d+)", served).group(1))
+
+    def asked(path, **headers):
+        line = http.client.HTTPConnection("127.0.0.1", port, timeout=10.0)
+        line.request("GET", path, headers=headers)
+        with line.getresponse() as answer:
+            answer.read()
+        line.close()
+        return answer
+
+    assert asked("/").headers["Content-Type"] == "text/html; charset=utf-8"
+    assert asked("/page.js").headers["Content-Type"] == "text/javascript; charset=utf-8"
+    assert asked("/../pyproject.toml").status == 404
+    assert asked("/", Host="example.org").status == 403
+    with pytest.raises(ConnectionRefusedError):
+        http.client.HTTPConnection("127.0.0.2", port, timeout=5.0).connect()
+
+
+@with_runtime
+@with_chromium
+@pytest.mark.slow
+def test_the_browser_draws_the_golden_frames_again(page):
+    found = page.run("player.verify()", seconds=240.0)
+    assert len(found) > 0
+    assert all(frame["alike"] for frame in found), found
+
+
+@with_runtime
+@with_chromium
+@pytest.mark.slow
+def test_the_browser_draws_what_the_player_draws(page, package, novel):
+    player, motion = Player.load(package), read_motion(novel)
+    row, size = 7, 96
+    part = page.run(
+        f"""(async () => {{
+          const {{ Orbit }} = await import("./orbit.js");
+          const pose = player.pose({row});
+          const camera = new Orbit(player.avatar.look).camera(pose, {size}, {size});
+          const part = await player.draw({{ tier: "hq" }}, pose, camera);
+          return {{ ...part, rgba: Array.from(part.rgba) }};
+        }})()""",
+        seconds=120.0,
+    )
+    rows = slice(part["y"], part["y"] + part["height"])
+    columns = slice(part["x"], part["x"] + part["width"])
+    shown = np.zeros((size, size, 4), dtype=np.uint8)
+    shown[rows, columns] = np.reshape(part["rgba"], (part["height"], part["width"], 4))
+    expected = player.render(
+        motion[row], FollowingCamera.of(player, motion, size).camera_for(motion[row])
+    )
+    assert expected[..., 3].max() == 255
+    assert PictureDifference.of(premultiply(shown), premultiply(expected)).matches
+
+
+@with_runtime
+@with_chromium
+@pytest.mark.slow
+def test_the_page_plays_pauses_turns_and_zooms(page):
+    page.run("document.getElementById('picture').focus()")
+    until(lambda: moves(page), 30.0)
+    paused(page)
+    front = drawn(page)
+    rows, columns = np.flatnonzero(front.any(axis=1)), np.flatnonzero(front.any(axis=0))
+    assert len(rows) > 0.6 * front.shape[0]  # a person upright in the middle
+    assert abs(columns.mean() - SIZE[0] / 2.0) < 0.1 * SIZE[0]
+    page.drag((450, 300), (300, 300))
+    until(lambda: (drawn(page) != front).mean() > 0.01, 30.0)
+    until(lambda: not moves(page), 30.0)
+    turned = drawn(page)
+    for _ in range(4):
+        page.press("+")
+    until(lambda: drawn(page).mean() > 1.3 * turned.mean(), 30.0)
+    page.press("Home")
+    until(lambda: np.array_equal(drawn(page), front), 30.0)
+    before = page.run("Number(document.getElementById('timeline').value)")
+    page.press(".")
+    after = (before + 1) % 12
+    until(lambda: page.run("Number(document.getElementById('timeline').value)") == after, 30.0)
+
+
+@with_runtime
+@with_chromium
+@pytest.mark.slow
+def test_the_page_is_dark_for_those_who_like_it_and_fits_a_phone(page):
+    paused(page)
+    page.emulate(scheme="dark", size=(390, 700))
+    try:
+        until(lambda: not moves(page), 30.0)
+        until(lambda: page.picture()[70, 10].max() < 60, 30.0)
+        assert page.run("document.documentElement.scrollWidth") <= 390
+        assert 0.03 < drawn(page).mean() < 0.5
+    finally:
+        page.emulate(scheme="light", size=SIZE)
+    until(lambda: page.picture()[70, 10].min() > 200, 30.0)
+
+
+@with_runtime
+@with_chromium
+@pytest.mark.slow
+def test_keys_turn_it_before_anything_was_clicked(page):
+    paused(page)
+    page.run("document.activeElement.blur()")
+    before = drawn(page)
+    for _ in range(3):
+        page.press("ArrowLeft")
+    until(lambda: (drawn(page) != before).mean() > 0.01, 30.0)
+    page.press("Home")
+    until(lambda: np.array_equal(drawn(page), before), 30.0)
+
+
+@with_runtime
+@with_chromium
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [(640, 300), (390, 700)])
+def test_the_person_stands_above_the_bar_however_low_the_screen(page, size):
+    paused(page)
+    page.emulate(scheme="light", size=size)
+    try:
+        until(lambda: not moves(page), 30.0)
+        feet, bar = page.run(
+            """(() => {
+              const canvas = document.getElementById("picture");
+              const { width, height, clientHeight } = canvas;
+              const { data } = canvas.getContext("2d").getImageData(0, 0, width, height);
+              let last = 0;
+              for (let i = 3; i < data.length; i += 4) if (data[i] > 127) last = i;
+              const row = Math.floor(last / 4 / width);
+              const bar = document.getElementById("bar").getBoundingClientRect();
+              return [(row / height) * clientHeight, bar.top];
+            })()"""
+        )
+    finally:
+        page.emulate(scheme="light", size=SIZE)
+    assert 0.5 * bar < feet < bar
+
+
+@with_runtime
+@with_chromium
+@pytest.mark.slow
+def test_what_is_too_near_for_surfels_is_drawn_with_fewer_pixels(page):
+    far, near, beside = page.run(
+        """(async () => {
+          const { Orbit } = await import("./orbit.js");
+          const orbit = new Orbit(player.avatar.look), pose = player.pose(0);
+          const camera = () => orbit.camera(pose, 2000, 2000);
+          const width = () => player.drawable({ tier: "hq" }, pose, camera()).width;
+          const far = width();
+          orbit.nearer(100);
+          const near = width();
+          orbit.shift(0, -1e6, 2000, 2000);
+          return [far, near, width()];
+        })()"""
+    )
+    assert far == beside == 2000
+    assert 500 < near < 1800
+
+
+@with_runtime
+@with_chromium
+@pytest.mark.slow
+def test_nothing_came_from_anywhere_else(page, served):
+    names = page.run("performance.getEntriesByType('resource').map((entry) => entry.name)")
+    assert len(names) > 5
+    assert all(name.startswith(served + "/") for name in names)
+
+
+@with_runtime
+@with_chromium
+@pytest.mark.slow
+def test_the_folder_plays_below_any_address(call_play, package, tmp_path):
+    """Python's own server stands for any static host; without --poses the avatar turns round."""
+    out = tmp_path / "host" / "people" / "actor"
+    outcome = call_play(package, "--web", "--out", out)
+    assert outcome.code == 0
+    told = json.loads((out / "avatar.json").read_text())
+    told["tiers"]["other"] = told["tiers"]["hq"]
+    (out / "avatar.json").write_text(json.dumps(told))
+    host = [sys.executable, "-u", "-m", "http.server", "0", "--bind", "127.0.0.1"]
+    with subprocess.Popen(
+        host, cwd=tmp_path / "host", stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as process:
+        address = re.search(r"http://\S+", process.stdout.readline()).group(0)
+        try:
+            with Browser(tmp_path / "browser", size=SIZE) as browser:
+                browser.emulate(scheme="light", size=SIZE)
+                browser.go(f"{address.rstrip('/').rstrip(')')}/people/actor/")
+                until(lambda: browser.run("!!window.player"), 120.0)
+                until(lambda: drawn(browser).mean() > 0.03, 60.0)
+                paused(browser)
+                before = browser.picture()
+                browser.run("document.querySelector('#tiers input[value=other]').click()")
+                until(lambda: browser.run("document.getElementById('status').hidden"), 60.0)
+                until(lambda: np.array_equal(browser.picture()[STAGE], before[STAGE]), 30.0)
+                largest = max((out / "data").iterdir(), key=lambda file: file.stat().st_size)
+                largest.write_bytes(largest.read_bytes()[:-1000])  # as a copy that was cut off
+                browser.run("location.reload()")
+                until(
+                    lambda: f"{largest.name} arrived damaged or incomplete" in browser.text(), 60.0
+                )
+        finally:
+            process.terminate()
+
+
+@with_runtime
+def test_a_page_replaces_a_page_but_nothing_else(call_play, package, tmp_path):
+    out = tmp_path / "page"
+    for _ in range(2):
+        outcome = call_play(package, "--web", "--out", out)
+        assert outcome.code == 0
+        assert outcome.out.strip() == str(out)
+    assert (out / "index.html").is_file()
+    assert (out / "runtime" / "LICENSE").is_file()
+    assert (out / "runtime" / "ort.js").is_file()
+    assert not list(out.rglob("*.mjs"))  # which many hosts do not serve as a script
+    other = tmp_path / "mine"
+    other.mkdir()
+    (other / "notes.txt").write_text("mine")
+    outcome = call_play(package, "--web", "--out", other)
+    assert outcome.code == 2
+    assert "notes.txt" in outcome.complaint("ia-play")
+    assert [file.name for file in other.iterdir()] == ["notes.txt"]
+
+
+def test_without_the_runtime_it_says_how_to_get_it(call_play, package, tmp_path, monkeypatch):
+    monkeypatch.setattr(player_page, "RUNTIME_FOLDER", tmp_path / "nothing")
+    outcome = call_play(package, "--web", "--out", tmp_path / "page")
+    assert outcome.code == 2
+    assert "make web" in outcome.complaint("ia-play")
+    assert not (tmp_path / "page").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--web", "0"], "but must be a port"),
+        (["--web", "--bench"], "--bench"),
+        (["--web", "--tier", "lite"], "--tier"),
+        (["--web", "--size", "200"], "--size"),
+        (["--web", "--camera", "cameras.npz"], "--camera"),
+    ],
+)
+def test_what_the_page_cannot_do_is_refused(call_play, package, words, said):
+    outcome = call_play(package, *words)
+    assert outcome.code == 2
+    assert said in outcome.complaint("ia-play")

@@ -1,0 +1,129 @@
+"""What is learnt, again or not at all, by the results in a folder or behind a URL."""
+
+import json
+import uuid
+from pathlib import Path
+
+import pytest
+
+from capture.input_error import InputError
+from instant_avatar.batching.batch_folder import BatchFolder
+from instant_avatar.batching.capture_discovery import find_captures
+from instant_avatar.batching.remote_files import fetch_files, list_files, open_remote, read_text
+from instant_avatar.cli.command_line import CommandExit
+from instant_avatar.cli.console import Console
+
+
+@pytest.fixture(params=["file", "memory"])
+def out(request, tmp_path) -> str:
+    """A folder, and a URL in the memory of this process."""
+    return str(tmp_path / "out") if request.param == "file" else f"memory://{uuid.uuid4().hex}/out"
+
+
+def send(url: str, files: dict[str, bytes]) -> None:
+    with open_remote(url) as (system, path):
+        for name, content in files.items():
+            system.pipe_file(f"{path}/{name}", content)
+
+
+def waiting(out: str, captures, *, again: bool = False) -> list[str]:
+    """Names of the captures that a batch would learn."""
+    folder = BatchFolder(out)
+    with folder.claim(Console()):
+        return [c.name for c in captures if folder.settled(c, again=again) is None]
+
+
+def place(out: str, *attempts) -> None:
+    folder = BatchFolder(out)
+    with folder.claim(Console()):
+        for attempt in attempts:
+            folder.place_attempt(attempt)
+
+
+def test_what_ended_stands_until_it_changes_or_its_package_is_gone(out, named, ended):
+    captures = [named("a"), named("bad"), named("weak")]
+    assert waiting(out, captures) == ["a", "bad", "weak"]
+    place(out, ended(captures[0]), ended(captures[1], 2), ended(captures[2], None))
+    assert waiting(out, captures) == []
+    assert waiting(out, captures, again=True) == ["bad", "weak"]
+    assert waiting(out, [named("a", input_key="longer"), named("new")]) == ["a", "new"]
+    assert waiting(out, [named("bad", options_key="more steps")]) == ["bad"]
+    place(out, ended(named("a", options_key="more steps")))
+    assert waiting(out, captures) == ["a"]  # its package is another one now
+    place(out, ended(captures[0]))
+    assert waiting(out, captures) == []
+    if "://" in out:
+        with open_remote(out) as (system, path):
+            system.rm(f"{path}/a", recursive=True)
+    else:
+        (Path(out) / "a" / "avatar.iavatar").unlink()
+    assert waiting(out, captures) == ["a"]
+
+
+def test_a_line_per_capture_and_a_folder_for_each(out, named, ended):
+    place(out, ended(named("a"), 1), ended(named("b"), 2))
+    place(out, ended(named("a"), 0))
+    lines = [json.loads(line) for line in read_text(f"{out}/results.jsonl").splitlines()]
+    assert [(r["capture"], r["status"], r["attempt"]) for r in lines] == [
+        ("a", "failed", 1), ("b", "refused", 1), ("a", "done", 2),
+    ]  # fmt: skip
+    names = {path.removeprefix(out) for path in list_files(out)}
+    assert {"/a/avatar.iavatar", "/_failed/b/ingest.log", "/results.jsonl"} <= names
+
+
+def test_a_line_that_was_cut_short_is_dropped(named, ended, tmp_path):
+    place(str(tmp_path), ended(named("a")), ended(named("b")))
+    results = tmp_path / "results.jsonl"
+    results.write_text(results.read_text()[:-30])
+    assert waiting(str(tmp_path), [named("a"), named("b")]) == ["b"]
+    place(str(tmp_path), ended(named("b")))
+    assert len(list(map(json.loads, results.read_text().splitlines()))) == 2
+
+
+def test_files_of_others_stay(named, ended, tmp_path):
+    (tmp_path / "others").mkdir()
+    (tmp_path / "others" / "results.jsonl").write_text("mine")
+    with pytest.raises(InputError, match="others"):
+        waiting(str(tmp_path / "others"), [])
+    out = tmp_path / "out"
+    place(str(out), ended(named("a")))
+    (out / "b").mkdir()
+    (out / "b" / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match=r"notes\.txt"):
+        waiting(str(out), [named("b")])
+    (out / "results.jsonl").write_text('{"mine": 1}\n')
+    with pytest.raises(InputError, match=r"results\.jsonl"):
+        waiting(str(out), [])
+    assert (out / "results.jsonl").read_text() == '{"mine": 1}\n'
+
+
+def test_one_batch_at_a_time(tmp_path):
+    with (
+        BatchFolder(str(tmp_path)).claim(Console()),
+        pytest.raises(CommandExit),
+        BatchFolder(str(tmp_path)).claim(Console()),
+    ):
+        pass
+
+
+def test_captures_behind_a_url_are_found_and_fetched(tmp_path):
+    bucket = f"memory://{uuid.uuid4().hex}"
+    table = b"capture,poses\nmay/bob.mp4,may/anna/poses.npz\n"
+    files = {"anna/images/0.png": b"film", "anna/poses.npz": b"poses", "bob.mp4": b"other"}
+    send(f"{bucket}/may", files)
+    send(bucket, {"list.csv": table})
+    anna, bob = find_captures([f"{bucket}/may"])
+    assert (anna.name, anna.video) == ("anna", f"{bucket}/may/anna")
+    assert set(anna.sources) == {f"{bucket}/may/anna/{n}" for n in ("images/0.png", "poses.npz")}
+    assert (bob.name, bob.sources) == ("bob", (f"{bucket}/may/bob.mp4",))
+    (bob,) = find_captures([f"{bucket}/list.csv"])
+    assert bob.paths == {"--poses": f"{bucket}/may/anna/poses.npz"}
+    local = fetch_files([anna.video, *bob.places()], [*anna.sources, *bob.sources], tmp_path)
+    assert Path(local[anna.video], "images", "0.png").read_bytes() == b"film"
+    assert Path(local[bob.video]).read_bytes() == b"other"
+    assert Path(local[bob.paths["--poses"]]).read_bytes() == b"poses"
+
+
+def test_a_url_that_cannot_be_read_is_bad_input():
+    with pytest.raises(InputError, match="nonsense"):
+        list_files("nonsense://bucket/a")

@@ -1,0 +1,222 @@
+"""How commands end, and files that appear whole or not at all."""
+
+import errno
+import io
+import os
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from rich.console import Console as RichConsole
+
+from capture.image_folder import read_image
+from capture.input_error import InputError
+from instant_avatar.animation.clip_file import background_compositor
+from instant_avatar.cli.command_line import CommandExit, run_command, stop_on_interrupt
+from instant_avatar.cli.console import MAX_PRINTED_WARNINGS, Console, format_duration
+
+
+def raising(error):
+    def work():
+        raise error
+
+    return work
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "word"),
+    [
+        (InputError("3 poses for 4 frames"), 2, "3 poses for 4 frames"),
+        (OSError(errno.ENOSPC, "No space left on device"), 3, "full"),
+        (OSError(errno.EDQUOT, "Disk quota exceeded"), 3, "full"),
+        (OSError(errno.EBUSY, "Device or resource busy"), 3, "busy"),
+        (RuntimeError("CUDA error: out of memory\nat line 3"), 3, "out of memory"),
+        (PermissionError(errno.EACCES, "Permission denied", "/out"), 2, "/out"),
+        (OSError(errno.ENAMETOOLONG, "File name too long", "xxx"), 2, "too long: xxx"),
+        (OSError(errno.ELOOP, "Too many levels of symbolic links", "a"), 2, "Choose another path"),
+        (MemoryError(), 3, "memory"),
+        (KeyboardInterrupt(), 130, "Ctrl-C"),
+        (CommandExit("too [blurred]", 1), 1, "too [blurred]"),
+    ],
+)
+def test_each_failure_has_its_number_and_one_message(error, code, word, capsys):
+    assert run_command("ia-test", raising(error)) == code
+    said = capsys.readouterr().err
+    assert said.startswith("ia-test: ")
+    assert word in said
+    assert said.count("\n") == 1
+
+
+def test_notes_added_to_an_error_are_printed(capsys):
+    error = OSError(errno.ENOSPC, "No space left on device")
+    error.add_note("The checkpoint is kept.")
+    assert run_command("ia-test", raising(error)) == 3
+    assert "The checkpoint is kept." in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError(), RuntimeError("shape"), OSError(5, "EIO")])
+def test_our_own_faults_keep_their_traceback(error):
+    with pytest.raises(type(error)):
+        run_command("ia-test", raising(error))
+
+
+def test_what_an_import_makes_of_ctrl_c_is_still_ctrl_c(capsys):
+    def half_imported():
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+        except KeyboardInterrupt:
+            raise ImportError("initialization failed") from None
+
+    before = signal.getsignal(signal.SIGINT)
+    assert run_command("ia-test", half_imported) == 130
+    assert capsys.readouterr().err == "ia-test: stopped by Ctrl-C.\n"
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_machine_that_asks_for_an_end_is_answered_like_ctrl_c(capsys):
+    before = signal.getsignal(signal.SIGTERM)
+    assert run_command("ia-test", lambda: signal.raise_signal(signal.SIGTERM) or 0) == 130
+    assert capsys.readouterr().err == "ia-test: stopped by Ctrl-C.\n"
+    assert signal.getsignal(signal.SIGTERM) is before
+    said = Console(RichConsole(file=io.StringIO()))
+
+    def saves():
+        with stop_on_interrupt(said) as stop:
+            signal.raise_signal(signal.SIGTERM)
+            return 130 if stop.is_set() else 0
+
+    assert run_command("ia-test", saves) == 130
+
+
+def test_where_nothing_is_to_be_saved_ctrl_c_does_not_wait_for_other_threads():
+    """They would have a tree taken away from under them, and the process would crash."""
+    code = (
+        "import os, signal, threading, time\n"
+        "from instant_avatar.cli.console import Console\n"
+        "from instant_avatar.cli.command_line import exit_on_interrupt\n"
+        "with exit_on_interrupt(Console(), 'ia-test'):\n"
+        "    threading.Thread(target=time.sleep, args=(60,)).start()\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "    time.sleep(60)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=50
+    )
+    assert done.returncode == 130
+    assert done.stderr == "ia-test: stopped by Ctrl-C.\n"
+
+
+@pytest.mark.parametrize(("name", "shown"), [("ia-play", False), ("mine.py", True)])
+def test_a_command_that_is_stopped_while_it_loads_shows_no_traceback(name, shown):
+    code = f"import sys; sys.argv = ['/bin/{name}']; import instant_avatar; raise KeyboardInterrupt"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=50
+    )
+    assert ("Traceback" in done.stderr) is shown
+    assert done.returncode != 0
+
+
+def test_a_reader_that_has_seen_enough_is_no_fault():
+    printing = "[print('x' * 999) for _ in range(999)]"
+    code = f"import sys; sys.argv = ['ia-play']; import instant_avatar; {printing}"
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stdout.readline()
+        process.stdout.close()
+        assert process.stderr.read() == b""
+
+
+def test_work_continues_when_its_output_is_closed():
+    code = (
+        "import sys\n"
+        "from instant_avatar.cli.console import Console\n"
+        "from instant_avatar.cli.command_line import CommandExit, run_command\n"
+        "def work():\n"
+        "    for _ in range(99): Console().info('x' * 999)\n"
+        "    print('done', flush=True)\n"
+        "    raise CommandExit('too late', 2)\n"
+        "sys.exit(run_command('ia-test', work))\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stderr.readline()
+        process.stderr.close()
+        assert process.stdout.read() == b"done\n"
+        assert process.wait(timeout=50) == 2
+
+
+def test_warnings_are_said_once_and_not_for_ever():
+    said = io.StringIO()
+    console = Console(RichConsole(file=said, soft_wrap=True))
+    for number in range(MAX_PRINTED_WARNINGS + 3):
+        console.warning(f"frame {number} [bold]")
+        console.warning(f"frame {number} [bold]")
+    console.summarize_warnings()
+    assert said.getvalue().count("frame") == MAX_PRINTED_WARNINGS
+    assert "and 3 more" in said.getvalue()
+    assert "[bold]" in said.getvalue()
+    assert len(console.warnings) == MAX_PRINTED_WARNINGS + 3
+
+
+def test_a_log_gets_plain_lines_and_few(monkeypatch):
+    said = io.StringIO()
+    console = Console(RichConsole(file=said))
+    with console.progress("learning", 60.0) as bar:
+        for step in range(100):
+            bar.update(float(step), f"step {step}")
+        monkeypatch.setattr("instant_avatar.cli.console.LOG_INTERVAL_S", 0.0)
+        bar.update(60.0, "the end")
+    assert said.getvalue() == "learning\nlearning: the end\n"
+
+
+def test_a_count_says_how_long_the_rest_takes(monkeypatch):
+    """A quarter is done after ten seconds, so thirty are left."""
+    now, said = [100.0], io.StringIO()
+    monkeypatch.setattr("instant_avatar.cli.console.time.perf_counter", lambda: now[0])
+    with Console(RichConsole(file=said)).progress("scoring 12 held-out frames", 12.0) as bar:
+        bar.set_count(1)  # too early to say
+        now[0] += 10.0
+        bar.set_count(3)
+        now[0] += 30.0
+        bar.set_count(12)
+    assert said.getvalue().splitlines() == [
+        "scoring 12 held-out frames",
+        "scoring 12 held-out frames: 3 of 12, about 30 s left",
+        "scoring 12 held-out frames: 12 of 12",
+    ]
+
+
+def test_a_long_note_leaves_a_bar_its_name():
+    said = io.StringIO()
+    rich = RichConsole(file=said, force_terminal=True, width=100, color_system=None)
+    with Console(rich).progress("writing the package", 1.0) as bar:
+        bar.update(0.4, "40% " + 200 * "x")
+    assert "writing the package" in said.getvalue()
+    assert "40%" in said.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"),
+    [(0.2, "1 s"), (8.4, "8 s"), (43.0, "45 s"), (89.0, "90 s"), (130.0, "2 min")],
+)
+def test_durations_as_people_say_them(seconds, said):
+    assert format_duration(seconds) == said
+
+
+def test_colors_and_images_serve_as_backgrounds(tmp_path, rng):
+    rgba = rng.integers(0, 256, (6, 8, 4), dtype=np.uint8)
+    rgba[0, :, 3], rgba[1, :, 3] = 0, 255
+    on_blue = background_compositor("rgb(10, 20, 250)")(rgba)
+    assert (on_blue[0] == [10, 20, 250]).all()
+    np.testing.assert_array_equal(on_blue[1], rgba[1, :, :3])
+    from PIL import Image
+
+    path = tmp_path / "wall.png"
+    Image.fromarray(rng.integers(0, 256, (6, 20, 3), dtype=np.uint8)).save(path)
+    on_wall = background_compositor(str(path))(rgba)
+    np.testing.assert_array_equal(on_wall[0], read_image(path)[0][0, 6:14])
+    np.testing.assert_array_equal(on_wall[1], rgba[1, :, :3])

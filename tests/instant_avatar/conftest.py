@@ -1,0 +1,162 @@
+"""A short film of the actor and a short run on it, shared by all tests of the commands."""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from avatar.rig import Rig
+from avatar.training import held_out_pose_fitting, train
+from capture.atomic_files import write_text_atomically
+from export.bake import bake_tables, fine_tuning
+from export.build import ExportReport
+from instant_avatar import ingest, play
+from instant_avatar.report import report_writer
+from instant_avatar.run import session_start, snapshot_writer
+from instant_avatar.studio.shoot import ShootConfig, film_capture
+from preprocess.capture_session import CaptureInputs
+from preprocess.open_capture import open_capture
+
+
+@dataclass(frozen=True, kw_only=True)
+class Outcome:
+    """How a command ended.
+
+    Attributes:
+        code: Its exit code.
+        out, err: What it said.
+    """
+
+    code: int
+    out: str
+    err: str
+
+    def complaint(self, program: str = "ia-ingest") -> str:
+        """Its one message, as one line of words."""
+        said = [line for line in self.err.splitlines() if line.startswith(f"{program}:")]
+        assert len(said) == 1, self.err
+        assert "Traceback" not in self.err
+        return said[0]
+
+
+Command = Callable[..., Outcome]
+
+ENOUGH_STEPS = 150
+"""Training steps after which this film's avatar is firm enough for a package."""
+FEW_STEPS = 10
+"""Training steps where a test is not about what was learnt."""
+
+
+BRIEF = pytest.MonkeyPatch()
+"""A shorter end of a run; undone after each test, for other folders measure what it shortens."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup():
+    """Fine-tune on fewer, smaller images, fit poses in fewer steps, and show a shorter film."""
+    BRIEF.setattr(bake_tables, "FINE_TUNING_PICTURES", 4)
+    BRIEF.setattr(fine_tuning, "TRAINING_PX", 128)
+    BRIEF.setattr(fine_tuning, "VALIDATION_PX", 128)
+    BRIEF.setattr(held_out_pose_fitting, "CORRECTIONS_PER_FRAME", 4)
+    BRIEF.setattr(report_writer, "ANIMATION_PX", 160)
+    BRIEF.setattr(report_writer, "ANIMATION_FRAMES", 12)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown():
+    """Undo it."""
+    BRIEF.undo()
+
+
+@pytest.fixture(scope="session")
+def film(tmp_path_factory) -> Path:
+    """A capture folder: 24 frames of 64 px."""
+    folder = tmp_path_factory.mktemp("film") / "capture"
+    film_capture(folder, ShootConfig(frames=24, size=64, background="plain"))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def run(film, tmp_path_factory) -> Path:
+    """What ia-ingest makes of it."""
+    out = tmp_path_factory.mktemp("runs") / "run"
+    assert ingest.main([str(film), "--out", str(out), "--steps", str(ENOUGH_STEPS)]) == 0
+    return out
+
+
+@pytest.fixture(scope="session")
+def rig(film) -> Rig:
+    """The rig of the actor, whom all of these films are about."""
+    return Rig.from_shaped_body(open_capture(CaptureInputs(video=film)).shaped)
+
+
+@pytest.fixture
+def capture(film, tmp_path) -> Path:
+    """A copy of the film that a test may spoil."""
+    copy = tmp_path / "capture"
+    shutil.copytree(film, copy)
+    return copy
+
+
+@pytest.fixture
+def call_ingest(capsys, monkeypatch, rig) -> Command:
+    """Runs ia-ingest, for a few steps unless the test says otherwise."""
+    monkeypatch.setattr(session_start.Rig, "from_shaped_body", lambda shaped: rig)
+    monkeypatch.setattr(train, "warm_up", lambda trainer: 0.0)
+
+    def call(*arguments: object, steps: int = FEW_STEPS) -> Outcome:
+        words = [str(argument) for argument in arguments]
+        code = ingest.main([*words, "--steps", str(steps)])
+        captured = capsys.readouterr()
+        return Outcome(code=code, out=captured.out, err=captured.err)
+
+    return call
+
+
+@pytest.fixture
+def call_play(capsys) -> Command:
+    """Runs ia-play."""
+
+    def call(*arguments: object) -> Outcome:
+        code = play.main([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return Outcome(code=code, out=captured.out, err=captured.err)
+
+    return call
+
+
+@pytest.fixture
+def without_baking(monkeypatch) -> None:
+    """Leaves out the seconds that baking takes, where a test is not about the package.
+
+    Nor is it about how good the avatar is, for which half a second may not be enough.
+    """
+
+    def export_nothing(avatar, path, *, views, metrics, quick, fine_tune_bricks, progress):
+        write_text_atomically(path, "stand-in")
+        return ExportReport(
+            path=path, bytes=8, seconds=0.0, psnr_to_renderer={"hq": 40.0},
+            largest_difference=0.0, fine_tuning_psnr=None, warnings=(),
+        )  # fmt: skip
+
+    monkeypatch.setattr(snapshot_writer, "export_avatar", export_nothing)
+    monkeypatch.setattr(snapshot_writer, "update_metrics", lambda path, metrics: 8)
+    monkeypatch.setattr(report_writer, "diagnose_failure", lambda report: None)
+    monkeypatch.setattr(report_writer, "demo_animation", lambda player: b"")
+    monkeypatch.setattr(report_writer.Player, "load", lambda path: None)
+
+
+@pytest.fixture
+def changed() -> Callable[..., None]:
+    """Rewrites an .npz with some arrays changed, or left out where they are None."""
+
+    def change(path: Path, **arrays: np.ndarray | None) -> None:
+        with np.load(path) as archive:
+            content = {key: archive[key] for key in archive.files}
+        content.update(arrays)
+        np.savez(path, **{key: array for key, array in content.items() if array is not None})
+
+    return change

@@ -1,0 +1,281 @@
+"""ia-evaluate: the same figures as the report's, and the paper's protocol."""
+
+import json
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+
+from avatar.evaluation.image_metrics import ground_truth_on_white, ground_truth_over
+from avatar.evaluation.perceptual import Lpips
+from instant_avatar import evaluate
+from instant_avatar.cli import hardware
+from instant_avatar.cli.command_line import INTERRUPTED
+from instant_avatar.evaluation import datasets
+from instant_avatar.evaluation.evaluation_session import FrameScorer
+from instant_avatar.evaluation.frame_scoring import SHOWN_FRAMES, FrameScore, score_picture
+from instant_avatar.evaluation.score_table import (
+    AvatarEvaluation,
+    ScoreRow,
+    markdown_table,
+)
+from preprocess.capture_session import CaptureInputs
+from preprocess.open_capture import open_capture
+from tests.instant_avatar.conftest import Outcome
+from tests.instant_avatar.report.test_report_page import Tags
+
+
+@pytest.fixture
+def call_evaluate(capsys):
+    """Runs ia-evaluate."""
+
+    def call(*arguments):
+        code = evaluate.main([str(argument) for argument in arguments])
+        captured = capsys.readouterr()
+        return Outcome(code=code, out=captured.out, err=captured.err)
+
+    return call
+
+
+def rows_of(path):
+    (avatar,) = json.loads(path.read_text())["avatars"]
+    return {
+        (row["renderer"], row["poses"]): row
+        for row in avatar["rows"]
+        if row["background"] == "white"
+    }
+
+
+def test_a_runs_own_table_says_what_its_report_says(run, call_evaluate, tmp_path):
+    ended = call_evaluate(run, "--json", tmp_path / "t.json", "--markdown", tmp_path / "t.md")
+    assert ended.code == 0, ended.err
+    report, rows = json.loads((run / "report.json").read_text()), rows_of(tmp_path / "t.json")
+    assert set(rows) == {
+        ("renderer", "given"), ("renderer", "fitted"), ("player hq", "given"),
+        ("player lite", "given"),
+    }  # fmt: skip
+    for poses, key in (("given", "held_out"), ("fitted", "held_out_refined")):
+        row = rows["renderer", poses]
+        assert [frame["frame"] for frame in row["frames"]] == report[key]["frames"]
+        for figure in ("psnr", "psnr_mask", "ssim"):
+            assert row[figure] == pytest.approx(report[key][figure], abs=2e-4)
+    assert rows["player hq", "given"]["psnr"] > rows["player lite", "given"]["psnr"] > 20.0
+    assert (tmp_path / "t.md").read_text() == ended.out
+    assert f"{report['held_out']['psnr']:.2f}" in ended.out
+    assert rows["renderer", "given"]["verdict"] == report["held_out"]["verdict"]
+
+
+def test_a_package_alone_is_scored_as_within_its_run(run, film, call_evaluate, tmp_path):
+    for name, what in (("run", run), ("package", run / "avatar.iavatar")):
+        ended = call_evaluate(
+            what, "--on", film, "--frames", "3::8", "--no-fitted", "--json", tmp_path / name
+        )
+        assert ended.code == 0, ended.err
+    whole, alone = rows_of(tmp_path / "run"), rows_of(tmp_path / "package")
+    assert set(alone) == {("player hq", "given"), ("player lite", "given")}
+    for way, row in alone.items():
+        assert [frame["frame"] for frame in row["frames"]] == [3, 11, 19]
+        assert row["psnr"] == whole[way]["psnr"]
+
+
+@pytest.fixture
+def dataset(film, call_ingest, tmp_path, monkeypatch):
+    """Two subjects in the paper's layout, with shorter lists."""
+    lists = {datasets.TRAIN_POSES: np.s_[0:16:2], datasets.TEST_POSES: np.s_[16:24:3]}
+    names = ("female-3-casual", "male-3-casual")
+    monkeypatch.setattr(datasets, "SPLITS", dict.fromkeys(names, ("0:16:2", "16:24:3")))
+    for name in names:
+        place = tmp_path / "PeopleSnapshot" / name
+        shutil.copytree(film, place)
+        poses = dict(np.load(place / "poses.npz"))
+        kept = {key: each for key, each in poses.items() if key not in ("frame", "time", "valid")}
+        (place / "poses").mkdir()
+        for path, rows in lists.items():
+            timed = {key: kept[key][rows] for key in ("global_orient", "body_pose", "transl")}
+            np.savez(place / path, **(kept | timed))
+        (place / "poses.npz").unlink()
+    return tmp_path / "PeopleSnapshot"
+
+
+def psnrs(ended):
+    return [line.split("|")[6] for line in ended.out.splitlines()]
+
+
+def test_the_papers_frames_are_learnt_scored_and_set_beside_the_papers_figures(
+    dataset, call_evaluate, without_baking, tmp_path
+):
+    place, out = dataset / "male-3-casual", tmp_path / "evaluation"
+
+    def call(steps):
+        words = ("--out", out, "--size", 64, "--no-player", "--json", tmp_path / "t", "--overwrite")
+        return call_evaluate(place, *words, "--steps", steps)
+
+    ended = call(10)
+    assert ended.code == 0, ended.err
+    frames = json.loads((out / place.name / "report.json").read_text())["frames"]
+    assert (frames["used"] + frames["near_duplicates"], frames["held_out"]) == (8, 0)
+    row = rows_of(tmp_path / "t")["renderer", "given"]
+    assert [frame["frame"] for frame in row["frames"]] == [16, 19, 22]
+    assert "InstantAvatar (paper)" in ended.out
+    assert "29.65" in ended.out
+    (avatar,) = json.loads((tmp_path / "t").read_text())["avatars"]
+    ways = [(row["poses"], row["background"]) for row in avatar["rows"]]
+    assert ways == [(p, on) for p in ("given", "fitted") for on in ("white", "black")]
+    assert "LPIPS (alex, vgg) was not measured" in ended.err
+    assert "n/a" in ended.out
+    again = call(10)
+    assert "was trained before" in again.err
+    assert psnrs(again) == psnrs(ended)
+    longer = call(15)
+    assert "Resuming after 10 steps" in longer.err
+    assert "was trained before" not in longer.err
+
+
+@pytest.mark.slow
+def test_a_stopped_lesson_leaves_the_table_of_those_before(
+    dataset, call_evaluate, without_baking, tmp_path, monkeypatch
+):
+    train = evaluate.ingest
+
+    def stopped_in_the_second(given, console):
+        return INTERRUPTED if given.video.name == "male-3-casual" else train(given, console)
+
+    monkeypatch.setattr(evaluate, "ingest", stopped_in_the_second)
+    ended = call_evaluate(
+        dataset, "--out", tmp_path / "out", "--steps", 10, "--size", 64, "--no-player"
+    )
+    assert ended.code == INTERRUPTED
+    assert "female-3-casual" in ended.out
+    assert "male-3-casual" not in ended.out.replace("female-3-casual", "")
+
+
+def test_the_papers_lists_are_as_long_as_the_paper_says():
+    counts = {"female-3-casual": (112, 51), "female-4-casual": (84, 48), "male-3-casual": (114, 55),
+              "male-4-casual": (110, 36)}  # fmt: skip
+    for name, splits in datasets.SPLITS.items():
+        lists = [range(*map(int, text.split(":"))) for text in splits]
+        assert tuple(map(len, lists)) == counts[name]
+    assert datasets.PAPER.keys() == counts.keys()
+
+
+def test_a_box_is_scored_without_the_white_around_it(film):
+    (seen, *_) = open_capture(CaptureInputs(video=film)).observations()
+    truth = ground_truth_on_white(seen)
+    wrong = np.dstack([np.clip(truth - 0.1, 0.0, 1.0), np.ones(truth.shape[:2])]).astype(np.float32)
+    score = score_picture(seen, wrong, "white")
+    rows, columns = np.nonzero(seen.alpha > 0.5)
+    box = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+    error = ((wrong[..., :3] - truth)[box].astype(float) ** 2).mean()
+    assert score.psnr_box == pytest.approx(-10.0 * np.log10(error), abs=1e-4)
+    perfect = np.dstack([truth, np.ones(truth.shape[:2], np.float32)])
+    score = score_picture(seen, perfect, "white")
+    assert (score.psnr_box, score.ssim) == (np.inf, pytest.approx(1.0))
+
+
+def test_each_background_has_its_own_scores_of_one_rendering(film, monkeypatch):
+    monkeypatch.setattr(Lpips, "compare", lambda self, image, truth, name: float(image.mean()))
+    lpips = Lpips(())
+    lpips.conventions = ("alex",)
+    (seen, *_) = open_capture(CaptureInputs(video=film)).observations()
+    alpha = 0.5 * seen.alpha[..., None]
+    picture = np.concatenate([alpha * (seen.frame.rgb / np.float32(255.0)), alpha], axis=-1)
+    drawn = FrameScorer({"hq": lambda _: picture}, None, ("white", "black"), lpips)
+    drawn.score_frame(seen)
+    white, black = (row.scores[0] for row in drawn.rows)
+    for score, gray in ((white, 1.0), (black, 0.0)):
+        shown = picture[..., :3] + np.float32(gray) * (1.0 - picture[..., 3:])
+        error = ((shown - ground_truth_over(seen, gray)).astype(float) ** 2).mean()
+        assert score.psnr == pytest.approx(-10.0 * np.log10(error), abs=1e-3)
+        assert score.as_json()["lpips_alex"] == pytest.approx(shown.mean(), abs=1e-4)
+    assert white.psnr != black.psnr
+    assert white.overlap == black.overlap
+
+
+def test_a_table_is_markdown_and_its_means_are_means():
+    def avatar(name, psnr):
+        score = FrameScore(
+            frame=0, psnr=psnr, psnr_mask=20.0, psnr_box=25.0, ssim=0.9, cpu_ms=np.inf,
+            blur=0.01, overlap=0.9,
+        )  # fmt: skip
+        row = ScoreRow(renderer="renderer", poses="given", scores=[score])
+        return AvatarEvaluation(name=name, capture="c", size=(8, 8), rows=[row])
+
+    lines = markdown_table([avatar("one", 30.0), avatar("other", 33.0)]).splitlines()
+    assert len({line.count("|") for line in lines}) == 1
+    assert len(set(map(len, lines))) == 1
+    cells = [cell.strip() for cell in lines[-1].split("|")]
+    assert cells[1:7] == ["mean", "2", "renderer", "given", "white", "31.50"]
+    assert lines[2].endswith("| soft  |")
+
+
+def test_a_page_holds_conditions_scores_and_pictures(run, film, call_evaluate, tmp_path):
+    words = ("--no-fitted", "--background", "white", "black", "--dance", film / "poses.npz")
+    out = ("--card", tmp_path / "card.html", "--json", tmp_path / "t.json")
+    ended = call_evaluate(run, *words, *out)
+    assert ended.code == 0, ended.err
+    content = json.loads((tmp_path / "t.json").read_text())
+    conditions, (avatar,) = content["conditions"], content["avatars"]
+    assert conditions["background"] == "white and black"
+    assert conditions["resolution"] == "64x64 px"
+    page = (tmp_path / "card.html").read_text()
+    tags = Tags(page)
+    scored = len(avatar["rows"][0]["frames"])
+    assert len(tags.addresses) == 3 * min(scored, SHOWN_FRAMES) + 1  # and the dance
+    assert all(address.startswith("data:image/webp;base64,") for address in tags.addresses)
+    assert f"{avatar['rows'][0]['psnr']:.2f}" in page
+    assert conditions["software"] in page
+    again = call_evaluate(run, *words, *out)
+    assert again.code == 2
+    assert "card.html" in again.complaint("ia-evaluate") or "t.json" in again.err
+
+
+def test_a_run_is_found_again_from_another_folder(run, film, call_evaluate, tmp_path, monkeypatch):
+    place = tmp_path / "then"
+    shutil.copytree(film, place / "capture")
+    shutil.copytree(run, place / "out" / "run")
+    report = place / "out" / "run" / "report.json"
+    content = json.loads(report.read_text())
+    content["command"] |= {"video": "capture", "out": "out/run"}
+    report.write_text(json.dumps(content))
+    monkeypatch.chdir(tmp_path)
+    ended = call_evaluate(place / "out" / "run", "--no-fitted", "--no-player")
+    assert ended.code == 0, ended.err
+    assert f"{content['held_out']['psnr']:.2f}" in ended.out
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["{run}", "--frames", "0:5"], "--on"),
+        (["{run}", "--dance", "{film}/poses.npz"], "--card"),
+        (["{run}", "--lpips-weights", "{tmp}/nothing"], "--lpips-weights"),
+        (["{run}/avatar.iavatar"], "--on"),
+        (["{tmp}"], "neither a run"),
+        (["{tmp}/nothing"], "does not exist"),
+        (["{data}", "--on", "{film}"], "omit --on"),
+        (["{run}", "--size", "4"], "16 pixels"),
+        (["{run}", "--on", "{film}", "--frames", "500:"], "frames"),
+        (["{lost}"], "report.json"),
+        ([], "run"),
+    ],
+)
+def test_what_cannot_be_scored_is_refused_with_the_reason(
+    run, film, call_evaluate, tmp_path, words, told
+):
+    lost = tmp_path / "lost"
+    shutil.copytree(run, lost)
+    (lost / "report.json").unlink()
+    (data := tmp_path / "sets" / "male-3-casual").mkdir(parents=True)
+    places = {"data": data, "run": run, "film": film, "tmp": tmp_path, "lost": lost}
+    ended = call_evaluate(*(word.format(**places) for word in words))
+    assert ended.code == 2
+    assert told in ended.complaint("ia-evaluate")
+    assert ended.out == ""
+
+
+def test_an_installation_within_another_checkout_has_no_commit(monkeypatch, tmp_path):
+    subprocess.run(["git", "init", "-q", tmp_path], check=True)
+    (tmp_path / "site-packages").mkdir()
+    monkeypatch.setattr(hardware, "ROOT", tmp_path / "site-packages")
+    assert hardware._commit() == "unknown"

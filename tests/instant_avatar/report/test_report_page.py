@@ -1,0 +1,332 @@
+"""The report: numbers that a machine can read and a page that needs nothing else."""
+
+import json
+import re
+from dataclasses import is_dataclass, replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import get_args, get_type_hints
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from avatar.evaluation.all_round_verdict import AllRoundVerdict
+from avatar.events import HeldOutScore
+from instant_avatar.report.page_rendering import data_uri, encode_webp, webp_data_uri
+from instant_avatar.report.report_figures import curve_svg
+from instant_avatar.report.report_page import ComparisonPair, report_page
+from instant_avatar.report.report_schema import (
+    CurvePoint,
+    ForgettingStats,
+    FrameStats,
+    HeldOutStats,
+    MachineInfo,
+    Percentiles,
+    Report,
+    StreamStats,
+    TrainingStats,
+    finite_mean,
+    format_psnr,
+)
+from instant_avatar.report.report_writer import diagnose_failure, play_command
+from preprocess.observation import DroppedFrame
+
+
+def point(seconds, psnr, psnr_mask=None):
+    return CurvePoint(
+        wall_seconds=seconds, cpu_seconds=seconds, frames_seen=9, psnr=psnr, psnr_mask=psnr_mask
+    )
+
+
+def report(**changes):
+    content = {
+        "command": {"video": "a <b> & c.mp4"},
+        "recipe": {"rays": 1024, "finest_m": 0.0081234567},
+        "machine": MachineInfo(threads=2),
+        "frames": FrameStats(
+            read=20,
+            used=17,
+            held_out=2,
+            dropped=(DroppedFrame(index=7, reason="pose invalid"),),
+            near_duplicates=0,
+            not_replayed=0,
+        ),
+        "training": TrainingStats(
+            wall_seconds=60.0,
+            step_cpu_seconds=1.0,
+            cpu_seconds=61.0,
+            cpu_contention_seconds=0.5,
+            startup_seconds=3.0,
+            steps=100,
+            rays=102400,
+            rays_per_second=1706.7,
+            samples_per_ray=7.0,
+            peak_memory_mb=900.0,
+        ),
+        "held_out": HeldOutStats.of((), None),
+        "curve": (point(2.0, 24.0, 18.0), point(5.0, 29.0, 23.0)),
+        "stream": StreamStats(
+            realtime=False,
+            ingest_ms=Percentiles(p50=20.0, p95=30.0),
+            inbox_dropped=0,
+            ready_after_last_frame_seconds=None,
+            latency_ms=Percentiles(p50=25.0, p95=40.0),
+            lateness_ms=Percentiles(p50=0.0, p95=1.0),
+            inbox_depth=Percentiles(p50=0.0, p95=2.0),
+        ),
+        "package": None,
+        "all_round": judged(None),
+    }
+    return Report(**{**content, **changes})
+
+
+def judged(held_out):
+    return AllRoundVerdict.of(
+        held_out, seen=0.99, half_transparent=0.08, player_psnr=44.0, film_advice="Turn."
+    )
+
+
+def scores(*values):
+    return tuple(
+        HeldOutScore(frame=9 + 10 * i, psnr=psnr, psnr_mask=mask, ssim=0.9)
+        for i, (psnr, mask) in enumerate(values)
+    )
+
+
+def test_the_mean_leaves_out_what_is_no_number():
+    assert finite_mean([1.0, float("nan"), 3.0, float("inf")]) == 2.0
+    assert finite_mean([float("nan")]) is None
+    assert finite_mean([]) is None
+
+
+def test_a_frame_without_a_person_has_no_masked_score():
+    note = HeldOutStats.of(scores((30.0, 20.0), (32.0, float("nan"))), (64, 48))
+    assert (note.psnr, note.psnr_mask) == (31.0, 20.0)
+    assert note.frames == (9, 19)
+
+
+def test_nothing_to_score_is_null():
+    content = json.loads(report().to_json())
+    assert content["held_out"]["psnr"] is None
+    assert content["held_out"]["frames"] == []
+    assert content["package"] is None
+    assert content["held_out_refined"] is None
+
+
+def test_nan_and_infinity_become_null():
+    text = report(curve=(point(2.0, float("nan"), float("inf")),)).to_json()
+    content = json.loads(text, parse_constant=lambda name: pytest.fail(name))
+    assert content["curve"][0]["psnr"] is None
+    assert content["curve"][0]["psnr_mask"] is None
+
+
+def test_the_page_reports_forgetting():
+    marks = (
+        point(2.0, 24.0),
+        replace(point(40.0, 20.0), video=2),
+        replace(point(50.0, 21.0), video=2),
+    )
+    earlier = ForgettingStats(
+        videos=("first <1>.mp4",), video_of_frame=(1, 1), frames_trained=54, wall_seconds=30.0,
+        replayed_key_frames=40, frames=(9, 19), psnr_before=21.0, psnr_after=21.25,
+        largest_drop=0.5,
+    )  # fmt: skip
+    page = report_page(report(earlier_videos=earlier, curve=marks), name="second.mp4")
+    lead = "17 frames of this video, and 54 of first &lt;1&gt;.mp4"
+    assert lead in page
+    assert "60 seconds (30 on this video)" in page
+    assert "40 key frames of first" in page
+    assert "21.00 dB before this video, 21.25 dB now." in page
+    svg = ElementTree.fromstring(curve_svg(marks))
+    lines = [line.get("points").split() for line in svg.findall("polyline[@class='whole']")]
+    assert [len(line) for line in lines] == [1, 2]
+    assert [text.text for text in svg.findall("text") if "video" in text.text] == [
+        "video 1",
+        "video 2",
+    ]
+
+
+def test_a_point_of_the_curve_survives_a_checkpoint():
+    kept = replace(point(2.0, 24.0), frames=((9, 30.0), (19, 20.0)))
+    assert CurvePoint.from_checkpoint(json.loads(json.dumps(vars(kept)))) == kept
+    older = {key: value for key, value in vars(kept).items() if key not in ("frames", "verdict")}
+    assert CurvePoint.from_checkpoint(older).frames == ()
+
+
+class Tags(HTMLParser):
+    """Checks that tags close in order, and collects addresses."""
+
+    VOID = ("meta", "img", "br")
+
+    def __init__(self, page):
+        super().__init__()
+        self.open, self.addresses = [], []
+        self.feed(page)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.addresses += [value for name, value in attrs if name in ("src", "href")]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_the_page_is_whole_and_asks_for_no_other_file():
+    white = webp_data_uri(np.full((4, 4, 3), 255, np.uint8))
+    page = report_page(
+        report(),
+        name="a <b> & c.mp4",
+        pairs=[ComparisonPair(frame=9, psnr=30.0, verdict="soft", truth=white, render=white)],
+        animation=data_uri(encode_webp([np.zeros((4, 4, 4), np.uint8)] * 3, fps=10.0)),
+        warnings=["masks <turned>", "Frame 7 is left out: pose invalid."],
+    )
+    tags = Tags(page)
+    assert len(tags.addresses) == 3
+    assert all(address.startswith("data:image/webp;base64,") for address in tags.addresses)
+    assert "a &lt;b&gt; &amp; c.mp4" in page
+    assert "masks &lt;turned&gt;" in page
+    assert "Skipped, pose invalid: frame 7." in page
+    assert "url(" not in page
+    assert 'tabindex="0"' in page  # a click enlarges a pair, by its focus alone
+
+
+def test_a_page_without_pictures_or_scores_is_whole_too():
+    page = report_page(report(curve=()), name="clip")
+    assert Tags(page).addresses == []
+    assert "<svg" not in page
+    assert "n/a" in page
+    assert "not scored" in page
+
+
+def test_every_psnr_on_the_page_has_its_verdict():
+    note = replace(
+        HeldOutStats.of(scores((22.78, 16.4)), (64, 48)), verdict="blurred", blur=0.016, overlap=0.9
+    )
+    pair = ComparisonPair(frame=9, psnr=22.78, verdict="blurred", truth="data:,", render="data:,")
+    page = report_page(replace(report(), held_out=note), name="clip", pairs=[pair])
+    assert "held-out PSNR, on white: blurred" in page
+    assert "22.78 dB (blurred)" in page
+    assert "no usable avatar" not in page
+
+
+def failed(*, steps, video="my clip.mp4", overlap=0.9):
+    note = replace(
+        HeldOutStats.of(scores((6.88, 6.0)), (64, 48)), verdict="failed", overlap=overlap
+    )
+    given = report()
+    return replace(
+        given,
+        held_out=note,
+        all_round=judged("failed"),
+        training=replace(given.training, steps=steps),
+        command={"video": video, "poses": "p.npz", "masks": None, "cameras": "solve"},
+    )
+
+
+def test_a_failure_names_what_was_seen_and_what_to_do():
+    room = diagnose_failure(failed(steps=900, overlap=0.2))
+    assert "6.88 dB (failed)" in room
+    assert "the IoU of rendered alpha and masks is 0.20" in room
+    assert room.endswith("ia-check 'my clip.mp4' --poses p.npz")
+    assert "blurred by 8% of body height" in diagnose_failure(failed(steps=900))
+    assert "Only 26 steps were made" in diagnose_failure(failed(steps=26))
+    assert "ia-check" not in diagnose_failure(failed(steps=900, video="camera:0"))
+    assert diagnose_failure(report()) is None
+
+
+def test_nothing_has_failed_during_training():
+    assert format_psnr(13.3, "failed", digits=1) == "13.3 dB (failed)"
+    assert format_psnr(13.3, "failed", provisional=True) == "13.30 dB (not converged yet)"
+    assert format_psnr(30.0, "soft", provisional=True) == "30.00 dB (soft)"
+    assert format_psnr(30.0, None) == "30.00 dB"
+    assert format_psnr(None, None) == "n/a"
+
+
+def test_an_avatar_of_one_side_is_not_called_sharp():
+    one_sided = AllRoundVerdict.of(
+        "sharp", seen=0.45, half_transparent=0.11, player_psnr=40.0, film_advice="Turn round."
+    )
+    kept = replace(report(), all_round=one_sided)
+    assert kept.verdict == "blurred"
+    assert json.loads(kept.to_json())["all_round"]["limit"] == "filmed"
+    page = report_page(kept, name="clip")
+    assert "55% of the skin was not filmed" in page
+    assert "Turn round." in page
+    assert diagnose_failure(kept) is None
+
+
+SOLVED = {
+    "verdict": "solved", "focal_px": 434.2, "scale": {"cues": ["ground"]},
+    "frames": {"key": 60, "placed": 28, "interpolated": 2, "missing": 0},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        (None, None),
+        ({"verdict": "still"}, "did not move"),
+        (SOLVED, "434 px; metric scale from: ground"),
+    ],
+)  # fmt: skip
+def test_the_page_describes_solved_cameras(found, said):
+    page = report_page(replace(report(), cameras=found), name="clip")
+    assert Tags(page).addresses == []
+    assert ("<h2>Cameras" in page) == (said is not None)
+    assert said is None or said in page
+
+
+def test_the_page_names_no_file_that_is_not_there():
+    solved = replace(report(), cameras=SOLVED)
+    assert "cameras.npz" not in report_page(solved, name="clip", present_files=["cameras.npz"])
+    both = ["cameras.npz", "poses.npz"]
+    assert "poses.npz hold" in report_page(solved, name="clip", present_files=both)
+    command = play_command(Path("a run/avatar.iavatar"), Path("clip/poses.npz"))
+    page = report_page(solved, name="clip", play_command=command)
+    assert "ia-play &#39;a run/avatar.iavatar&#39; --poses clip/poses.npz" in page
+
+
+def test_the_curve_goes_up_when_the_score_does():
+    svg = ElementTree.fromstring(curve_svg((point(2.0, 24.0), point(5.0, 29.0), point(9.0, 29.0))))
+    (line,) = svg.findall("polyline")
+    places = [tuple(map(float, pair.split(","))) for pair in line.get("points").split()]
+    (x0, y0), (x1, y1), (x2, y2) = places
+    assert x0 < x1 < x2
+    assert y0 > y1 == y2
+    assert (x1 - x0) / (x2 - x1) == pytest.approx(3.0 / 4.0, abs=0.01)
+    width, height = map(float, svg.get("viewBox").split()[2:])
+    assert all(0.0 < x < width and 0.0 < y < height for x, y in places)
+
+
+def test_nothing_measured_draws_nothing():
+    assert curve_svg((point(2.0, None),)) == ""
+
+
+def paths_in(record, above=""):
+    """Every key of a record in dots, as in `training.steps`."""
+    for name, kind in get_type_hints(record).items():
+        yield f"{above}{name}"
+        for part in (kind, *get_args(kind)):
+            if is_dataclass(part):
+                yield from paths_in(part, f"{above}{name}.")
+
+
+def test_the_page_on_the_report_names_every_key_and_no_other():
+    page = (Path(__file__).parents[3] / "docs" / "report.md").read_text()
+    told = set(re.findall(r"`([a-z0-9_.]+)`", page))
+    free = {"command", "recipe", "cameras", "tracking"}  # what is in these, no record says
+    paths = {path for path in paths_in(Report) if path.split(".")[0] not in free} | free
+    above = {path.split(".")[0] for path in told}
+    alike = {path: path.replace("held_out_refined.", "held_out.") for path in paths}
+    known = told | above
+    assert not [p for p, like in alike.items() if not {like, like.split(".")[-1]} & known]
+    dotted = {
+        path
+        for path in told
+        if "." in path and path.split(".")[0] not in {"report", "turning", *free}
+    }
+    assert len(dotted) > 20
+    assert dotted <= paths

@@ -1,0 +1,169 @@
+"""Watching it learn: a run with a page, driven as a person would, in a headless browser."""
+
+import importlib.util
+import itertools
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from export.player import Player
+from instant_avatar import ingest
+from instant_avatar.cli.command_line import fill_optional_value
+from instant_avatar.run.ingest_arguments import VIEW_PORT
+from tests.instant_avatar.browser import Browser, chromium, until
+
+PAPER = np.array([251, 250, 247])
+PANEL_PX = 380
+
+with_viser = pytest.mark.skipif(
+    importlib.util.find_spec("viser") is None, reason="viser is not installed ([viewer])"
+)
+with_chromium = pytest.mark.skipif(chromium() is None, reason="there is no Chromium here")
+
+
+def scene(browser: Browser) -> tuple[np.ndarray, np.ndarray]:
+    """The picture left of the panel, below the browser's own notes, and where it is no paper."""
+    picture = browser.picture()[:, :-PANEL_PX].astype(int)
+    picture[:160, :320] = PAPER  # Chromium shows its notice about a missing GPU here
+    return picture, np.abs(picture - PAPER).max(axis=2) > 24
+
+
+def shows_a_person(drawn: np.ndarray) -> bool:
+    """Something upright stands in the middle, and the rest is empty."""
+    rows, columns = np.flatnonzero(drawn.any(axis=1)), np.flatnonzero(drawn.any(axis=0))
+    if not len(rows) or not 0.02 < drawn.mean() < 0.5:
+        return False
+    height, width = drawn.shape
+    middle = (columns[0] + columns[-1]) / 2.0
+    return len(rows) > 0.5 * height and abs(middle - width / 2.0) < 0.15 * width
+
+
+def actors_color(film: Path) -> np.ndarray:
+    """The mean color of the person in the film's first frame."""
+    _, bgr = cv2.VideoCapture(str(next(film.glob("video.*")))).read()
+    alpha = cv2.imread(str(min((film / "masks").iterdir())), cv2.IMREAD_GRAYSCALE)
+    return bgr[alpha > 200][:, ::-1].mean(axis=0)
+
+
+def steps(browser: Browser) -> int:
+    found = re.search(r"([\d,]+)\s+steps", browser.text())
+    return int(found.group(1).replace(",", "")) if found else 0
+
+
+@with_viser
+@with_chromium
+@pytest.mark.slow
+def test_a_user_watches_pauses_saves_and_starts_the_dance(film, tmp_path):
+    log, out = tmp_path / "log", tmp_path / "run"
+    command = [sys.executable, "-m", "instant_avatar.ingest", str(film), "--out", str(out)]
+    with log.open("w") as file:
+        process = subprocess.Popen([*command, "--seconds", "45", "--view", "0"], stderr=file)
+    try:
+        until(lambda: "Live viewer" in log.read_text(), 240.0)
+        address = re.search(r"http://127\.0\.0\.1:(\d+)", log.read_text())
+        only_this_machine(int(address.group(1)))
+        with Browser(tmp_path / "browser") as browser:
+            browser.go(address.group(0))
+            look_and_pause(browser, film)
+            save(browser, out, process)
+            browser.click("Resume")
+            stay_and_dance(browser, log)
+        os.kill(process.pid, signal.SIGINT)
+        assert process.wait(timeout=60.0) == 0
+    finally:
+        process.kill()
+        process.wait()
+    said = log.read_text()
+    assert "Traceback" not in said
+    assert "Ctrl-C closes it" in said
+    assert (out / "report.html").exists()
+
+
+def only_this_machine(port: int) -> None:
+    """A server that listened everywhere would answer on the loopback's other addresses, too."""
+    socket.create_connection(("127.0.0.1", port), timeout=5.0).close()
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.2", port), timeout=5.0)
+
+
+def look_and_pause(browser: Browser, film: Path) -> None:
+    until(lambda: "Pause" in browser.text() and steps(browser) >= 100, 120.0)
+    browser.click("Pause")
+    until(lambda: "Paused" in browser.text(), 30.0)
+    before = steps(browser)
+    time.sleep(2.0)
+    assert steps(browser) == before  # a step takes some 20 ms
+    until(lambda: shows_a_person(scene(browser)[1]), 60.0)
+    picture, drawn = scene(browser)
+    # not just a shape: it is dressed as the actor is
+    assert np.abs(picture[drawn].mean(axis=0) - actors_color(film)).max() < 40.0
+    assert "seen" in browser.text()
+    assert browser.run("!!document.querySelector('svg.body-map path.well')")
+
+
+def save(browser: Browser, out: Path, process: subprocess.Popen) -> None:
+    browser.click("Save package now")
+    until(lambda: "Package saved" in browser.text() or "No package" in browser.text(), 120.0)
+    if "Package saved" in browser.text():  # on a slow machine it may be too early for one
+        Player.load(out / "avatar.iavatar")
+    assert process.poll() is None
+
+
+def stay_and_dance(browser: Browser, log: Path) -> None:
+    until(lambda: "The page stays" in log.read_text(), 240.0)
+    until(lambda: "Done after 45 s" in browser.text(), 30.0)
+    browser.click("Dance")
+    pictures = []
+    for _ in range(4):
+        time.sleep(1.0)
+        pictures.append(scene(browser)[0])
+    until(lambda: shows_a_person(scene(browser)[1]), 30.0)
+    moved = [np.abs(b - a).max(axis=2).mean() for a, b in itertools.pairwise(pictures)]
+    assert max(moved) > 0.5
+
+
+def test_view_without_viser_says_how_to_get_it(film, tmp_path, monkeypatch, capsys):
+    found = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util,
+        "find_spec",
+        lambda name, *more: None if name == "viser" else found(name, *more),
+    )
+    assert ingest.main([str(film), "--out", str(tmp_path / "run"), "--view"]) == 2
+    said = capsys.readouterr().err
+    assert "pip install 'instant-avatar-stream[viewer]'" in said
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "port"),
+    [
+        (["v.mp4", "--view"], VIEW_PORT),
+        (["--view", "v.mp4"], VIEW_PORT),
+        (["v.mp4", "--view", "9000"], 9000),
+        (["v.mp4", "--view", "--seconds", "5"], VIEW_PORT),
+        (["v.mp4"], None),
+    ],
+)
+def test_the_port_may_be_left_out(words, port):
+    import tyro
+
+    from instant_avatar.run.ingest_arguments import IngestArguments
+
+    given = tyro.cli(IngestArguments, args=fill_optional_value(words, "--view", VIEW_PORT))
+    assert given.view == port
+    assert given.video == Path("v.mp4")
+
+
+def test_a_port_that_cannot_be_is_refused(film, tmp_path, capsys):
+    assert ingest.main([str(film), "--out", str(tmp_path / "run"), "--view", "70000"]) == 2
+    assert "70000" in capsys.readouterr().err

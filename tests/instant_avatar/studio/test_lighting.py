@@ -1,0 +1,87 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from capture.camera import Camera
+from instant_avatar.studio.lighting import NO_FACE, rasterize
+
+SIZE = 40
+
+
+@pytest.fixture
+def camera():
+    return Camera(
+        focal_px=(50.0, 50.0),
+        center_px=(SIZE / 2, SIZE / 2),
+        size_px=(SIZE, SIZE),
+        camera_from_world=np.eye(4),
+    )
+
+
+def rectangle(left, right, top, bottom, depth):
+    """Two triangles at one depth, whose corners project to the given pixels."""
+    corners = [(left, top), (right, top), (right, bottom), (left, bottom)]
+    points = [((x - SIZE / 2) / 50 * depth, (y - SIZE / 2) / 50 * depth, depth) for x, y in corners]
+    return np.array(points), np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
+
+
+def test_a_tilted_plane_is_as_deep_as_its_equation_says(camera):
+    normal, offset = np.array([0.5, -0.3, 1.0]), 2.0  # normal · x = offset
+    points = np.array([[-9.0, -9.0, 0.0], [9.0, -9.0, 0.0], [0.0, 20.0, 0.0]]) * 0.05
+    points[:, 2] = offset - points[:, :2] @ normal[:2]
+    seen = rasterize(points, np.array([[0, 1, 2]], dtype=np.int32), camera, supersampling=2)
+    rows, columns = np.nonzero(seen.face != NO_FACE)
+    assert len(rows) > 100
+    pixels = np.stack([columns + 0.5, rows + 0.5], axis=1) / 2
+    rays = np.concatenate([(pixels - SIZE / 2) / 50, np.ones((len(rows), 1))], axis=1)
+    expected = offset / (rays @ normal)
+    np.testing.assert_allclose(seen.depth[rows, columns], expected, rtol=1e-4)
+
+
+def test_shares_lead_back_to_the_point_that_the_ray_meets(camera):
+    points = np.array([[-0.5, -0.4, 1.5], [0.8, -0.5, 3.0], [0.1, 0.9, 2.2]])
+    seen = rasterize(points, np.array([[0, 1, 2]], dtype=np.int32), camera, supersampling=1)
+    rows, columns = np.nonzero(seen.face == 0)
+    b, c = seen.barycentric[rows, columns].T
+    met = (1 - b - c)[:, None] * points[0] + b[:, None] * points[1] + c[:, None] * points[2]
+    np.testing.assert_allclose(
+        camera.project(met), np.stack([columns + 0.5, rows + 0.5], axis=1), atol=1e-3
+    )
+
+
+def test_the_nearer_of_two_triangles_is_seen_whatever_their_order(camera):
+    near, faces = rectangle(10, 30, 10, 30, 1.0)
+    far, _ = rectangle(5, 35, 5, 35, 2.0)
+    for first, second, nearer in ((near, far, (0, 1)), (far, near, (2, 3))):
+        seen = rasterize(
+            np.concatenate([first, second]), np.concatenate([faces, faces + 4]), camera
+        )
+        middle = seen.face[20 * 4 : 21 * 4, 12 * 4 : 28 * 4]
+        assert np.isin(middle, nearer).all()
+        assert np.isin(seen.face[7 * 4, 6 * 4 : 34 * 4], [2 - nearer[0], 3 - nearer[0]]).all()
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.tuples(st.floats(1, 15), st.floats(17, 39), st.floats(1, 15), st.floats(17, 39)),
+)
+def test_coverage_is_the_area_of_a_rectangle(sides):
+    camera = Camera(
+        focal_px=(50.0, 50.0),
+        center_px=(SIZE / 2, SIZE / 2),
+        size_px=(SIZE, SIZE),
+        camera_from_world=np.eye(4),
+    )
+    left, right, top, bottom = sides
+    points, faces = rectangle(left, right, top, bottom, 1.7)
+    seen = rasterize(points, faces, camera, supersampling=4)
+    covered = (seen.face != NO_FACE).sum() / 16
+    border = 2 * (right - left + bottom - top)
+    assert abs(covered - (right - left) * (bottom - top)) <= border / 8 + 0.25
+
+
+def test_what_stands_behind_the_camera_is_not_drawn(camera):
+    points, faces = rectangle(10, 30, 10, 30, 1.0)
+    points[:, 2] *= -1
+    assert (rasterize(points, faces, camera).face == NO_FACE).all()

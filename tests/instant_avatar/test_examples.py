@@ -1,0 +1,85 @@
+"""The examples run as they stand, only shorter."""
+
+import importlib.util
+import runpy
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from instant_avatar.run import session_start
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def load(name):
+    spec = importlib.util.spec_from_file_location("example", EXAMPLES / name)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_examples_are_one_walk_each():
+    for file in EXAMPLES.glob("*.py"):
+        assert len(file.read_text().splitlines()) <= 80
+
+
+@pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.py")), ids=lambda file: file.stem)
+def test_what_is_missing_is_one_line(file, tmp_path, monkeypatch):
+    """A package that is not installed; and an avatar, or a folder, that is not there."""
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(sys, "argv", [str(file), str(tmp_path / "file" / "none")])
+    with pytest.raises(SystemExit, match=r"none|is a file"):
+        runpy.run_path(str(file), run_name="__main__")
+    monkeypatch.setitem(sys.modules, "numpy" if file.stem[0] != "1" else "torch", None)
+    with pytest.raises(SystemExit, match=r"pip install '?instant-avatar-stream"):
+        runpy.run_path(str(file), run_name="__main__")
+
+
+@pytest.mark.slow
+def test_an_avatar_is_learnt_from_python(film, rig, tmp_path, monkeypatch, capsys):
+    example = load("1_learn_from_python.py")
+    monkeypatch.setattr(example, "STEPS", 150)
+    monkeypatch.setattr(
+        example, "film_capture", lambda out, config, overwrite: shutil.copytree(film, out)
+    )
+    monkeypatch.setattr(session_start.Rig, "from_shaped_body", lambda shaped: rig)
+    example.main(tmp_path)
+    said = capsys.readouterr().out
+    assert (tmp_path / "avatar.iavatar").exists()
+    assert "steps" in said
+    assert "'hq'" in said
+
+
+def test_a_package_is_played_in_a_pose_of_our_own(run, tmp_path, capsys):
+    example = load("2_play_in_a_new_pose.py")
+    example.main(run / "avatar.iavatar", tmp_path / "pose.png")
+    with Image.open(tmp_path / "pose.png") as picture:
+        rgba = np.asarray(picture)
+    assert rgba.shape == (540, 540, 4)
+    assert 0.05 < (rgba[..., 3] > 0).mean() < 0.3
+    # the person's left arm is up, so the right half of the picture has its highest pixel
+    columns = np.flatnonzero(rgba[np.flatnonzero(rgba[..., 3].max(axis=1) > 127)[0], :, 3] > 127)
+    assert columns.mean() > 270
+
+
+def test_an_avatar_is_drawn_from_all_sides(run, tmp_path, capsys):
+    example = load("3_turntable_with_workers.py")
+    example.main(run / "avatar.iavatar", tmp_path / "turn.webp")
+    assert "540x540 px" in capsys.readouterr().out
+    with Image.open(tmp_path / "turn.webp") as clip:
+        assert clip.n_frames == example.PICTURES
+        widths = []
+        for number in range(clip.n_frames):
+            clip.seek(number)
+            alpha = np.asarray(clip.convert("RGBA"))[..., 3] > 127
+            rows, columns = np.flatnonzero(alpha.any(axis=1)), np.flatnonzero(alpha.any(axis=0))
+            assert rows[0] > 0
+            assert rows[-1] < example.SIZE - 1
+            widths.append(columns[-1] - columns[0])
+    # arms are away from the body: from the side the person is much narrower than from the front
+    assert widths[6] < 0.6 * widths[0]
+    assert abs(widths[12] - widths[0]) < 8

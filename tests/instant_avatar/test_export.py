@@ -1,0 +1,134 @@
+"""ia-export: a package at any second, from what is on the disk."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from export.package.package_file import read_package
+from export.player import Player, compare_golden_frames
+from instant_avatar import export
+from preprocess.poses.pose_file import read_motion
+
+
+@pytest.fixture
+def call_export(capsys):
+    """Runs ia-export."""
+
+    def call(*arguments):
+        code = export.main([str(argument) for argument in arguments])
+        return code, capsys.readouterr()
+
+    return call
+
+
+@pytest.mark.slow
+def test_a_runs_checkpoint_becomes_a_package_that_plays(run, call_export, tmp_path):
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
+    code, said = call_export(run, "--out", tmp_path / "now.iavatar")
+    assert code == 0, said.err
+    frames = compare_golden_frames(read_package(tmp_path / "now.iavatar"))
+    assert all(frame.matches for frame in frames)
+    golden = Player.load(tmp_path / "now.iavatar").manifest.golden[0]
+    shown = Player.load(tmp_path / "now.iavatar").render(golden.pose, golden.camera)
+    assert 0.03 < (shown[..., 3] > 127).mean() < 0.5
+    assert {path: path.stat().st_mtime_ns for path in run.rglob("*")} == before
+
+
+def test_the_whole_person_is_in_the_views(rig):
+    for _, camera in export.synthetic_views(rig):
+        seen = camera.project(rig.seeds.astype(float))
+        assert (seen > 0).all()
+        assert (seen < np.array(camera.size_px)).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda run, out: (out.parent, out), "checkpoint"),
+        (lambda run, out: (run, out.with_suffix(".zip")), "iavatar"),
+        (lambda run, out: (run / "avatar.iavatar", out), "--to glb"),
+        (lambda run, out: (run, out.parent / "none" / "a.iavatar"), "does not exist"),
+    ],
+)
+def test_impossible_exports_are_refused_and_write_nothing(run, call_export, tmp_path, change, told):
+    folder, out = change(run, tmp_path / "a.iavatar")
+    code, said = call_export(folder, "--out", out)
+    assert code == 2
+    assert told in said.err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_a_run_becomes_a_mesh_that_dances(run, film, call_export, tmp_path):
+    out = tmp_path / "a.GLB"
+    poses = film / "truth" / "novel" / "poses.npz"
+    code, said = call_export(run, "--to", "glb", "--poses", poses, "--out", out)
+    assert code == 0, said.err
+    (mesh,) = trimesh.load(out).geometry.values()
+    low, high = mesh.bounds
+    assert 1.4 < high[1] - low[1] < 2.1  # a person's height
+    assert [file.name for file in tmp_path.iterdir()] == ["a.GLB"]
+
+
+def test_a_mesh_dances_what_any_file_of_poses_says(run, film, call_export, tmp_path):
+    """AMASS's keys, which ia-play reads, say the same as our own."""
+    ours = read_motion(film / "truth" / "novel" / "poses.npz")
+    turned = np.concatenate([ours.root_rotations[:, None], ours.joint_rotations], axis=1)
+    np.savez(
+        tmp_path / "amass.npz",
+        poses=np.pad(turned.reshape(len(ours), 72)[:, :66], [(0, 0), (0, 90)]),
+        trans=ours.root_translations,
+        betas=np.zeros(16),
+        gender="neutral",
+        mocap_framerate=30.0,
+    )
+    out = tmp_path / "a.glb"
+    words = run / "avatar.iavatar", "--to", "glb", "--poses", tmp_path / "amass.npz", "--out", out
+    code, said = call_export(*words)
+    assert code == 0, said.err
+    assert len(trimesh.load(out).geometry) == 1
+    code, said = call_export(*words, "--overwrite", "--person", "7")
+    assert code == 2
+    assert "7" in said.err
+
+
+def test_a_mesh_of_few_triangles_has_a_texture(run, call_export, tmp_path):
+    pytest.importorskip("fast_simplification")
+    out = tmp_path / "few.glb"
+    words = ("--to", "glb", "--triangles", 2000, "--out", out)
+    code, said = call_export(run / "avatar.iavatar", *words)
+    assert code == 0, said.err
+    assert "2,000 triangles" in said.err
+    (mesh,) = trimesh.load(out).geometry.values()
+    assert mesh.visual.kind == "texture"
+    assert np.asarray(mesh.visual.material.baseColorTexture)[..., :3].std() > 20.0
+
+
+@pytest.mark.parametrize("name", ["A.PLY", pytest.param("a.OBJ", marks=pytest.mark.slow)])
+def test_a_package_becomes_a_still_mesh_in_color(run, call_export, tmp_path, name):
+    out = tmp_path / name
+    code, said = call_export(run / "avatar.iavatar", "--to", name[2:].lower(), "--out", out)
+    assert code == 0, said.err
+    mesh = trimesh.load(out)
+    assert len(mesh.faces) > 10_000
+    assert mesh.visual.kind == "vertex"
+    colors = np.asarray(mesh.visual.vertex_colors)[:, :3].astype(float)
+    assert colors.std(axis=0).max() > 20.0  # a shirt is no skin
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--to", "glb", "--out", "a.ply"], ".glb"),
+        (["--to", "ply", "--out", "a.ply", "--poses", "poses.npz"], "--poses"),
+        (["--to", "glb", "--out", "a.glb", "--poses", "nowhere.npz"], "nowhere.npz"),
+        (["--to", "glb", "--out", "a.glb", "--triangles", "10"], "at least 500"),
+        (["--out", "a.iavatar", "--triangles", "1000"], "--to glb, ply or obj"),
+    ],
+)
+def test_meshes_that_cannot_be_are_refused(run, call_export, tmp_path, monkeypatch, words, told):
+    monkeypatch.chdir(tmp_path)
+    code, said = call_export(run / "avatar.iavatar", *words)
+    assert code == 2
+    assert told in said.err
+    assert list(tmp_path.iterdir()) == []

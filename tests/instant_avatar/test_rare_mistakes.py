@@ -1,0 +1,160 @@
+"""Rare mistakes: named if possible, and never misnamed."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from capture.source_opening import open_source
+from instant_avatar import check
+from instant_avatar.studio.shoot import ShootConfig, film_capture
+from preprocess.poses.pose_file import read_motion, write_motion
+
+SIDE, FRAMES = 96, 40
+
+
+@pytest.fixture(scope="module")
+def turning(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("turning") / "capture"
+    film_capture(folder, ShootConfig(frames=FRAMES, size=SIDE, background="plain", turns=1.0))
+    return folder
+
+
+@pytest.fixture
+def capture(turning, tmp_path) -> Path:
+    shutil.copytree(turning, tmp_path / "capture")
+    return tmp_path / "capture"
+
+
+@pytest.fixture
+def diagnosed(capture, tmp_path, capsys):
+    """Runs ia-check on the capture: its exit code, its words, its JSON."""
+
+    def call(*arguments):
+        found = tmp_path / "found.json"
+        words = [str(capture), *map(str, arguments)]
+        code = check.main(
+            [*words, "--json", str(found), "--sheet", str(tmp_path / "sheet.png"), "--overwrite"]
+        )
+        return code, " ".join(capsys.readouterr().err.split()), json.loads(found.read_text())
+
+    return call
+
+
+def masks_of(folder: Path) -> list[Path]:
+    return sorted((folder / "masks").iterdir())
+
+
+def change_masks(folder: Path, change) -> None:
+    for row, path in enumerate(masks_of(folder)):
+        cv2.imwrite(str(path), change(row, cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)))
+
+
+@pytest.mark.slow
+def test_a_cropped_video_is_detected_by_its_principal_point_and_corrected(
+    capture, diagnosed, tmp_path, capsys
+):
+    cut = 18
+    frames = list(open_source(capture / "video.mp4").frames())
+    pictures = capture / "images"
+    pictures.mkdir()
+    for frame in frames:
+        bgr = cv2.cvtColor(frame.rgb[:, cut:], cv2.COLOR_RGB2BGR)
+        cv2.imwrite(str(pictures / f"{frame.index:06d}.png"), bgr)
+    (capture / "video.mp4").unlink()
+    change_masks(capture, lambda _, mask: mask[:, cut:])
+    with np.load(capture / "cameras.npz") as stored:
+        np.savez(capture / "cameras.npz", **{**stored, "width": SIDE - cut})
+    code, said, found = diagnosed("--fix", tmp_path / "mended")
+    assert code == 0
+    assert "principal point is" in said
+    assert "too far right" in said
+    assert found["cause"] == "focal"
+    assert found["iou"]["after_fix"] > 0.75 > 0.5 > found["iou"]["now"]
+    with (
+        np.load(tmp_path / "mended" / "cameras.npz") as mended,
+        np.load(capture / "cameras.npz") as stored,
+    ):
+        moved = mended["intrinsic"] - stored["intrinsic"]
+        assert moved[0, 2] == pytest.approx(-cut, abs=1.5)
+        assert abs(moved[1, 2]) < 1.5
+
+
+@pytest.mark.slow
+def test_poses_of_another_person_from_the_middle_on_are_no_offset(capture, diagnosed):
+    motion = read_motion(capture / "poses.npz")
+    motion.root_translations[FRAMES // 2 :, 0] += 0.9
+    write_motion(capture / "poses.npz", motion)
+    code, said, found = diagnosed()
+    assert "The poses jump once (20). Did the tracker switch to another person?" in said
+    assert found["corrections"] == []
+    assert code == 2
+
+
+def test_boxes_are_called_boxes_and_no_focal_length_is_fitted_to_them(capture, diagnosed):
+    def boxed(_, mask):
+        rows, columns = np.nonzero(mask > 127)
+        mask[rows.min() : rows.max(), columns.min() : columns.max()] = 255
+        return mask
+
+    change_masks(capture, boxed)
+    _, said, found = diagnosed()
+    assert "The masks are boxes" in said
+    assert found["corrections"] == []
+
+
+def test_masks_that_are_turned_here_and_there_are_named_and_left_out(capture, diagnosed):
+    change_masks(capture, lambda row, mask: 255 - mask if 10 <= row < 20 else mask)
+    code, said, found = diagnosed()
+    assert "4 of 16 sampled masks cannot be used" in said
+    assert "is it inverted?" in said
+    assert (code, found["verdict"], found["corrections"]) == (0, "warn", [])
+    assert found["iou"]["now"] > 0.8
+
+
+def test_times_in_milliseconds_are_said_to_be(capture, diagnosed):
+    with np.load(capture / "poses.npz") as stored:
+        arrays = {key: stored[key] for key in stored.files if key != "frame"}
+    np.savez(capture / "poses.npz", **{**arrays, "time": 1000.0 * arrays["time"]})
+    code, said, found = diagnosed()
+    assert code == 2
+    assert "Milliseconds, or another clock?" in said
+    assert "in milliseconds, or by another clock?" in found["refused"]
+
+
+@pytest.mark.slow
+def test_a_reversed_video_is_detected_and_corrected(capture, diagnosed, tmp_path):
+    true = read_motion(capture / "poses.npz")
+    back = true.select_rows(np.arange(FRAMES)[::-1], np.arange(FRAMES))
+    write_motion(capture / "poses.npz", back)
+    code, said, found = diagnosed("--fix", tmp_path / "mended")
+    assert (code, found["cause"], len(found["corrections"])) == (0, "frame_rate", 1)
+    assert "the video runs backwards against its poses" in said
+    assert found["iou"]["after_fix"] > found["iou"]["now"] + 0.1
+    mended = read_motion(tmp_path / "mended" / "poses.npz")
+    np.testing.assert_array_equal(mended.frames, np.arange(FRAMES))
+    np.testing.assert_allclose(mended.joint_rotations, true.joint_rotations, atol=1e-9)
+    np.testing.assert_allclose(mended.root_translations, true.root_translations, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_degrees_are_distinguished_from_radians_and_corrected(capture, diagnosed, tmp_path):
+    true = read_motion(capture / "poses.npz")
+    degrees = replace(
+        true,
+        root_rotations=np.rad2deg(true.root_rotations),
+        joint_rotations=np.rad2deg(true.joint_rotations),
+    )
+    write_motion(capture / "poses.npz", degrees)
+    code, said, found = diagnosed("--fix", tmp_path / "mended")
+    assert (code, found["cause"], len(found["corrections"])) == (0, "root_rotation", 1)
+    assert "the rotations are in degrees, not in radians" in said
+    assert "degrees given?" in found["refused"]
+    assert found["iou"]["after_fix"] > 0.75 > 0.5 > found["iou"]["now"]
+    mended = read_motion(tmp_path / "mended" / "poses.npz")
+    np.testing.assert_allclose(mended.root_rotations, true.root_rotations, atol=1e-12)
+    np.testing.assert_allclose(mended.joint_rotations, true.joint_rotations, atol=1e-12)

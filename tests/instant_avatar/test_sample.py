@@ -1,0 +1,71 @@
+import errno
+import shlex
+
+import pytest
+
+from instant_avatar import sample
+from instant_avatar.studio import shoot
+
+
+def run(*arguments):
+    """Exit code of `ia-sample` with these arguments."""
+    try:
+        return sample.main([str(argument) for argument in arguments])
+    except SystemExit as stop:
+        return stop.code
+
+
+def test_it_films_and_says_what_comes_next(tmp_path, capsys):
+    out = tmp_path / "my [c]" / ("long" * 30)
+    assert run(out, "--frames", 2, "--size", 32, "--background", "plain") == 0
+    assert (out / "video.mp4").exists()
+    command = capsys.readouterr().err.splitlines()[-1]
+    assert shlex.split(command) == [
+        "ia-ingest", str(out / "video.mp4"), "--poses", str(out / "poses.npz")
+    ]  # fmt: skip
+
+
+def test_a_capture_like_a_phones_names_no_preview(tmp_path, capsys):
+    assert run(tmp_path / "c", "--like-a-phone", "--frames", 2, "--size", 36) == 0
+    printed = capsys.readouterr().err
+    assert "preview" not in printed
+    assert "--poses" in printed
+    assert (tmp_path / "c" / "truth" / "body.npz").exists()
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("--frames", "0"), ("--size", "3"), ("--fps", "nan"), ("--mask-noise-px", "-1")],
+)
+def test_numbers_out_of_range_are_named(tmp_path, capsys, option, value):
+    assert run(tmp_path / "c", option, value) == 2
+    assert option in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_folder_is_refused_with_advice(tmp_path, capsys):
+    small = ("--frames", 1, "--size", 32)
+    assert run(tmp_path / "c", *small) == 0
+    assert run(tmp_path / "c", *small) == 2
+    assert "--overwrite" in " ".join(capsys.readouterr().err.split())
+    assert run(tmp_path / "c", *small, "--overwrite") == 0
+
+
+def test_unknown_subjects_are_bad_input(tmp_path):
+    assert run(tmp_path / "c", "--subject", 4) == 2
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (KeyboardInterrupt(), 130),
+        (OSError(errno.ENOSPC, "No space left on device"), 3),
+        (PermissionError(errno.EACCES, "Permission denied"), 2),
+    ],
+)
+def test_what_goes_wrong_has_an_exit_code(monkeypatch, tmp_path, error, code):
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr(shoot, "film_capture", fail)
+    assert run(tmp_path / "c") == code

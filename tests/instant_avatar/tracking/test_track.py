@@ -1,0 +1,196 @@
+"""ia-track: from a video to poses, masks, a film and grades."""
+
+import json
+import threading
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from capture.source_opening import open_source
+from instant_avatar import check, track
+from instant_avatar.cli.console import Console
+from instant_avatar.run import person_tracking
+from preprocess.body.parametric_body import load_body_model
+from preprocess.body.proportion_space import shape_for_motion
+from preprocess.capture_session import CaptureInputs
+from preprocess.observation import Observation
+from preprocess.open_capture import open_capture
+from preprocess.poses.pose_file import read_motion
+from preprocess.tracking.blazepose import BlazePoseTracker
+
+
+@pytest.fixture(scope="module")
+def tracked(filmed, tmp_path_factory):
+    """What ia-track makes of the actor's film."""
+    folder = tmp_path_factory.mktemp("tracked")
+    video = folder / "video.mp4"
+    video.write_bytes((filmed / "video.mp4").read_bytes())
+    assert track.main([str(video), "--out", str(folder / "out" / "poses.npz")]) == 0
+    return folder
+
+
+def joints_mm(motion):
+    """Joints of each row relative to the root, millimetres."""
+    shaped = shape_for_motion(load_body_model(None), motion)
+    joints = np.stack([shaped.with_pose(motion[row]).joints() for row in range(len(motion))])
+    return 1000.0 * (joints - joints[:, :1])
+
+
+def test_poses_are_near_the_truth(tracked, filmed):
+    found = joints_mm(read_motion(tracked / "out" / "poses.npz"))
+    true = joints_mm(read_motion(filmed / "poses.npz"))
+    true = true @ np.load(filmed / "cameras.npz")["extrinsic"][:3, :3].T  # to the camera's axes
+    scale = (found * true).sum() / (found * found).sum()
+    assert np.linalg.norm(scale * found - true, axis=2).mean() < 60.0
+
+
+def test_masks_are_near_the_truth(tracked, filmed):
+    overlaps = []
+    for true in sorted((filmed / "masks").iterdir())[::5]:
+        number = int("".join(filter(str.isdigit, true.stem)))
+        a = cv2.imread(str(true), 0) > 127
+        b = cv2.imread(str(tracked / "out" / "masks" / f"{number:06d}.png"), 0) > 127
+        overlaps.append((a & b).sum() / (a | b).sum())
+    assert np.mean(overlaps) > 0.85
+
+
+def test_grades_and_film_are_written(tracked):
+    grade = json.loads((tracked / "out" / "grade.json").read_text())
+    assert grade["good_enough"]
+    assert grade["found_share"] == 1.0
+    assert grade["iou_mean"] > 0.75
+    film = cv2.VideoCapture(str(tracked / "out" / "skeleton.webm"))
+    assert film.read()[0]
+    assert int(film.get(cv2.CAP_PROP_FRAME_COUNT)) in (0, 20)
+
+
+def test_a_capture_opens_from_what_was_written(tracked):
+    capture = open_capture(
+        CaptureInputs(video=tracked / "video.mp4", poses=tracked / "out" / "poses.npz")
+    )
+    assert capture.masks is not None
+    assert capture.masks.path == tracked / "out" / "masks"
+    assert capture.cameras.source == "K of the poses"
+    assert capture.motion.proportions is not None
+
+
+def test_poses_and_masks_of_some_frames_are_read_beside_the_whole_video(video, tmp_path, capsys):
+    out = tmp_path / "out" / "poses.npz"
+    assert track.main([str(video), "--out", str(out), "--frames", "::2", "--no-film"]) == 0
+    told = capsys.readouterr().err
+    assert f"ia-ingest {video} --poses {out} --frames ::2" in "".join(told.splitlines())
+    capture = open_capture(CaptureInputs(video=video, poses=out))
+    found = [each for each in capture.observations() if isinstance(each, Observation)]
+    assert [each.frame.index for each in found] == list(range(0, 20, 2))
+
+
+def test_ia_check_grades_tracked_poses(tracked, tmp_path, capsys):
+    told = tmp_path / "check.json"
+    words = ["--poses", str(tracked / "out" / "poses.npz"), "--json", str(told)]
+    sheet = ["--sheet", str(tmp_path / "sheet.png")]
+    assert check.main([str(tracked / "video.mp4"), *words, *sheet]) == 0
+    assert "Good enough for an avatar: yes" in capsys.readouterr().err
+    assert json.loads(told.read_text())["tracking"]["found_share"] == 1.0
+
+
+def test_files_are_replaced_only_if_asked(tracked, capsys):
+    words = [str(tracked / "video.mp4"), "--out", str(tracked / "out" / "poses.npz")]
+    assert track.main(words) == 2
+    assert "--overwrite" in capsys.readouterr().err
+
+
+def test_tracking_beside_the_video_reads_and_repeats(video, capsys):
+    words = ["--out", str(video.with_name("poses.npz")), "--frames", ":8", "--overwrite"]
+    assert track.main([str(video), *words]) in (0, 1)
+    stamp = video.with_name("masks") / "000000.png"
+    before = stamp.stat().st_ino
+    assert track.main([str(video), *words]) in (0, 1), capsys.readouterr().err
+    assert stamp.stat().st_ino != before  # not taken for masks that the user has given
+    assert "which lie beside the video" not in capsys.readouterr().err
+    assert open_capture(CaptureInputs(video=video.parent)).paths.video == video.parent
+
+
+def test_a_video_without_a_person_is_bad_input(tmp_path, capsys):
+    images = tmp_path / "images"
+    images.mkdir()
+    for number in range(4):
+        noise = np.random.default_rng(number).integers(0, 255, (96, 96, 3), dtype=np.uint8)
+        cv2.imwrite(str(images / f"{number}.png"), noise)
+    assert track.main([str(images), "--out", str(tmp_path / "out" / "poses.npz")]) == 2
+    told = capsys.readouterr().err
+    assert "A person was found in none of 4 frames" in told
+    assert "Traceback" not in told
+    assert not (tmp_path / "out" / "masks").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["--out", "poses.pkl"], "must end in .npz"),
+        (["--person", "0"], "at least 1"),
+        (["--cameras", "solve"], "needs poses first"),
+        (["--frames", "5"], "START:STOP:STEP"),
+    ],
+)
+def test_bad_arguments_are_named(video, words, reason, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert track.main([str(video), *words]) == 2
+    assert reason in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("option", ["--masks", "--cameras", "--body"])
+def test_parts_that_are_missing_are_named_before_tracking(option, video, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert track.main([str(video), "--out", str(out / "p.npz"), option, "nowhere"]) == 2
+    told = capsys.readouterr().err
+    assert "nowhere" in told
+    assert "tracking the person" not in told
+    assert not out.exists()
+
+
+def test_of_a_long_video_every_nth_frame_is_tracked(video, monkeypatch):
+    monkeypatch.setattr(person_tracking, "MAX_FRAMES", 8)
+    inputs = CaptureInputs(video=video)
+    limited = person_tracking.limit_frames(inputs, open_source(video))
+    assert limited.frames == slice(None, None, 3)
+    chosen = CaptureInputs(video=video, frames=slice(0, 15, 1))
+    assert person_tracking.limit_frames(chosen, open_source(video)) == chosen
+
+
+def test_what_was_found_before_ctrl_c_is_kept(video, tmp_path):
+    stop = threading.Event()
+
+    class StoppingTracker(BlazePoseTracker):
+        """Is stopped in the ninth of twenty frames."""
+
+        calls = 0
+
+        def __call__(self, rgb):
+            self.calls += 1
+            if self.calls == 9:
+                stop.set()
+            return super().__call__(rgb)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(person_tracking, "make_tracker", lambda name, person: StoppingTracker())
+        found = person_tracking.track_person(
+            CaptureInputs(video=video), tmp_path / "out" / "poses.npz", Console(), stop=stop
+        )
+    assert found.interrupted
+    assert found.grade.frames == 9
+    assert len(read_motion(tmp_path / "out" / "poses.npz")) == 9
+    assert len(list((tmp_path / "out" / "masks").glob("*.png"))) == 9
+    assert open_capture(found.inputs).source.frame_count == 9
+
+
+def test_frames_that_had_better_not_be_learnt_from_have_no_valid_pose(video, tmp_path, monkeypatch):
+    graded = person_tracking._grade
+    monkeypatch.setattr(
+        person_tracking, "_grade", lambda *parts: replace(graded(*parts), left_out=(3, 4))
+    )
+    words = ["--out", str(tmp_path / "poses.npz"), "--frames", ":8", "--no-film"]
+    assert track.main([str(video), *words]) in (0, 1)
+    found = read_motion(tmp_path / "poses.npz")
+    assert found.frames[~found.valid].tolist() == [3, 4]

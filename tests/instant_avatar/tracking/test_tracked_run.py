@@ -1,0 +1,158 @@
+"""ia-ingest of a video alone: the person is tracked first, or while the frames come."""
+
+import json
+import signal
+from concurrent.futures import Future
+
+import numpy as np
+import pytest
+
+from avatar.training import train
+from avatar.training.trainer import Trainer
+from instant_avatar import ingest
+from instant_avatar.cli.console import Console
+from instant_avatar.evaluation.evaluation_frames import held_out_frames
+from instant_avatar.run import missing_inputs, person_tracking
+from instant_avatar.run.run_folder import RunFolder
+from preprocess import tracked_stream
+from preprocess.capture_session import CaptureInputs
+from preprocess.fitting import tracked_frames
+from preprocess.masks.mask_refinement import MaskRefiner
+from preprocess.poses.pose_file import read_motion
+from preprocess.tracking.blazepose import BlazePoseTracker
+from tests.instant_avatar.conftest import Outcome
+
+
+@pytest.fixture
+def ingest_video(video, tmp_path, capsys, monkeypatch):
+    """Runs ia-ingest on the video; returns how it ended and the run's folder."""
+    monkeypatch.setattr(train, "warm_up", lambda trainer: 0.0)
+
+    def call(*words, steps=10):
+        out = tmp_path / "run"
+        named = ["--out", out, "--steps", steps, *words]
+        code = ingest.main([str(word) for word in (video, *named)])
+        captured = capsys.readouterr()
+        return Outcome(code=code, out=captured.out, err=captured.err), out
+
+    return call
+
+
+class AtOnce:
+    """An executor that runs what it is given before it returns."""
+
+    def __init__(self, **named) -> None:
+        pass
+
+    def submit(self, work, *arguments) -> Future:
+        done = Future()
+        done.set_result(work(*arguments))
+        return done
+
+
+@pytest.fixture
+def fits_at_once(monkeypatch):
+    """Earlier poses are fitted again on the thread that asks for it: no race with training."""
+    monkeypatch.setattr(tracked_frames, "ThreadPoolExecutor", AtOnce)
+
+
+@pytest.mark.usefixtures("without_baking")
+def test_a_video_alone_is_tracked_and_learnt(ingest_video, monkeypatch):
+    done, out = ingest_video()
+    assert done.code == 0, done.err
+    report = json.loads((out / "report.json").read_text())
+    assert report["tracking"]["good_enough"]
+    assert report["command"]["poses"] is None
+    assert report["frames"]["dropped"] == []
+    assert read_motion(out / "tracking" / "poses.npz").proportions is not None
+    assert "Good enough for an avatar" in (out / "report.html").read_text()
+    # a resumed run reads the poses that it has
+    monkeypatch.setattr(missing_inputs, "track_person", None)
+    again, _ = ingest_video("--resume", steps=12)
+    assert again.code == 0, again.err
+    frames = held_out_frames(RunFolder(path=out), None)
+    assert frames.recording.paths.poses == out / "tracking" / "poses.npz"
+
+
+class CountingTracker(BlazePoseTracker):
+    """Ctrl-C comes in the ninth frame of all that it is shown."""
+
+    frames = 0
+
+    def __call__(self, rgb):
+        CountingTracker.frames += 1
+        if CountingTracker.frames == 9:
+            signal.raise_signal(signal.SIGINT)
+        return super().__call__(rgb)
+
+
+@pytest.mark.usefixtures("without_baking")
+def test_ctrl_c_keeps_the_frames_that_were_tracked(ingest_video, monkeypatch):
+    monkeypatch.setattr(CountingTracker, "frames", 0)
+    monkeypatch.setattr(person_tracking, "make_tracker", lambda name, person: CountingTracker())
+    done, out = ingest_video()
+    assert done.code == 130
+    assert "9 tracked frames are kept" in done.complaint()
+    assert "--resume" in done.complaint()
+    first = read_motion(out / "tracking" / "poses.npz").keypoints
+    again, out = ingest_video("--resume")
+    assert again.code == 0, again.err
+    assert CountingTracker.frames == 9 + 1 + 11  # the ninth again: is it the same person?
+    all_frames = read_motion(out / "tracking" / "poses.npz").keypoints
+    assert all_frames.frames.tolist() == list(range(20))
+    np.testing.assert_array_equal(all_frames.image_px[:9], first.image_px)
+    assert len(list((out / "tracking" / "masks").glob("*.png"))) == 20
+
+
+def test_a_resumed_run_does_not_join_two_persons(video, tmp_path, monkeypatch):
+    poses = tmp_path / "out" / "poses.npz"
+    inputs = CaptureInputs(video=video, frames=slice(0, 8))
+    person_tracking.track_person(inputs, poses, Console())
+    monkeypatch.setattr(person_tracking, "SAME_PERSON", 0.0)
+    monkeypatch.setattr(person_tracking, "make_tracker", lambda name, person: CountingTracker())
+    monkeypatch.setattr(CountingTracker, "frames", 10)
+    inputs = CaptureInputs(video=video, frames=slice(0, 10))
+    person_tracking.track_person(inputs, poses, Console(), resume=True)
+    assert CountingTracker.frames == 10 + 1 + 10  # all once more
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("without_baking")
+def test_given_poses_replace_tracked_ones(ingest_video, filmed):
+    done, out = ingest_video("--frames", ":10")
+    assert done.code == 0, done.err
+    done, out = ingest_video("--poses", filmed / "poses.npz", "--overwrite")
+    assert done.code == 0, done.err
+    assert json.loads((out / "report.json").read_text())["tracking"] is None
+    assert not (out / "tracking").exists()
+
+
+@pytest.mark.usefixtures("without_baking")
+def test_a_video_played_at_its_own_speed_is_tracked_meanwhile(ingest_video, monkeypatch):
+    monkeypatch.setattr(tracked_stream, "MAX_LATENESS_S", 1e9)  # on a busy machine, too
+    done, out = ingest_video("--realtime")
+    assert done.code == 0, done.err
+    report = json.loads((out / "report.json").read_text())
+    assert report["stream"]["realtime"]
+    assert report["recipe"]["masks"] == "tracked"
+    frames = report["frames"]
+    assert frames["used"] + frames["held_out"] + frames["near_duplicates"] == 10  # every second
+
+
+@pytest.mark.usefixtures("without_baking", "fits_at_once")
+def test_a_stream_learns_from_given_masks_and_brings_poses_along(ingest_video, filmed, monkeypatch):
+    monkeypatch.setattr(tracked_stream, "MAX_LATENESS_S", 1e9)  # on a busy machine, too
+    monkeypatch.setattr(tracked_frames, "REVISED_FRAMES", 4)
+    monkeypatch.setattr(MaskRefiner, "__call__", lambda *given: pytest.fail("a mask is refined"))
+    revised = []
+    monkeypatch.setattr(Trainer, "revise_pose", lambda trainer, frame, pose: revised.append(frame))
+    done, out = ingest_video("--realtime", "--no-refine-masks", "--masks", filmed / "masks")
+    assert done.code == 0, done.err
+    assert json.loads((out / "report.json").read_text())["recipe"]["masks"] == "masks"
+    assert {0, 2, 4, 6} <= set(revised)  # every second frame is taken
+
+
+def test_person_must_be_a_number(ingest_video):
+    done, _ = ingest_video("--person", "anna")
+    assert done.code == 2
+    assert "counted from left to right" in done.complaint()
