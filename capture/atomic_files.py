@@ -31,13 +31,10 @@ TEMPORARY_PATTERN = re.compile(r"\.instant-avatar-(\d+)-[0-9a-f]{16}\.(part|old)
 
 @dataclass(frozen=True)
 class OutputFileList:
-    """The marker of one folder: its header, and a line for each name that was written.
+    """The marker of one folder: its header, and a line for each name, relative to the folder.
 
     A name is listed, and on the disk, before its file appears: a process that is killed between
     the two leaves a line too many, and never a file of ours that is not listed.
-
-    Attributes:
-        folder: The folder; names are relative to it.
     """
 
     folder: Path
@@ -48,19 +45,14 @@ class OutputFileList:
         return self.folder / LIST_NAME
 
     def exists(self) -> bool:
-        """Whether the folder has a marker."""
+        """Return whether the folder has a marker."""
         try:
             return self.path.read_bytes().startswith(HEADER)
         except OSError:
             return False
 
     def create(self) -> None:
-        """Begin the marker, unless there is one.
-
-        Raises:
-            InputError: If a foreign file has its name.
-            OSError: If the disk is full.
-        """
+        """Begin the marker, unless there is one; an InputError if a foreign file has its name."""
         if self.exists():
             return
         if self.path.is_file() and not HEADER.startswith(self.path.read_bytes()):  # else cut short
@@ -88,7 +80,7 @@ class OutputFileList:
                 os.fsync(file.fileno())
 
     def owns(self, name: str) -> bool:
-        """Whether a file of this name is there, and was written by this program."""
+        """Return whether a file of this name exists and was written by this program."""
         return (self.folder / name).is_file() and name in self.names()
 
     def remove(self, name: str) -> bool:
@@ -146,12 +138,10 @@ class OutputFileList:
 
 
 def is_replaceable(path: Path, replace: bool | None) -> bool:
-    """Whether a file may be written under a name.
+    """Return whether a file may be written under a name.
 
-    Args:
-        path: The name.
-        replace: Whether a file that no marker names may be replaced; None: only in a folder without
-            a marker.
+    `replace` tells whether a file that no marker names may be replaced; None: only in a folder
+    without a marker.
     """
     if replace or not os.path.lexists(path) or is_stream(path):
         return True
@@ -164,22 +154,14 @@ class AtomicFile:
     """A file under a temporary name beside its own, which it takes when it is finished.
 
     The target of a link is replaced. The temporary name keeps the suffix, by which encoders choose
-    a format. An older file stays until `commit`.
-
-    Attributes:
-        temporary_path: Where to write until `commit`.
+    a format. Write to `temporary_path`; an older file stays until `commit`.
     """
 
     def __init__(self, path: Path, *, replace: bool | None = None) -> None:
-        """Make the empty file, and folders above it.
-
-        Args:
-            path: The name that the file will have.
-            replace: As in `is_replaceable`.
+        """Make the empty file, and folders above it; `replace` is that of `is_replaceable`.
 
         Raises:
             InputError: If `path` is a folder, a device or a pipe, or a file that must stay.
-            OSError: If it cannot be written.
         """
         self._path, self._replace = path, replace
         if path.is_dir():
@@ -197,7 +179,6 @@ class AtomicFile:
 
         Raises:
             InputError: If a file that must stay has come there meanwhile.
-            OSError: If the disk is full.
         """
         with self.temporary_path.open("r+b") as file:
             os.fsync(file.fileno())
@@ -248,11 +229,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     """Yield a folder to fill; it takes its own name, and an older one's place, at the end.
 
     A link is followed, as by `atomic_file`. An older folder is replaced only if it is empty, or if
-    its marker names all that is in it.
-
-    Raises:
-        InputError: If something there must stay.
-        OSError: If it cannot be written.
+    its marker names all that is in it; else an InputError is raised.
     """
     check_replaceable_folder(path)
     real = Path(os.path.realpath(path))
@@ -284,8 +261,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 def check_replaceable_folder(path: Path) -> None:
     """Refuse a folder that cannot be made, or with anything in it that this program did not write.
 
-    Raises:
-        InputError: Naming what is in the way.
+    The InputError names what is in the way.
     """
     file = next((parent for parent in path.absolute().parents if parent.is_file()), None)
     if file is not None:
@@ -309,6 +285,6 @@ STREAM_PATH = re.compile(r"/dev/(stdin|stdout|stderr|fd/\d+)|/proc/(self|\d+)/fd
 
 
 def is_stream(path: Path) -> bool:
-    """Whether a name is that of a device or a pipe; stdout is one wherever it was sent to."""
+    """Return whether a name is that of a device or a pipe; stdout is one wherever it leads."""
     named = STREAM_PATH.fullmatch(str(path.absolute())) is not None
     return named or (path.exists() and not (path.is_file() or path.is_dir()))

@@ -53,7 +53,7 @@ class Camera:
 
     @property
     def center_world(self) -> Float[np.ndarray, "3"]:
-        """Where the camera stands, in metres."""
+        """The camera's position, metres."""
         rotation, translation = self.camera_from_world[:3, :3], self.camera_from_world[:3, 3]
         return -rotation.T @ translation
 
@@ -128,7 +128,7 @@ class Camera:
         return in_world / np.linalg.norm(in_world, axis=-1, keepdims=True)
 
     def project(self, points_world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
-        """Where points of the world land, as (x, y) in pixels; meaningless behind the camera."""
+        """Project points of the world to (x, y) in pixels; meaningless behind the camera."""
         rotation, translation = self.camera_from_world[:3, :3], self.camera_from_world[:3, 3]
         in_camera = points_world @ rotation.T + translation
         plane = in_camera[..., :2] / in_camera[..., 2:]
@@ -155,7 +155,7 @@ class Camera:
 
 
 def same_aspect_ratio(a: tuple[int, int], b: tuple[int, int]) -> bool:
-    """Whether two pictures have one aspect ratio: the larger shrinks to the smaller within 1 px."""
+    """Return whether two images have one aspect ratio: scaled, their sides agree to 1 px or 1 %."""
     large, small = sorted((a, b), key=max, reverse=True)
     scale = max(small) / max(large)
     return all(

@@ -36,7 +36,7 @@ LUT_SIZE = 4096
 def tone_map_hdr(
     rgb: UInt16[np.ndarray, "height width 3"], curve: int
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """8-bit sRGB of a 16-bit picture in BT.2020 with an HDR curve.
+    """8-bit sRGB of a 16-bit image in BT.2020 with an HDR curve.
 
     Light is linearised, white scaled to `WHITE_NITS` and colors converted to BT.709; above the knee
     all three channels are compressed by one factor, which preserves hues.

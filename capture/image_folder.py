@@ -21,7 +21,7 @@ LOG_LEVEL_SILENT = 0
 
 @cache
 def silence_opencv() -> None:
-    """Silences OpenCV and its FFmpeg; to be called before a file is opened."""
+    """Silence OpenCV and its FFmpeg; to be called before a file is opened."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read when FFmpeg is first used
     set_level = getattr(cv2, "setLogLevel", None)  # OpenCV 4 has it here, OpenCV 5 there
     (set_level or cv2.utils.logging.setLogLevel)(LOG_LEVEL_SILENT)
@@ -48,7 +48,7 @@ EXIF_TRANSPOSE = {
 """Pillow's operation that makes stored pixels upright, by EXIF's orientation."""
 
 TIFF_MAGIC = (b"II*\x00", b"MM\x00*")
-"""How TIFF files begin: their tags are EXIF's, and OpenCV turns their pixels in any mode."""
+"""First bytes of TIFF files: their tags are EXIF's, and OpenCV turns their pixels in any mode."""
 
 ALPHA_SAMPLES = 5
 """Number of images, evenly spread, whose alpha channel is examined."""
@@ -71,11 +71,7 @@ def natural_sort_key(path: Path) -> list[tuple[int, str]]:
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The pictures in a folder, in natural order.
-
-    Raises:
-        InputError: If a pipe or a device has the name of one.
-    """
+    """The images in a folder, in natural order; an InputError if a pipe has the name of one."""
     images = (file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES)
     found = sorted((file for file in images if not file.name.startswith(".")), key=natural_sort_key)
     for file in found:
@@ -84,11 +80,7 @@ def list_images(folder: Path) -> list[Path]:
 
 
 def refuse_pipe(path: Path) -> None:
-    """Refuse what is neither a file nor a folder: it may be waited for without end.
-
-    Raises:
-        InputError: Naming it.
-    """
+    """Refuse what is neither a file nor a folder: it may be waited for without end."""
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise InputError(
             f"{path} is a pipe or a device; a file or a folder was expected. Store what comes from "
@@ -99,7 +91,7 @@ def refuse_pipe(path: Path) -> None:
 def read_image(
     path: Path,
 ) -> tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"] | None]:
-    """One upright picture as RGB, and its alpha channel if it has one.
+    """One upright image as RGB, and its alpha channel if it has one.
 
     Raises:
         InputError: If it cannot be decoded, or is not complete.
@@ -126,7 +118,7 @@ def read_image(
 
 
 def write_png(path: Path, picture: UInt8[np.ndarray, "..."]) -> None:
-    """Write a gray, RGB or RGBA picture as PNG.
+    """Write a gray, RGB or RGBA image as PNG.
 
     Raises:
         OSError: If the disk is full, which OpenCV's own writer does not say.
@@ -138,12 +130,12 @@ def write_png(path: Path, picture: UInt8[np.ndarray, "..."]) -> None:
 
 
 def has_cutout_alpha(alpha: UInt8[np.ndarray, "height width"] | None) -> bool:
-    """Whether an alpha channel says where the person is: an opaque one says nothing."""
+    """Return whether an alpha channel cuts the person out: an opaque one does not."""
     return alpha is not None and float((alpha < 128).mean()) >= MIN_TRANSPARENT_FRACTION
 
 
 def any_has_cutout_alpha(images: Sequence[Path]) -> bool:
-    """Whether the alpha channel of any of a few pictures, spread over all, cuts the person out.
+    """Return whether the alpha channel of any of a few images, evenly spread, cuts the person out.
 
     One image proves nothing: matting tools write opaque ones at first, or where nothing is found.
     """
@@ -160,7 +152,7 @@ def any_has_cutout_alpha(images: Sequence[Path]) -> bool:
 
 
 def exif_orientation(data: bytes) -> int:
-    """EXIF's orientation of an encoded picture, 1 to 8; 1 (upright) where there is none."""
+    """EXIF's orientation of an encoded image, 1 to 8; 1 (upright) where there is none."""
     tagged = data.startswith(TIFF_MAGIC) or any(
         mark in data for mark in (b"Exif", b"eXIf", b"EXIF")
     )
@@ -193,7 +185,7 @@ def _decode(encoded: UInt8[np.ndarray, "bytes"], mode: int) -> np.ndarray | None
 
 
 def _is_complete(data: bytes) -> bool:
-    """Whether a PNG or JPEG has its end (some decoders fill the missing rest in silence)."""
+    """Return whether a PNG or JPEG has its end: some decoders fill a missing rest in silence."""
     if data.startswith(b"\x89PNG"):
         return b"IEND" in data[-1024:]
     if data.startswith(b"\xff\xd8"):
@@ -202,14 +194,10 @@ def _is_complete(data: bytes) -> bool:
 
 
 class ImageFolder(Recording):
-    """A folder of pictures; picture i was taken at i / 30 s."""
+    """A folder of images; image i was taken at i / 30 s."""
 
     def __init__(self, path: Path, selection: FrameSelection) -> None:
-        """Lists the folder and reads the first picture that can be read.
-
-        Raises:
-            InputError: If there is none, or none is wanted.
-        """
+        """List the folder and read the first image that can be read."""
         super().__init__(path, selection)
         self._images = list_images(path)
         self.frames_in_file = len(self._images)
@@ -226,7 +214,7 @@ class ImageFolder(Recording):
         )
 
     def frames(self) -> Iterator[Frame]:
-        """The wanted pictures in order; every call starts from the first."""
+        """The selected images in order; every call starts from the first."""
         previous = None
         for index, path in enumerate(self._images):
             if not self.selection.contains(index):
@@ -248,11 +236,11 @@ class ImageFolder(Recording):
             previous = rgb
 
     def count_frames(self) -> int:
-        """How many pictures the folder holds."""
+        """The number of images in the folder."""
         return len(self._images)
 
     def _look(self) -> tuple[tuple[int, int], int]:
-        """Size of the first picture that can be read, and by how many quarters it is turned."""
+        """Size of the first image that can be read, and its counter-clockwise quarter turns."""
         for path in self._images:
             try:
                 rgb, _ = read_image(path)

@@ -18,7 +18,7 @@ class Inbox(Generic[Item]):
 
     Attributes:
         paced: Whether items come at times of their own, so that hurrying would not help.
-        live: Whether the latest is kept.
+        live: Whether the producer never waits and older items are dropped for the latest.
         dropped: Number of items that were dropped for later ones.
     """
 
@@ -30,14 +30,7 @@ class Inbox(Generic[Item]):
         paced: bool = False,
         live: bool = False,
     ) -> None:
-        """Starts the producer.
-
-        Args:
-            items: Iterated on the inbox's own thread.
-            capacity: How many items wait at most.
-            paced: Whether items come at times of their own.
-            live: Whether the producer never waits.
-        """
+        """Start the producer; at most `capacity` items wait."""
         self.paced = paced
         self.dropped = 0
         self.live = live
@@ -50,7 +43,7 @@ class Inbox(Generic[Item]):
 
     @property
     def finished(self) -> bool:
-        """Whether everything has been taken and nothing more will come."""
+        """Return whether everything has been taken and nothing more will come."""
         return self._ended.is_set() and self._queue.empty() and self._error is None
 
     @property
@@ -59,12 +52,7 @@ class Inbox(Generic[Item]):
         return self._queue.qsize()
 
     def take(self, *, timeout_s: float = 0.0, max_items: int | None = None) -> list[Item]:
-        """Takes what has arrived, in order.
-
-        Args:
-            timeout_s: Seconds to wait for a first item.
-            max_items: Number of items taken at most; None for all.
-        """
+        """Take what has arrived, in order: at most `max_items`, after waiting for a first one."""
         taken: list[Item] = []
         try:
             taken.append(
@@ -80,14 +68,14 @@ class Inbox(Generic[Item]):
         return taken
 
     def close(self) -> None:
-        """Tells the producer to stop and waits until it has."""
+        """Tell the producer to stop and wait until it has."""
         self._stop.set()
         while self._thread.is_alive():
             self._drain()
             self._thread.join(timeout=0.02)
 
     def _drain(self) -> None:
-        """Empties the inbox, so that a waiting producer can see that it should stop."""
+        """Empty the inbox, so that a waiting producer can see that it should stop."""
         while not self._queue.empty():
             try:
                 self._queue.get_nowait()
@@ -95,7 +83,7 @@ class Inbox(Generic[Item]):
                 return
 
     def _drop_oldest(self) -> None:
-        """Makes room for the latest, of a live source; else the producer goes on waiting."""
+        """Make room for the latest item of a live source; else the producer goes on waiting."""
         if not self.live:
             return
         try:

@@ -1,7 +1,7 @@
-"""Live sources: a camera, and a folder of pictures that still grows.
+"""Live sources: a camera, and a folder of images that still grows.
 
-A camera is read by a thread of its own; the latest pictures are kept, older ones give way. A
-picture in a folder is taken when it is complete.
+A camera is read by a thread of its own; the latest images are kept, older ones dropped. An image in
+a folder is taken when it is complete.
 """
 
 import errno
@@ -41,7 +41,7 @@ MAX_READ_FAILURES = 16
 
 
 def camera_address(path: Path) -> str | None:
-    """What follows `camera:` in an argument; None if it names no camera."""
+    """The part of an argument behind `camera:`; None if it names no camera."""
     text = str(path)
     if not text.startswith(CAMERA_PREFIX):
         return None
@@ -50,13 +50,9 @@ def camera_address(path: Path) -> str | None:
 
 @final
 class CameraDevice:
-    """A live source: a camera's number, a device, the address of a stream, or a file like one.
+    """A camera by its number, a device, the address of a stream, or a file that plays like one.
 
-    A file is read at its own pace, as if it came from a camera; so can be tried what will be done.
-
-    Attributes:
-        dropped: How many pictures gave way to later ones.
-        started_at: When the first picture came, in seconds since 1970.
+    `dropped` counts images that were dropped for later ones; `started_at` is when the first came.
     """
 
     has_alpha = False
@@ -67,16 +63,16 @@ class CameraDevice:
     duration_s: float | None = None
 
     def __init__(self, address: str, selection: FrameSelection, pace: PacingClock) -> None:
-        """Opens it and waits for its first picture.
+        """Open it and wait for its first image.
 
         Args:
-            address: What follows `camera:`.
-            selection: Which pictures are wanted.
-            pace: By which others wait for what belongs to its pictures; closing ends it.
+            address: The part of the argument behind `camera:`.
+            selection: The frames that are wanted.
+            pace: The clock of those who wait for poses or masks of its images; closing ends it.
 
         Raises:
             InputError: If there is no such camera.
-            OSError: If it is there and cannot be used now (EBUSY), or may not be (EACCES).
+            OSError: If it exists and is in use (EBUSY), or may not be opened (EACCES).
         """
         self.path = Path(CAMERA_PREFIX + address)
         self.selection = selection
@@ -99,11 +95,11 @@ class CameraDevice:
 
     @property
     def waited_s(self) -> float:
-        """How long it has been waited for pictures, and for what belongs to them."""
+        """Seconds of waiting for images, and for what belongs to them, so far."""
         return self._waited_s + self._pace.waited_s
 
     def frames(self) -> Iterator[Frame]:
-        """The pictures as they come; to be read once."""
+        """The images as they come; to be read once."""
         if self._reader is None:
             self._reader = threading.Thread(target=self._read, daemon=True)
             self._reader.start()
@@ -118,7 +114,7 @@ class CameraDevice:
         return 0
 
     def close(self) -> None:
-        """Lets the camera go."""
+        """Release the camera."""
         self._pace.stop()
         with self._changed:
             self._ended = True
@@ -129,7 +125,7 @@ class CameraDevice:
             self._capture.release()
 
     def _next(self) -> Frame | None:
-        """The oldest picture that waits; None at the end."""
+        """The oldest image that waits; None at the end."""
         with self._changed:
             began = time.perf_counter()
             while not (self._waiting or self._ended):
@@ -138,7 +134,7 @@ class CameraDevice:
             return self._waiting.popleft() if self._waiting and not self._pace.stopped else None
 
     def _read(self) -> None:
-        """Takes pictures as fast as they come; runs on its own thread."""
+        """Take images as fast as they come; runs on its own thread."""
         try:
             count = 1 + self._read_all()
             if not (self._ended or self._is_file):
@@ -152,7 +148,7 @@ class CameraDevice:
                 self._changed.notify_all()
 
     def _read_all(self) -> int:
-        """The number of the last picture."""
+        """Read until the end; return the number of the last image."""
         index, failures = 0, 0
         while failures < MAX_READ_FAILURES and not self._ended:
             if not self._capture.grab():
@@ -182,12 +178,7 @@ class CameraDevice:
 
 
 def _open_device(address: str) -> cv2.VideoCapture:
-    """The camera, open.
-
-    Raises:
-        InputError: If there is none.
-        OSError: If it cannot be opened although it is there.
-    """
+    """Open the camera; an OSError if it exists and cannot be opened."""
     silence_opencv()
     number = int(address) if address.isdigit() else None
     device = Path(f"/dev/video{number}") if number is not None else Path(address)
@@ -229,11 +220,10 @@ Picture = tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height w
 
 @final
 class WatchedImageFolder:
-    """A live source: pictures that another program writes, in natural order.
+    """A live source: images that another program writes, in natural order.
 
-    Attributes:
-        dropped: How many pictures were passed over, because too many were waiting.
-        started_at: When the first picture was written, in seconds since 1970.
+    `dropped` counts images that were passed over because too many were waiting; `started_at` is
+    when the first was written.
     """
 
     live = paced = True
@@ -249,16 +239,16 @@ class WatchedImageFolder:
         *,
         idle_s: float = IDLE_TIMEOUT_S,
     ) -> None:
-        """Waits for the first picture.
+        """Wait for the first image.
 
         Args:
             path: The folder, which may be empty.
-            selection: Which pictures are wanted, counted in natural order.
-            pace: Its clock; ending it ends the watch.
-            idle_s: No new picture for so long is the end.
+            selection: The images that are wanted, counted in natural order.
+            pace: Its clock; stopping it ends the watch.
+            idle_s: The source ends when no new image has come for this time, seconds.
 
         Raises:
-            InputError: If there is no such folder, or no picture in it after `idle_s`.
+            InputError: If there is no such folder, or no image in it after `idle_s`.
         """
         if not path.is_dir():
             raise InputError(
@@ -278,11 +268,11 @@ class WatchedImageFolder:
 
     @property
     def waited_s(self) -> float:
-        """How long it has been waited for pictures."""
+        """Seconds of waiting for images so far."""
         return self._pace.waited_s
 
     def frames(self) -> Iterator[Frame]:
-        """The pictures as they are completed."""
+        """The images as they are completed."""
         last_s = 0.0
         for index, path in self._arriving():
             if self.selection.is_past_end(index):
@@ -305,15 +295,15 @@ class WatchedImageFolder:
             )
 
     def count_frames(self) -> int:
-        """How many pictures there are by now."""
+        """The number of images by now."""
         return len(list_images(self.path))
 
     def close(self) -> None:
-        """Ends the watch, also in the middle of a wait."""
+        """End the watch, also in the middle of a wait."""
         self._pace.stop()
 
     def _first(self) -> tuple[Path, Picture]:
-        """The first picture that can be read."""
+        """The first image that can be read."""
         deadline = self._now() + self._idle_s
         while True:
             for path in list_images(self.path):
@@ -329,7 +319,7 @@ class WatchedImageFolder:
             self._pace.wait_until(self._now() + POLL_INTERVAL_S)
 
     def _arriving(self) -> Iterator[tuple[int, Path]]:
-        """Place in natural order and path of each picture that is to be taken."""
+        """Place in natural order and path of each image that is to be taken."""
         count, newest, quiet_since = 0, None, self._now()
         while not self._pace.stopped:
             looked_at = self._now()
@@ -364,7 +354,7 @@ class WatchedImageFolder:
         return self._pace.now()
 
     def _complete(self, path: Path) -> Picture | None:
-        """A picture once it is whole; None if it never is."""
+        """An image once it is whole; None if it never is."""
         while not self._pace.stopped:
             try:
                 picture = read_image(path)
@@ -390,7 +380,7 @@ class WatchedImageFolder:
 
 
 def _modified_at(path: Path) -> float:
-    """When a file was last written to, in seconds since 1970; long ago, if it is gone."""
+    """Time of the last change of a file, seconds since 1970; long ago if it is gone."""
     try:
         return path.stat().st_mtime
     except OSError:

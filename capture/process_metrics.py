@@ -32,11 +32,9 @@ RESERVOIR_SIZE = 4096
 
 @final
 class ReservoirSample:
-    """A uniform sample of all numbers so far (Vitter 1985, algorithm R).
+    """A uniform sample of `count` numbers so far (Vitter 1985, algorithm R).
 
-    Attributes:
-        count: How many there were.
-        largest: The largest of them all; 0 of none.
+    `largest` is the largest of them all; 0 of none.
     """
 
     def __init__(self, kept: int = RESERVOIR_SIZE) -> None:
@@ -48,7 +46,7 @@ class ReservoirSample:
         self.largest = 0.0
 
     def add(self, number: float) -> None:
-        """Takes a number in; to be called by one thread."""
+        """Take a number in; to be called by one thread."""
         self.count += 1
         self.largest = number if self.count == 1 else max(self.largest, number)
         if len(self._kept) < self._most:

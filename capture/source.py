@@ -15,17 +15,16 @@ from capture.input_error import InputError
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Frame:
-    """An upright RGB picture and its place in the stream.
+    """An upright RGB image and its place in the stream.
 
     Attributes:
         index: Position in the source, counted from 0 (frames that were skipped keep their number).
         time_s: Container timestamp in seconds; never computed from an assumed rate.
-        rgb: Picture, 8-bit RGB, upright.
         flags: What is wrong with it: "corrupt", "repeated", or both.
-        alpha: The source's own alpha channel (RGBA pictures), else None.
-        due_s: When it was there to be taken, on `time.perf_counter`'s clock: played or filmed at
-            that moment. None for a recording that is read as fast as it is taken.
-        name: Of the picture's file without its ending, where each picture has a file.
+        alpha: The source's own alpha channel (RGBA images), else None.
+        due_s: Time on `time.perf_counter`'s clock at which it was played or filmed. None for a
+            recording that is read as fast as it is taken.
+        name: Of the image's file without its ending, where each image has a file.
     """
 
     index: int
@@ -52,7 +51,7 @@ class FrameSelection:
 
     @classmethod
     def of(cls, frames: slice | None) -> "FrameSelection":
-        """From a slice; all frames if it is None.
+        """The selection of a slice; all frames if it is None.
 
         Raises:
             InputError: If it counts from the end, goes backwards or leaves nothing.
@@ -69,7 +68,7 @@ class FrameSelection:
         return cls(start=start, stop=frames.stop, step=step)
 
     def contains(self, index: int) -> bool:
-        """Whether the frame with this number belongs to it."""
+        """Return whether the frame with this number is selected."""
         return (
             index >= self.start
             and not self.is_past_end(index)
@@ -77,19 +76,19 @@ class FrameSelection:
         )
 
     def is_past_end(self, index: int) -> bool:
-        """Whether no frame from this number on belongs to it."""
+        """Return whether no frame from this number on is selected."""
         return self.stop is not None and index >= self.stop
 
     def count(self, total: int) -> int:
-        """How many of `total` frames belong to it."""
+        """Number of selected frames of `total`."""
         return len(range(self.start, min(total, self.stop or total), self.step))
 
     def position(self, index: int) -> int:
-        """The place of a wanted frame among the wanted ones, counted from 0."""
+        """The place of a selected frame among the selected ones, counted from 0."""
         return (index - self.start) // self.step
 
     def span(self, total: int) -> int:
-        """How many of `total` frames lie from the first wanted one to the last, both counted."""
+        """Number of frames of `total` from the first selected one to the last, both counted."""
         count = self.count(total)
         return (count - 1) * self.step + 1 if count else 0
 
@@ -99,23 +98,19 @@ class FrameSource(Protocol):
     """A recorded or live stream of upright RGB frames of one size.
 
     Attributes:
-        path: The video file or the folder of pictures itself.
-        size_px: Width and height of every frame.
-        selection: The frames that are wanted.
-        frames_in_file: How many frames there are in all, wanted or not, as the container claims;
-            of a live source 0.
+        path: The video file or the folder of images itself.
+        frames_in_file: Number of all frames, selected or not, as the container claims; of a live
+            source 0.
         frame_count: Number of selected frames; fewer may come, see `warnings`. None for a live
             source.
-        duration_s: How long the wanted frames last, as the container claims; None if unknown.
+        duration_s: Duration of the selected frames, as the container claims; None if unknown.
         has_alpha: Whether the frames' own alpha channel is their mask: it cuts the person out of
-            one of the pictures that were looked at, and no segmenter was asked for instead.
+            one of the sampled images, and no segmenter was named instead.
         quarter_turns: Counter-clockwise quarter turns that make stored images upright.
         live: Whether frames that are not taken in time are lost.
         paced: Whether frames come at times of their own, however fast they are taken.
-        waited_s: How long `frames()` has waited for frames, in all.
-        dropped: Number of frames that were lost because they were not taken in time.
-        started_at: When the first frame of a live source was filmed, in seconds since 1970.
-        warnings: What was wrong so far; grows while `frames()` is read.
+        started_at: Time when the first frame of a live source was filmed, seconds since 1970.
+        warnings: Problems so far; grows while `frames()` is read.
     """
 
     path: Path
@@ -133,7 +128,7 @@ class FrameSource(Protocol):
 
     @property
     def waited_s(self) -> float:
-        """How long `frames()` has waited for frames, in all."""
+        """Seconds that `frames()` has waited for frames, in all."""
         ...
 
     @property
@@ -142,32 +137,32 @@ class FrameSource(Protocol):
         ...
 
     def frames(self) -> Iterator[Frame]:
-        """The frames, lazily and in order; every call starts from the first."""
+        """The selected frames, lazily and in order; every call starts from the first."""
         ...
 
     def count_frames(self) -> int:
-        """How many frames there really are in all, found by decoding; slow."""
+        """The true number of all frames, found by decoding; slow."""
         ...
 
     def close(self) -> None:
-        """Ends `frames()`, also one that waits on another thread, and lets a device go."""
+        """End `frames()`, also one that waits on another thread, and release a device."""
         ...
 
 
 class Recording:
-    """What a video file and a folder of pictures have in common: nothing waits or is lost."""
+    """The common part of a video file and a folder of images: nothing waits or is lost."""
 
     live = paced = False
     started_at = waited_s = 0.0
     dropped = 0
 
     def __init__(self, path: Path, selection: FrameSelection) -> None:
-        """Nothing is read yet; see `FrameSource` for the arguments."""
+        """Keep the arguments; nothing is read yet."""
         self.path, self.selection = path, selection
         self.warnings: list[str] = []
 
     def close(self) -> None:
-        """Nothing is held open but by `frames()`, which lets it go itself."""
+        """Do nothing: only `frames()` holds files open, and closes them itself."""
 
     def _warn(self, message: str) -> None:
         if message not in self.warnings:
@@ -194,12 +189,12 @@ class _WrappedSource:
 
     @property
     def waited_s(self) -> float:
-        """How long it has been waited for frames, in all."""
+        """The recording's own."""
         return self._source.waited_s
 
     @property
     def dropped(self) -> int:
-        """Number of frames that were lost because they were not taken in time."""
+        """The recording's own."""
         return self._source.dropped
 
     def frames(self) -> Iterator[Frame]:
@@ -207,11 +202,11 @@ class _WrappedSource:
         return self._source.frames()
 
     def count_frames(self) -> int:
-        """How many frames there really are in all, found by decoding."""
+        """The recording's true number of frames, found by decoding."""
         return self._source.count_frames()
 
     def close(self) -> None:
-        """Closes the recording."""
+        """Close the recording."""
         self._source.close()
 
 
@@ -233,8 +228,7 @@ class TransposedSource(_WrappedSource):
 class PacingClock:
     """The clock of a source whose frames come at times of their own.
 
-    Attributes:
-        waited_s: How long it has been waited for frames, in all.
+    `waited_s` sums up the seconds of all waits.
     """
 
     def __init__(
@@ -243,12 +237,7 @@ class PacingClock:
         clock: Callable[[], float] = time.perf_counter,
         wait: Callable[[float], object] | None = None,
     ) -> None:
-        """Start a clock that was not stopped.
-
-        Args:
-            clock: Seconds; another one in tests.
-            wait: Sleeps for the given seconds, or until the clock is stopped.
-        """
+        """Start a clock of seconds; `wait` sleeps for some, or until the clock is stopped."""
         self._ended = threading.Event()
         self._clock = clock
         self._wait: Callable[[float], object] = self._ended.wait if wait is None else wait
@@ -256,7 +245,7 @@ class PacingClock:
 
     @property
     def stopped(self) -> bool:
-        """Whether `stop` was called: every wait returns at once."""
+        """Return whether `stop` was called: every wait returns at once."""
         return self._ended.is_set()
 
     def now(self) -> float:
@@ -264,15 +253,11 @@ class PacingClock:
         return self._clock()
 
     def stop(self) -> None:
-        """Ends every wait, the present one too; from any thread."""
+        """End every wait, the present one too; from any thread."""
         self._ended.set()
 
     def wait_until(self, moment: float) -> bool:
-        """Waits for a moment on the clock; does not if it has gone by.
-
-        Returns:
-            Whether to go on: False after `stop`.
-        """
+        """Wait for a moment on the clock, unless it has gone by; return False after `stop`."""
         began = self._clock()
         if moment > began and not self.stopped:
             self._wait(moment - began)
@@ -296,19 +281,14 @@ class RealtimePlayback(_WrappedSource):
     paced = True
 
     def __init__(self, source: FrameSource, pace: PacingClock) -> None:
-        """Nothing is read yet.
-
-        Args:
-            source: What is played.
-            pace: Its clock; ending it ends the playback, also in the middle of a wait.
-        """
+        """Wrap a recording; stopping the clock ends the playback, also in the middle of a wait."""
         super().__init__(source)
         self._pace = pace
         self.catch_up = False
 
     @property
     def waited_s(self) -> float:
-        """How long frames have been held back in all."""
+        """Seconds for which frames have been held back in all."""
         return self._pace.waited_s
 
     def frames(self) -> Iterator[Frame]:
@@ -324,6 +304,6 @@ class RealtimePlayback(_WrappedSource):
             yield replace(frame, due_s=due)
 
     def close(self) -> None:
-        """Ends the playback, also in the middle of a wait."""
+        """End the playback, also in the middle of a wait."""
         self._pace.stop()
         super().close()

@@ -1,4 +1,4 @@
-"""Opens what frames come from: a video file, a folder of pictures, a capture folder, a camera."""
+"""Opens a source of frames: a video file, a folder of images, a capture folder, a camera."""
 
 from pathlib import Path
 
@@ -19,11 +19,9 @@ SIDE_VIDEO_PREFIXES = ("mask", "preview", "skeleton")
 
 
 def open_source(path: Path, *, frames: slice | None = None) -> FrameSource:
-    """Opens a video file, a folder of pictures or a native capture folder.
+    """Open a video file, a folder of images, or a folder with `images/` or a single video in it.
 
-    Args:
-        path: A video, a folder of pictures, or a folder with `images/` or a single video in it.
-        frames: Which frames are wanted; they keep their numbers. All if None.
+    Selected `frames` keep their numbers; all if None.
 
     Raises:
         InputError: If there is nothing there that can be read.
@@ -73,18 +71,14 @@ def _ambiguous_folder_error(path: Path, videos: list[Path]) -> InputError:
 def open_live_source(
     path: Path, camera: str | None, frames: slice | None, pace: PacingClock, *, idle_s: float
 ) -> FrameSource:
-    """Opens a camera, or a folder that another program writes pictures to.
+    """Open a camera, or a folder that another program writes images to.
 
     Args:
-        path: The folder; a capture folder's pictures lie in its `images/`.
+        path: The folder; a capture folder's images lie in its `images/`.
         camera: Number or address of a camera instead.
-        frames: Which frames are wanted. All if None.
+        frames: The frames that are wanted. All if None.
         pace: The clock of a folder.
         idle_s: Time without a new image after which a folder ends, seconds.
-
-    Raises:
-        InputError: If there is no such camera, or no picture comes into the folder.
-        OSError: If the camera cannot be used now.
     """
     selection = FrameSelection.of(frames)
     if camera is not None:

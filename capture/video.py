@@ -33,10 +33,8 @@ MAX_DECODE_FAILURES = 16
 class DecodedFrame(NamedTuple):
     """A frame as the decoder yields it, not converted to RGB yet.
 
-    Attributes:
-        frame: PyAV's frame.
-        time_s: The container's timestamp, from the first frame on.
-        after_gap: Whether frames before it could not be decoded.
+    `time_s` is counted from the first frame on; `after_gap` tells whether frames before it could
+    not be decoded.
     """
 
     frame: Any
@@ -202,7 +200,7 @@ def _quarter_turns(frame: Any) -> int:
 
 
 def _has_transparency(frame: Any) -> bool:
-    """Whether a frame has an alpha channel that is not opaque."""
+    """Return whether a frame has an alpha channel that is not opaque."""
     if not any(component.is_alpha for component in frame.format.components):
         return False
     return has_cutout_alpha(frame.to_ndarray(format="rgba")[..., 3])

@@ -22,7 +22,6 @@ class VideoCodec:
     Attributes:
         name: FFmpeg's name of the encoder.
         pixel_format: FFmpeg's name of the pixel format.
-        options: Options of the encoder.
         description: What is written and where it plays, for the user.
     """
 
@@ -59,16 +58,13 @@ FFV1 = VideoCodec(name="ffv1", pixel_format="bgr0", description="FFV1, which is 
 
 
 def write_video(path: Path, images: Iterable[Pixels], fps: float, codec: VideoCodec) -> int:
-    """Write images of one size as a video.
+    """Write images of one size as a video; return their number.
 
     Args:
         path: File to write; its suffix selects the container.
         images: RGB, or RGBA with straight alpha.
         fps: Images per second.
-        codec: How they are encoded.
-
-    Returns:
-        Number of images written.
+        codec: The encoder and its options.
 
     Raises:
         OSError: If the disk is full.
