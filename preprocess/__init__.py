@@ -1,4 +1,4 @@
-"""Preprocess: what is known about each frame, as a mask, a body pose and a camera."""
+"""Preprocess: the mask, the body pose and the camera of each frame."""
 
 import os
 

@@ -22,19 +22,12 @@ MASK_NAMES = ["masks", "masks.npz", "masks.npy", "masks.mp4", "masks.json"]
 
 
 CAMERA_NAMES = ["cameras.npz", "transforms.json", "sparse"]
-"""Where cameras are looked for, in this order."""
+"""Names under which cameras lie in a capture folder, in the order of preference."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CapturePaths:
-    """The parts of a capture.
-
-    Attributes:
-        video: Video file, folder of pictures, or native capture folder.
-        poses: The pose file.
-        masks: Folder or file of masks; None where there are none.
-        cameras: The camera file; None for a static camera without a description.
-    """
+    """The paths of the parts of a capture; `cameras` is None for a static camera without a file."""
 
     video: Path
     poses: Path
@@ -43,13 +36,13 @@ class CapturePaths:
 
 
 def find_parts(folders: Iterable[Path]) -> list[Path]:
-    """What lies in some folders under the names of a capture's parts."""
+    """List the files in some folders that have the names of a capture's parts."""
     names = [*POSE_FILE_NAMES, *MASK_NAMES, *CAMERA_NAMES, "images"]
     return [path for folder in folders for name in names if (path := folder / name).exists()]
 
 
 def resolve_pose_path(path: Path) -> Path:
-    """The pose file of a capture folder, where the folder was named; else what was named."""
+    """The pose file of a capture folder, if `path` is one; else `path` itself."""
     return _first_existing([path], POSE_FILE_NAMES) or path
 
 
@@ -59,20 +52,20 @@ def find_capture_paths(
     masks: Path | None = None,
     cameras: Path | str | None = None,
 ) -> CapturePaths:
-    """Finds what was not named.
+    """Find the parts that the user did not name.
 
-    For a folder, everything defaults to what lies in it. For a file (and a folder that is named
+    For a folder, everything defaults to the files in it. For a file (and a folder that is named
     `images`), masks and cameras are looked for beside it, then beside the poses.
 
     Args:
-        video: Video file, folder of pictures, or native capture folder.
+        video: Video file, folder of images, or native capture folder.
         poses: Pose file; needed unless `video` is a folder that holds one of `POSES`.
         masks: Folder or file of masks.
         cameras: Camera file; "static" for a static camera without a description; "solve" for a
             moving one, for which no file is looked for either.
 
     Raises:
-        InputError: If something that was named, or the poses, is not there.
+        InputError: If something that was named, or the poses, does not exist.
     """
     if str(cameras) == "solve":  # nothing lies anywhere: until then each frame has its own camera
         cameras = "static"
@@ -119,10 +112,7 @@ def find_own_cameras(video: Path, poses: Path | None = None) -> Path | None:
 def find_stream_cameras(video: Path, named: str | None) -> Path | None:
     """The cameras of a video or a live source without poses; None without any.
 
-    Args:
-        video: Video file, folder of pictures, or `camera:…`.
-        named: Value of --cameras: a file, "static" or "solve", of which nothing is known yet, or
-            None.
+    `named` is the value of --cameras: a file, "static" or "solve" (nothing is known yet), or None.
     """
     if named in ("static", "solve"):
         return None
@@ -143,12 +133,9 @@ def _first_existing(places: list[Path], names: list[str]) -> Path | None:
 
 @dataclass(frozen=True, kw_only=True)
 class MaskOrigin:
-    """Where the masks come from: a file or folder, a segmenter, or else the alpha channel.
+    """The origin of the masks: a file or folder, a segmenter by name, or else the alpha channel.
 
-    Attributes:
-        path: The file or folder; None if there is none.
-        segmenter: Name of the segmenter that estimates them; None if nothing is estimated.
-        is_explicit: Whether the user named it.
+    `is_explicit` tells whether the user named it.
     """
 
     path: Path | None = None
@@ -157,19 +144,19 @@ class MaskOrigin:
 
     @property
     def uses_alpha_channel(self) -> bool:
-        """Whether the images' own alpha channel is the mask."""
+        """Return whether the images' own alpha channel is the mask."""
         return self.path is None and self.segmenter is None
 
     @property
     def is_fallback(self) -> bool:
-        """Whether masks are estimated only because there are no others."""
+        """Return whether masks are estimated only because there are no others."""
         return self.segmenter is not None and not self.is_explicit
 
 
 def choose_mask_origin(
     requested: Path | None, found: Path | None, *, has_alpha: bool
 ) -> MaskOrigin:
-    """Choose what the user named; else a file that was found, the alpha channel, or an estimate.
+    """Choose the masks the user named; else a file that was found, the alpha channel, an estimate.
 
     Args:
         requested: Value of --masks: a file, a folder, or `segmenter:NAME`.

@@ -1,4 +1,4 @@
-"""A capture: what the user named, and everything opened and aligned before its first frame."""
+"""A capture: the inputs of the user, and everything opened and aligned before its first frame."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -27,24 +27,21 @@ from preprocess.tracked_stream import LiveTracking
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureInputs:
-    """What the user named; the rest is looked for (see `find_capture_paths`).
+    """The inputs that the user named; the rest is looked for (see `find_capture_paths`).
 
     Attributes:
-        video: Video file, folder of pictures, or capture folder.
-        poses, masks: Files or folders, or None.
+        video: Video file, folder of images, or capture folder.
         cameras: A file, "static", "solve" (poses are then in the camera of each frame, and so is
             all the rest until cameras were solved), or None.
         body: A body file; None for the embedded body.
-        frames: Which frames are wanted.
         invert_masks: Whether the person is dark in the masks; None finds out.
         live: Whether `video` is a folder that grows; a camera is live without it.
         person: Whose poses, where the file holds several people's; None for the longest track.
-        idle_s: Of a live source: how long nothing new may come, seconds.
-        height_m: How tall the person is; None if only the poses tell.
-        tracker: Name of the tracker that finds poses where none are given; None for the built-in
-            one.
-        refine_masks: Whether given masks are refined where their borders miss the pictures' edges.
-        transposed: Whether the film's width and height are exchanged before masks and cameras are
+        idle_s: Longest time without a new image from a live source, seconds.
+        height_m: Height of the person; None if only the poses tell.
+        tracker: Name of the tracker that finds poses where none are given; None: the built-in one.
+        refine_masks: Whether given masks are refined where their borders miss the images' edges.
+        transposed: Whether the video's width and height are exchanged before masks and cameras are
             compared with it; only to find out whether it was rotated.
     """
 
@@ -65,11 +62,11 @@ class CaptureInputs:
 
     @property
     def is_live(self) -> bool:
-        """Whether frames come from a camera, or from a folder that still grows."""
+        """Return whether frames come from a camera, or from a folder that still grows."""
         return self.live or camera_address(self.video) is not None
 
     def input_paths(self) -> list[Path]:
-        """What no output may touch: files and folders that were named, and that may be found."""
+        """Paths that no output may touch: those that were named, and those that may be found."""
         named = [self.poses, self.body]
         if camera_address(self.video) is None:
             named.append(self.video)
@@ -87,22 +84,18 @@ class Capture:
     """A video of one person, with everything that belongs to it.
 
     Attributes:
-        paths: Where its parts lie.
-        source: The frames.
-        motion: The poses.
-        masks: The masks; None if the pictures' alpha channel is the mask, `segment` estimates them,
-            or `live` makes them.
+        masks: None if the images' alpha channel is the mask, `segment` estimates them, or `live`
+            makes them.
         cameras: The cameras, of the frames' size.
-        shaped: The person's body.
-        size_px: Longer side that training sees; None for the frames' own.
-        notes: What a user should know about how the parts were read.
-        live: What tracks the person while the frames come; `motion` is that of the first frames.
-        segment: What estimates the masks, if nothing holds them.
-        mask_refiner: What refines given masks; None if they stay as they are.
+        size_px: Longer side of the training images; None for the frames' own.
+        notes: Messages for the user about how the parts were read.
+        live: Tracks the person while the frames come; `motion` is that of the first frames.
+        segment: Estimates the masks, if no file or alpha channel holds them.
+        mask_refiner: Refines given masks; None if they stay as they are.
         camera_report: Entry of the report about solved cameras.
         tracking_report: Entry of the report about poses that were tracked in the video.
-        refit: How the poses were fitted to the masks, if they were made for another body.
-        fit: What was fitted to the masks before training (`preprocess.fitting`).
+        refit: The fit of the poses to the masks, if they were made for another body.
+        fit: The result of fitting to the masks before training (`preprocess.fitting`).
     """
 
     paths: CapturePaths
@@ -123,7 +116,7 @@ class Capture:
 
     @property
     def identity(self) -> str:
-        """What identifies the video in a checkpoint; each recording of a camera is a new one."""
+        """Name of the video in a checkpoint; each recording of a camera is a new one."""
         source = self.source
         if camera_address(source.path) is not None:
             return f"{source.path} {source.started_at:.3f}"
@@ -131,7 +124,7 @@ class Capture:
 
     @property
     def pose_uncertainty(self) -> float:
-        """How far the poses are estimates, in [0, 1]: 1 if they were tracked here.
+        """Degree to which the poses are estimates, in [0, 1]: 1 if they were tracked here.
 
         Given poses are as uncertain as the fit to the masks had to change them beyond its noise.
         """
@@ -140,11 +133,7 @@ class Capture:
         return 0.0 if self.fit is None else self.fit.share
 
     def check(self) -> None:
-        """Whether the parts fit together; no frame is read.
-
-        Raises:
-            InputError: If they do not.
-        """
+        """Raise an InputError if the parts do not fit together; no frame is read."""
         self.observation_builder()
         self.pixel_footprint_m()
 
@@ -153,7 +142,7 @@ class Capture:
         return map(self.observation_builder(), self.source.frames())
 
     def observation_builder(self) -> Callable[[Frame], Observation | DroppedFrame]:
-        """What joins a frame with its pose, mask and camera."""
+        """Make the function that joins a frame with its pose, mask and camera."""
         if self.live is not None:
             return self.live.observation_builder(
                 self.source, self.cameras, self.size_px, segment=self.segment,
@@ -169,7 +158,7 @@ class Capture:
         return {} if self.live is None else self.live.take_revised_poses()
 
     def mask_report(self) -> dict[str, str | float | None]:
-        """Where the masks come from, and how well estimated ones agree with the posed body."""
+        """Origin of the masks, and the agreement of estimated ones with the posed body."""
         if self.segment is not None:
             agreement = getattr(self.segment, "agreement", None)
             name = getattr(self.segment, "name", type(self.segment).__name__)
@@ -181,18 +170,18 @@ class Capture:
         return {"masks": f"{source}, refined" if refined else source, "mask_agreement": None}
 
     def final_notes(self) -> Iterator[str]:
-        """What could not be said before the frames came."""
+        """Messages for the user that need the frames to have come."""
         if self.live is not None:
             yield from self.live.final_notes()
         if self.mask_refiner is not None and self.mask_refiner.note is not None:
             yield self.mask_refiner.note
 
     def body_fit_report(self) -> dict[str, float | bool] | None:
-        """How the poses were fitted to the body that is used; None if that was not needed."""
+        """The fit of the poses to the body that is used; None if none was needed."""
         return None if self.refit is None else self.refit.as_json()
 
     def geometry(self) -> CaptureGeometry:
-        """Poses and cameras, as they are."""
+        """Poses and cameras of the capture as `CaptureGeometry`."""
         return CaptureGeometry.of(self.motion, self.cameras, self.source)
 
     def camera_of_pose(self, row: int) -> Camera:
@@ -204,10 +193,9 @@ class Capture:
         return replace(self, source=RealtimePlayback(self.source, PacingClock()))
 
     def pixel_footprint_m(self, *, as_filmed: bool = False) -> float:
-        """What one pixel covers on the body: the dial of the field's resolution.
+        """Size of one pixel on the body: the dial of the field's resolution.
 
-        Args:
-            as_filmed: Whether a pixel of the film is meant, not of the reduced pictures.
+        `as_filmed` means a pixel of the video, not of the reduced images.
 
         Raises:
             InputError: If the person is behind the camera.

@@ -1,8 +1,9 @@
-"""What a file holds, as dictionaries, lists, numbers, texts and numpy arrays; nothing is run.
+"""A file's content as dictionaries, lists, numbers, texts and numpy arrays; nothing is run.
 
 Three readers: `read_npz` and `read_pickled_arrays` for files whose keys are known, and
 `read_untrusted_file` for files of any container, which is recognised by its first bytes: people
-rename files.
+rename files. All raise InputError for a file that is missing or damaged, or holds anything that
+would have to be executed; the last two also for one beyond `MAX_BYTES`.
 """
 
 import io
@@ -28,12 +29,7 @@ MAX_BYTES = 1 << 30
 def read_npz(
     path: Path, keys: tuple[str, ...] | None = None
 ) -> dict[str, Shaped[np.ndarray, "..."]]:
-    """Read the arrays of an archive (only those of `keys` that it has, if given).
-
-    Raises:
-        InputError: If the file is missing or damaged, or holds pickled objects under a key in
-            `keys`.
-    """
+    """Read the arrays of an archive (only those of `keys` that it has, if given)."""
     if not path.is_file():
         raise InputError(f"{path} does not exist (or is no file); an .npz archive was expected.")
     try:
@@ -49,12 +45,7 @@ def read_npz(
 
 
 def read_pickled_arrays(path: Path, keys: Collection[str]) -> dict[str, Shaped[np.ndarray, "..."]]:
-    """Read those of the entries `keys` of a pickled dictionary that it has, as arrays.
-
-    Raises:
-        InputError: If the file is too large, is not a pickle of a dictionary, holds anything that
-            would have to be executed, or if a chosen entry is not an array.
-    """
+    """Read those of the entries `keys` of a pickled dictionary that it has, as arrays."""
     content = _explain_failures(path, lambda: load_safe_pickle(_read_bytes(path)), "pickle")
     if not isinstance(content, dict):
         raise InputError(f"{path} holds a {type(content).__name__}; a dictionary was expected.")
@@ -69,7 +60,7 @@ def read_pickled_arrays(path: Path, keys: Collection[str]) -> dict[str, Shaped[n
 
 
 def _explain_failures(path: Path, read: Callable[[], Any], kind: str) -> Any:
-    """Return what `read` gives, or tell what is wrong with the file."""
+    """Return the result of `read`, or raise an InputError that says what is wrong with the file."""
     try:
         return read()
     except (InputError, PermissionError, ModuleNotFoundError):  # commands explain these
@@ -103,11 +94,7 @@ POSE_FILE_SUFFIXES = frozenset(
 
 
 def read_untrusted_file(path: Path) -> Any:
-    """Return what a file holds; for a folder a dictionary of its files in natural order, by name.
-
-    Raises:
-        InputError: If it is missing, damaged, too large, or asks to run something.
-    """
+    """Return a file's content; for a folder a dictionary of its files in natural order, by name."""
     if path.is_dir():
         files = [file for file in path.iterdir() if file.suffix.lower() in POSE_FILE_SUFFIXES]
         files.sort(key=natural_sort_key)
@@ -125,7 +112,7 @@ def read_untrusted_file(path: Path) -> Any:
 
 
 def _decode(data: bytes, path: Path) -> Any:
-    """Return what the bytes hold, whatever they are packed in."""
+    """Return the content of the bytes, whatever they are packed in."""
     if not data:
         raise ValueError("it is empty")
     if data.startswith(b"PK"):
@@ -148,7 +135,7 @@ def _decode(data: bytes, path: Path) -> Any:
 
 
 def _decode_zip(data: bytes) -> Any:
-    """Return what an .npz holds, or what torch.save wrote."""
+    """Return the content of an .npz, or of a file of torch.save."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         names = archive.namelist()
         if any(name.endswith("data.pkl") for name in names):
@@ -174,11 +161,9 @@ def _decode_npy(data: bytes) -> Any:
 
 
 def _plain(thing: Any, known: dict[int, Any]) -> Any:
-    """Return dictionaries, lists and arrays for what is in a pickle, each once.
+    """Return dictionaries, lists and arrays for the content of a pickle, each once.
 
-    Args:
-        thing: What a pickle holds.
-        known: What was made of things with these ids; they live as long as the pickle's content.
+    `known` holds the results by the ids of their sources, which live as long as the pickle.
     """
     torch: Any = sys.modules.get("torch")
     if thing is None or isinstance(thing, bool | int | float | str):

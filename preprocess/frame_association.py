@@ -25,15 +25,11 @@ NUMBERING_HINT = "; or say which frame each belongs to (the keys `frame` or `tim
 
 
 def associate_by_order(rows: int, source: FrameSource, things: str) -> Callable[[int], int]:
-    """From a frame's number to its row: one row a frame, of all frames or of the wanted ones.
+    """Map a frame's number to its row: one row a frame, of all frames or of the selected ones.
 
     The container's claim counts, so that a truncated video still fits its poses; where it does not
-    fit, the frames are counted by decoding them.
-
-    Args:
-        rows: How many rows the file has.
-        source: The frames.
-        things: What the rows are, for the message ("poses in poses.npz").
+    fit, the frames are counted by decoding them. `things` names the rows in the message ("poses in
+    poses.npz").
 
     Raises:
         InputError: If there are more or fewer rows than frames.
@@ -52,7 +48,7 @@ def associate_by_order(rows: int, source: FrameSource, things: str) -> Callable[
 
 
 def _mismatch_hint(rows: int, count: int) -> str:
-    """What may have happened, and what to do then."""
+    """Suggest a cause of the mismatch, and a remedy."""
     if rows > count:
         return " Was the video cut, or re-encoded with fewer frames per second?"
     step = round(count / rows)
@@ -71,11 +67,11 @@ MIN_MATCHED_FRACTION = 0.1
 def associate_by_time(
     times_s: Float[np.ndarray, "poses"], source: FrameSource
 ) -> Callable[[float], int | None]:
-    """From a frame's time to the row nearest to it, or to None where none is near.
+    """Map a frame's time to the row nearest to it, or to None where none is near.
 
     Args:
         times_s: Of the poses, in any order; NaN where unknown.
-        source: The frames; what its container claims of their rate bounds how near a row must be.
+        source: The frames; the frame rate in its container bounds how near a row must be.
 
     Raises:
         InputError: If hardly any frame has a pose at its time.
@@ -86,7 +82,7 @@ def associate_by_time(
 
 
 def _frame_interval_s(source: FrameSource) -> float | None:
-    """From one wanted frame to the next, as the container claims."""
+    """Time from one selected frame to the next, as the container claims."""
     if not source.duration_s or not source.frame_count:
         return None
     return source.duration_s / source.frame_count
@@ -95,7 +91,7 @@ def _frame_interval_s(source: FrameSource) -> float | None:
 def _check_time_matches(
     times_s: Float[np.ndarray, "poses"], source: FrameSource, row_of: Callable[[float], int | None]
 ) -> None:
-    """Raises if hardly any frame has a pose at its time."""
+    """Raise an InputError if hardly any frame has a pose at its time."""
     step, count = _frame_interval_s(source), source.frame_count
     if step is None or count is None:
         return
@@ -135,16 +131,12 @@ def _nearest_row(
 
 
 def associate_by_name(names: Sequence[str], source: FrameSource) -> dict[int, int] | None:
-    """The masks' rows by their frames' numbers; None where names do not tell.
+    """Map frames' numbers to the rows of masks by file names, without endings; None if none tell.
 
-    In a folder of pictures a mask belongs to the picture of its name, or of its number. In a video
+    In a folder of images a mask belongs to the image of its name, or of its number. In a video
     numbers count the frames, from 0 if one is 0, from 1 if one is that of the last frame. Numbers
     without a gap are the count of a few chosen frames, and say nothing. Where half of the frames or
     more would have no mask, the masks are a choice that --frames has to state.
-
-    Args:
-        names: Of the masks' files, without their endings.
-        source: The frames.
     """
     if 2 * len(names) <= source.frames_in_file:
         return None
@@ -167,7 +159,7 @@ def associate_by_name(names: Sequence[str], source: FrameSource) -> dict[int, in
 def _match_names(
     masks: Sequence[str | int] | None, pictures: Sequence[str | int] | None
 ) -> dict[int, int] | None:
-    """Rows by frames, if every mask has its own picture."""
+    """Rows by frames, if every mask has its own image."""
     if masks is None or pictures is None:
         return None
     frame_of = {picture: frame for frame, picture in enumerate(pictures)}
@@ -200,15 +192,10 @@ MIN_NUMBERED_COVERAGE = 0.9
 def cameras_by_frame(
     found: Sequence[NamedCamera], source: FrameSource, path: Path
 ) -> dict[int, Camera]:
-    """The cameras by their frames' numbers.
-
-    Args:
-        found: In the order of their pictures' names.
-        source: The frames.
-        path: Of the cameras, for messages.
+    """The cameras by their frames' numbers; `found` is in the order of their images' names.
 
     Raises:
-        InputError: If it cannot be said which frames they belong to.
+        InputError: If it cannot be decided which frames they belong to.
     """
     found = _select_image_folder(found, source, path)
     names = [None if each.name is None else PurePosixPath(each.name).name for each in found]
@@ -234,11 +221,7 @@ def cameras_by_frame(
 def _select_image_folder(
     found: Sequence[NamedCamera], source: FrameSource, path: Path
 ) -> Sequence[NamedCamera]:
-    """The cameras of the video's own pictures, where several folders hold pictures of one name.
-
-    Raises:
-        InputError: If none of the folders is named like the video.
-    """
+    """The cameras of the video's own images, where several folders hold images of one name."""
     places = [PurePosixPath(each.name or str(row)) for row, each in enumerate(found)]
     if len({place.name for place in places}) == len(found):
         return found
@@ -256,12 +239,9 @@ def _select_image_folder(
 def interpolate_missing_cameras(
     cameras: dict[int, Camera], frames: int
 ) -> tuple[tuple[Camera, ...], frozenset[int]]:
-    """A camera for every frame; short gaps are filled in, longer ones named.
+    """A camera for every frame, and the frames whose camera is only a stand-in.
 
-    Between two cameras rotations turn evenly (slerp) and centres move on a line.
-
-    Returns:
-        One camera a frame, and the frames whose camera is only a stand-in.
+    Short gaps are filled in: rotations turn evenly (slerp) and centres move on a line.
     """
     known = np.array(sorted(number for number in cameras if 0 <= number < frames))
     if not len(known):

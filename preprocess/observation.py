@@ -22,14 +22,13 @@ from preprocess.plugins import Segmenter
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Observation:
-    """What the trainer learns from.
+    """One example of the trainer.
 
     Attributes:
-        frame: The picture.
-        alpha: How far each pixel is person, in [0, 1], never thresholded.
+        alpha: Degree to which each pixel is person, in [0, 1], never thresholded.
         pose: The body's pose in the camera's world.
-        camera: The camera, already of the picture's size.
-        filmed_rgb: The picture as it was filmed, where `frame` is a reduced copy; else None.
+        camera: The camera, already of the image's size.
+        filmed_rgb: The image as it was filmed, where `frame` is a reduced copy; else None.
     """
 
     frame: Frame
@@ -39,19 +38,14 @@ class Observation:
     filmed_rgb: UInt8[np.ndarray, "rows columns 3"] | None = None
 
     def __post_init__(self) -> None:
-        """Pictures, masks and cameras of different sizes are our own bug by now."""
+        """Refuse images, masks and cameras of different sizes: they are our own bug by now."""
         height, width = self.alpha.shape
         assert self.frame.size_px == (width, height) == self.camera.size_px
 
 
 @dataclass(frozen=True, kw_only=True)
 class DroppedFrame:
-    """A frame that cannot be used.
-
-    Attributes:
-        index: Its number in the source.
-        reason: Why, in a few words.
-    """
+    """A frame that cannot be used; `reason` says why, in a few words."""
 
     index: int
     reason: str
@@ -67,19 +61,16 @@ def observation_builder(
     segment: Segmenter | None = None,
     refine: GivenMaskRefiner | None = None,
 ) -> Callable[[Frame], Observation | DroppedFrame]:
-    """What makes an observation of a frame, after everything was checked.
+    """Check that the parts fit together, and return a function from a frame to its observation.
 
     Args:
         source: Where the frames come from.
         motion: Poses; matched by their frame numbers, by their times, or by order.
         masks: One mask a frame; None if `segment` finds it, or else the alpha channel is the mask.
         cameras: Cameras of the frames' size.
-        size_px: Longer side of the observations; pictures are never enlarged.
-        segment: What estimates the mask where there are no `masks`, whatever the alpha channel.
-        refine: What refines given masks.
-
-    Raises:
-        InputError: At once, if the parts do not fit together.
+        size_px: Longer side of the observations; images are never enlarged.
+        segment: Estimates the mask where there are no `masks`, whatever the alpha channel.
+        refine: Refines given masks.
     """
     row_of = associate_poses(motion, source)
     made = masks is None and segment is not None
@@ -119,15 +110,15 @@ def compose_observation_builder(
     segment: Segmenter | None = None,
     refine: GivenMaskRefiner | None = None,
 ) -> Callable[[Frame], Observation | DroppedFrame]:
-    """What joins a frame with its pose, mask and camera, each found by a function of its own.
+    """Join a frame with its pose, mask and camera, each found by a function of its own.
 
     Args:
         pose_of: The frame's pose, or why it has none.
         alpha_of: Its mask at a size; raises InputError if it has none.
         camera_of: The camera of a frame's number, of the frames' size.
         target_px: Width and height of the observations.
-        segment: What finds the mask in place of `alpha_of`, once the frame was scaled.
-        refine: What refines the mask that `alpha_of` finds.
+        segment: Estimates the mask in place of `alpha_of`, once the frame was scaled.
+        refine: Refines the mask that `alpha_of` finds.
     """
 
     def given_alpha(frame: Frame) -> Float32[np.ndarray, "height width"]:
@@ -161,13 +152,10 @@ def compose_observation_builder(
 
 
 def associate_poses(motion: Motion, source: FrameSource) -> Callable[[Frame], int | None]:
-    """Whether the poses fit the frames; cheap unless their numbers differ.
-
-    Returns:
-        From a frame to its row in the motion, or to None where it has none.
+    """Map a frame to its row in the motion, or to None; cheap unless their numbers differ.
 
     Raises:
-        InputError: If most poses are unusable, none belongs to a frame that is wanted, or rows and
+        InputError: If most poses are unusable, none belongs to a selected frame, or rows and
             frames are of different number and nothing tells which belong together.
     """
     usable = int(motion.valid.sum())
@@ -192,11 +180,11 @@ def associate_poses(motion: Motion, source: FrameSource) -> Callable[[Frame], in
 
 
 def associate_masks(masks: Masks | None, source: FrameSource) -> Callable[[int], int]:
-    """Whether the masks fit the frames; returns the mask's row by the frame's number.
+    """Map a frame's number to its mask's row; the function raises for frames without a mask.
 
     Raises:
         InputError: If there are none, or of another shape, or not one per frame and their names do
-            not tell whose they are. What is returned raises it for frames without a mask.
+            not tell whose they are.
     """
     if masks is None:
         if source.has_alpha:
@@ -235,11 +223,7 @@ def _row_by_name(named: dict[int, int], masks: Masks) -> Callable[[int], int]:
 
 
 def associate_cameras(cameras: CameraTrack, source: FrameSource) -> Callable[[int], int]:
-    """Whether there is a camera for each frame; returns its row by the frame's number.
-
-    Raises:
-        InputError: If there are many, but not one per frame.
-    """
+    """Map a frame's number to its camera's row; raise if there are many, but not one a frame."""
     if not cameras.is_moving:
         return lambda index: 0
     return associate_by_order(len(cameras.cameras), source, f"cameras in {cameras.source}")
@@ -256,10 +240,10 @@ def shrink_to_longer_side(size_px: tuple[int, int], longer_px: int | None) -> tu
 def alpha_channel_mask(
     frame: Frame, size_px: tuple[int, int]
 ) -> Float32[np.ndarray, "height width"]:
-    """The picture's own alpha channel, scaled.
+    """The image's own alpha channel, scaled.
 
     Raises:
-        InputError: If it has none, or an opaque one, which does not say where the person is.
+        InputError: If it has none, or an opaque one, which does not cut the person out.
     """
     if frame.alpha is None:
         raise InputError("the picture has no alpha channel")

@@ -1,4 +1,4 @@
-"""Find, open and align the parts of a capture, and describe what was assumed on the way.
+"""Find, open and align the parts of a capture, and describe the assumptions that were made.
 
 Of a stream that comes without poses, the person is tracked while its frames come.
 """
@@ -55,14 +55,10 @@ def describe_capture(
     *,
     unread_alpha_video: Path | None = None,
 ) -> Iterator[str]:
-    """Sentences, one after the other.
+    """Sentences about the poses, body, masks and cameras that were opened.
 
-    Args:
-        fit: Poses and body.
-        masks: The masks, if a file holds them.
-        cameras: The cameras.
-        mask_origin: Which masks are used.
-        unread_alpha_video: The video, if it has an alpha channel that is not read.
+    `masks` is None unless a file holds them; `unread_alpha_video` is the video if it has an alpha
+    channel that is not read.
     """
     motion, family = fit.motion, fit.shaped.body.family
     if motion.note is not None:
@@ -104,8 +100,8 @@ def open_capture(
     """Open a recording: its frames, poses, masks and cameras, aligned with each other.
 
     Args:
-        inputs: What the user named.
-        size_px: Longer side that training will see.
+        inputs: The inputs of the user.
+        size_px: Longer side of the training images.
         skip_checks: Opens the parts even if they do not fit together, to find out why.
         avatar_body: File of a finished avatar's person, to whom the poses belong.
 
@@ -150,7 +146,7 @@ def open_capture(
 
 
 def _mask_file(masks: Path | None) -> Path | None:
-    """What --masks names, unless it is a segmenter."""
+    """The value of --masks, unless it is a segmenter."""
     return masks if segmenter_name(masks) is None else None
 
 
@@ -159,7 +155,7 @@ def _make_segmenter(mask_origin: MaskOrigin, shaped: ShapedBody) -> Segmenter | 
 
 
 def make_mask_refiner(inputs: CaptureInputs) -> GivenMaskRefiner | None:
-    """What refines given masks; None if they stay as they are."""
+    """Make the refinement of given masks; None if they stay as they are."""
     return GivenMaskRefiner() if inputs.refine_masks else None
 
 
@@ -171,7 +167,7 @@ def _unread_alpha(source: FrameSource) -> Path | None:
 def _open_masks(
     paths: CapturePaths, source: FrameSource, inputs: CaptureInputs
 ) -> tuple[MaskOrigin, Masks | None]:
-    """Which masks are used; and those, if a file holds them, which may be that of the poses."""
+    """The origin of the masks; and the masks, if a file holds them, which may be the pose file."""
     mask_origin = choose_mask_origin(inputs.masks, paths.masks, has_alpha=source.has_alpha)
     source.has_alpha = mask_origin.uses_alpha_channel
     if mask_origin.is_fallback:
@@ -187,7 +183,7 @@ def _open_masks(
 def _read_or_assume_cameras(
     paths: CapturePaths, motion: Motion, source: FrameSource
 ) -> CameraTrack:
-    """Cameras of their own file, or what the poses say."""
+    """Cameras of their own file, or those that the poses state."""
     if paths.cameras is not None:
         return read_upright_cameras(paths.cameras, source)
     return assume_static_camera(motion, source.size_px)
@@ -207,9 +203,8 @@ def open_tracked_stream(
     alpha channel are learnt from; only without any are the tracker's.
 
     Args:
-        inputs: What the user named; without poses.
-        tracker: Follows the person.
-        make_refinement: From the frames' width and height to what makes masks from the tracker's.
+        inputs: The inputs of the user; without poses.
+        make_refinement: Makes the refinement of the tracker's masks for a width and height.
         poses: File to which the poses will be written in the end.
         avatar_body: File of a finished avatar's person, who is filmed again.
 
@@ -257,11 +252,7 @@ def open_tracked_stream(
 def _open_stream_masks(
     inputs: CaptureInputs, source: FrameSource
 ) -> tuple[MaskOrigin, MaskReader | None]:
-    """Which masks are used, and what reads them; a fallback means the tracker's.
-
-    Raises:
-        InputError: If masks that were named cannot be used.
-    """
+    """The masks that are used, and their reader; a fallback means the tracker's."""
     own = None if inputs.is_live else find_own_masks(inputs.video)
     mask_origin = choose_mask_origin(inputs.masks, own, has_alpha=source.has_alpha)
     source.has_alpha = mask_origin.uses_alpha_channel

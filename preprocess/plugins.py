@@ -62,9 +62,6 @@ def make_segmenter(name: str, shaped: ShapedBody) -> Segmenter:
     """Make this project's segmenter, or one of an installed package.
 
     Another package's entry point `make(shaped)` returns a Segmenter.
-
-    Raises:
-        InputError: If no package registers that name, or its segmenter cannot be loaded.
     """
     if name == DEFAULT_SEGMENTER:
         from preprocess.tracking.blazepose import BlazePoseSegmenter
@@ -78,15 +75,9 @@ def make_tracker(name: str = DEFAULT_TRACKER, person: int | None = None) -> Pers
     """Make this project's tracker, or one of an installed package.
 
     Another package's entry point NAME = "module:make" lies in the group
-    `instant_avatar.trackers`; `make(person)` returns a PersonTracker.
-
-    Args:
-        name: The tracker's.
-        person: Whom to follow, counted from left to right from 1, in the first frame with that
-            many persons; the largest one if it is not given.
-
-    Raises:
-        InputError: If no package registers that name, or its tracker cannot be loaded.
+    `instant_avatar.trackers`; `make(person)` returns a PersonTracker. `person` is the number of the
+    person to follow, counted from left to right from 1, in the first frame with that many persons;
+    the largest one if it is not given.
     """
     if name == DEFAULT_TRACKER:
         from preprocess.tracking.blazepose import BlazePoseTracker
@@ -98,19 +89,16 @@ def make_tracker(name: str = DEFAULT_TRACKER, person: int | None = None) -> Pers
 
 
 def _make_registered(kind: str, name: str, *arguments: object, own: str, option: str) -> Any:
-    """Make a part that an installed package registers.
+    """Make a part that an installed package registers, or raise an InputError.
 
     Its entry point NAME = "module:make" lies in the group `instant_avatar.KINDs`.
 
     Args:
-        kind: What it is: "segmenter" or "tracker".
+        kind: "segmenter" or "tracker".
         name: The name that it is registered by.
-        arguments: What `make` is called with.
+        arguments: Those of `make`.
         own: Name of this project's own part of that kind.
-        option: What the user gave, for messages.
-
-    Raises:
-        InputError: If no package registers that name, or the part cannot be loaded.
+        option: The user's option, for messages.
     """
     group = f"instant_avatar.{kind}s"
     registered = {point.name: point for point in entry_points(group=group)}

@@ -62,8 +62,7 @@ class SparseColumns(StandIn):
 def array_of(thing: Any) -> Shaped[np.ndarray, "..."]:
     """Return the array that a stand-in, a number or a list of numbers stands for.
 
-    Raises:
-        Exception: Of any kind, for stand-ins hold whatever the file says.
+    Any exception may be raised: stand-ins hold whatever the file says.
     """
     match thing:
         case np.ndarray() if not thing.dtype.hasobject:
@@ -177,7 +176,7 @@ class _SafeUnpickler(_PythonUnpickler):
         self._stream = stream
 
     def find_class(self, module_name: str, global_name: str) -> Callable[..., Any]:
-        """Return what stands for a name; nothing is ever imported."""
+        """Return the stand-in for a name; nothing is ever imported."""
         allowed = ALLOWED.get((module_name, global_name))
         if allowed is None:
             raise UnsafePickleError(f"{module_name}.{global_name}")
@@ -209,7 +208,7 @@ class _SafeUnpickler(_PythonUnpickler):
 
 
 def load_torch(data: bytes) -> Any:
-    """Return what `torch.load` makes of a file that may name nothing but tensors.
+    """Return the result of `torch.load` for a file that may name nothing but tensors.
 
     Raises:
         UnsafePickleError: If it names anything else.

@@ -52,7 +52,7 @@ MAX_SKIPPED = 5
 """Most frames in a row that are left out; a machine that is too busy to decode a recording at its
 own speed falls behind instead."""
 NOT_FOUND = "person not found"
-"""Why a frame without the person is not used."""
+"""Reason for which a frame without the person is not used."""
 
 MaskReader = Callable[[Frame, tuple[int, int]], Float32[np.ndarray, "rows columns"]]
 """From a frame, and a width and height, to its given mask at that size; raises InputError."""
@@ -63,19 +63,12 @@ class TrackedStream:
     """A source of frames at their own times, of which only those are taken that can be tracked.
 
     Frames are handed over `LAG_FRAMES` after they came, so that their poses are fitted together
-    with those of later frames.
-
-    Attributes:
-        look: Called with each frame as soon as it is taken.
-        end: Called when the last frame has been used.
+    with those of later frames. `look` is called with each frame as soon as it is taken, `end` when
+    the last frame has been used.
     """
 
     def __init__(self, source: FrameSource) -> None:
-        """Nothing is read yet.
-
-        Args:
-            source: Its frames come at their own times, or as fast as they are taken.
-        """
+        """Wrap a source whose frames come at their own times, or as fast as they are taken."""
         self._source = source
         self._frames: Iterator[Frame] | None = None
         self._waiting: deque[Frame] = deque()
@@ -90,7 +83,7 @@ class TrackedStream:
 
     @property
     def waited_s(self) -> float:
-        """How long it has been waited for frames, in all."""
+        """Seconds of waiting for frames, in all."""
         return self._source.waited_s
 
     @property
@@ -120,7 +113,7 @@ class TrackedStream:
         self.end()
 
     def count_frames(self) -> int:
-        """As the source's own."""
+        """The source's own number of frames."""
         return self._source.count_frames()
 
     def close(self) -> None:
@@ -143,13 +136,7 @@ class TrackedStream:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StreamStart:
-    """What the first frames of a stream have settled.
-
-    Attributes:
-        motion: Poses of these frames.
-        shaped: The person.
-        cameras: The camera, which stands still.
-    """
+    """The results of a stream's first frames: their poses, the person, and a static camera."""
 
     motion: Motion
     shaped: ShapedBody
@@ -161,9 +148,8 @@ class LiveTracking:
     """Poses and masks of a stream's frames, tracked as they come.
 
     Attributes:
-        stream: The frames.
         times_s: Time of each frame that was looked at, by its number.
-        lost: Frames in which the person was not found.
+        lost: Numbers of the frames in which the person was not found.
         given_masks: Reads the masks that are learnt from; None if they are the tracker's.
     """
 
@@ -174,13 +160,9 @@ class LiveTracking:
         refine: MaskRefinement,
         given_masks: MaskReader | None = None,
     ) -> None:
-        """Nothing is read yet.
+        """Connect a stream with its tracker; nothing is read yet.
 
-        Args:
-            stream: The frames.
-            tracker: Follows the person.
-            refine: Makes masks from the tracker's.
-            given_masks: Masks to learn from instead, where there are some.
+        `refine` makes masks from the tracker's; `given_masks` replaces them where there are some.
         """
         self.stream = stream
         self.times_s: dict[int, float] = {}
@@ -243,14 +225,14 @@ class LiveTracking:
         segment: Segmenter | None = None,
         refine: GivenMaskRefiner | None = None,
     ) -> Callable[[Frame], Observation | DroppedFrame]:
-        """What makes an observation of a frame, which was tracked when it was taken.
+        """Make the function from a frame, tracked when it was taken, to its observation.
 
         Args:
             source: The frames.
             cameras: The camera.
             size_px: Longer side of the observations.
-            segment: What estimates masks, where the user asked for that.
-            refine: What refines given masks; the tracker's are refined already.
+            segment: Estimates masks, where the user named a segmenter.
+            refine: Refines given masks; the tracker's are refined already.
         """
         target_px = shrink_to_longer_side(source.size_px, size_px)
         found = deque[SeenPerson](maxlen=1)  # in the frame whose pose was asked for
@@ -287,7 +269,7 @@ class LiveTracking:
         return {} if self._earlier is None else self._earlier.take()
 
     def final_notes(self) -> Iterator[str]:
-        """What could not be said before the frames came."""
+        """Messages for the user that need the frames to have come."""
         looked = len(self.times_s)
         if self.lost:
             times = [self.times_s[number] for number in self.lost]
