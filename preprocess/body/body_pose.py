@@ -1,4 +1,4 @@
-"""What a body does: one pose of the 24-joint tree, and poses over time."""
+"""One pose of the 24-joint tree, and poses over time."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -61,7 +61,7 @@ class RelativeFocalLength:
 
     @property
     def is_plausible(self) -> bool:
-        """Whether a camera may have it; trackers that cut out the person assume far longer ones."""
+        """Return whether a camera may have it; trackers that crop the person assume longer ones."""
         return 0.4 <= self.ratio <= 2.5
 
 
@@ -89,7 +89,7 @@ class Motion:
         proportions: Coefficients of `ProportionSpace` around the mean of the embedded body, if the
             poses were fitted together with them; then they are the person's shape, not the betas.
         keypoints: Key points in the video's frames that the poses were made of, if there are any.
-        note: What a user should know about how the file was read.
+        note: Message for the user about how the file was read.
     """
 
     root_rotations: Float[np.ndarray, "poses 3"]
@@ -112,7 +112,7 @@ class Motion:
     note: str | None = None
 
     def __len__(self) -> int:
-        """How many rows there are, valid or not."""
+        """Number of rows, valid or not."""
         return len(self.root_rotations)
 
     def __getitem__(self, row: int) -> BodyPose:

@@ -54,7 +54,7 @@ def visible_points(
     cell_m: float = 0.03,
     tolerance_m: float = 0.03,
 ) -> Bool[np.ndarray, "points"]:
-    """Which points face the camera unoccluded, by a depth buffer of coarse cells.
+    """Points that face the camera unoccluded, by a depth buffer of coarse cells.
 
     Args:
         image_points: Image coordinates, scaled to metres at the body.
@@ -62,7 +62,7 @@ def visible_points(
         cosine: Of the angle between a point's normal and the direction to the camera. Points that
             face away occlude nothing.
         cell_m: Edge of a cell: no less than the points' spacing.
-        tolerance_m: How far a point may lie behind the nearest of its cell, beyond its own slope.
+        tolerance_m: Largest distance behind the nearest point of its cell, beyond its own slope.
     """
     cell = np.floor((image_points - image_points.min(axis=0)) / cell_m).astype(np.int64)
     columns = int(cell[:, 1].max()) + 1
@@ -88,9 +88,7 @@ class SkinPoints:
     """Points spread evenly over one person's skin, dense enough to draw a silhouette.
 
     Attributes:
-        shaped: The person.
         rest: Rest positions, metres.
-        weights: Skinning weights.
         corners: The three vertices that each point lies between.
         shares: Barycentric coordinates of each point between them.
     """
@@ -209,11 +207,9 @@ class MeshSilhouette:
     def draw_vertices(
         self, vertices: Float[np.ndarray, "vertices 3"], camera: Camera
     ) -> UInt8[np.ndarray, "height width"]:
-        """Draw the body's triangles between the given vertices: 1, else 0.
+        """Draw the body's triangles between the given vertices, metres: 1, else 0.
 
-        Args:
-            vertices: World positions, metres.
-            camera: Camera of the image; if a vertex is too near or behind it, nothing is drawn.
+        Nothing is drawn if a vertex is behind the camera or too near.
         """
         width, height = camera.size_px
         image = np.zeros((height, width), dtype=np.uint8)

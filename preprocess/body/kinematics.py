@@ -48,12 +48,10 @@ def joint_transforms(
     parents: Int[np.ndarray, "joints"],
     rotations: Float[np.ndarray, "joints 3 3"],
 ) -> Float[np.ndarray, "joints 4 4"]:
-    """Where each joint's frame carries a point of the rest pose (SMPL's matrices A).
+    """Transforms of a point from the rest pose with each joint's frame (SMPL's matrices A), metres.
 
-    Args:
-        rest_joints: Joint positions in the rest pose, metres.
-        parents: Parent of each joint, before its children; -1 for the root.
-        rotations: Rotation of each joint relative to its parent; the root's about itself.
+    Joints come after their parents; the root's is -1. Rotations are relative to the parent's, the
+    root's about itself: G_j = G_p(j) [R_j | J_j - J_p(j)] and A_j x = G_j (x - J_j).
     """
     parents = np.asarray(parents)
     start = np.where(parents[:, None] >= 0, rest_joints[parents], 0.0)
@@ -73,10 +71,7 @@ def body_from_rest(
 ) -> Float[np.ndarray, "joints 4 4"]:
     """Joint transforms with the root left at rest: the *body frame*, where articulation happens.
 
-    Args:
-        rest_joints: Joint positions in the rest pose, metres.
-        parents: Parent of each joint; -1 for the root.
-        joint_rotations: Axis-angle of every joint but the root, radians.
+    Rest joints in metres; axis-angles of every joint but the root in radians.
     """
     rotations = rotation_matrices(np.concatenate([np.zeros((1, 3)), joint_rotations]))
     return joint_transforms(rest_joints, parents, rotations)
@@ -98,7 +93,7 @@ def world_from_body(
     root_rotation: Float[np.ndarray, "3"],
     root_translation: Float[np.ndarray, "3"],
 ) -> Float[np.ndarray, "4 4"]:
-    """The rigid rest of a pose: turn about the rest pelvis J0, then shift (SMPL's convention)."""
+    """The root's rigid motion: turn about the rest pelvis J0, then shift (SMPL's convention)."""
     rotation = rotation_matrices(root_rotation)
     return rigid_transform(rotation, pelvis + root_translation - rotation @ pelvis)
 
@@ -110,7 +105,7 @@ SMPL_JOINTS = 24
 """Number of SMPL's joints, the root included."""
 
 SUPPORTED_JOINT_COUNTS = (22, 24, 52, 55)
-"""How many joints a pose may have: without hands, SMPL, SMPL+H, SMPL-X."""
+"""Numbers of joints that a pose may have: without hands, SMPL, SMPL+H, SMPL-X."""
 
 
 def axis_angles_from_matrices(

@@ -23,15 +23,13 @@ class BodyModel:
     """A 24-joint body with linear blend skinning (SMPL's tree; Loper et al. 2015).
 
     Attributes:
-        family: Whose betas fit: "smpl" or "body24".
+        family: Family of betas that fit: "smpl" or "body24".
         template: Rest vertices of the mean shape, metres, T-pose.
-        faces: Triangles.
         weights: Skinning weights, rows sum to 1.
         joints: Rest joints of the mean shape, metres.
         parents: Parent of each joint, -1 for the root.
-        shape_directions: Vertex displacement per unit of beta, metres.
-        joint_directions: Joint displacement per unit of beta, metres.
-        pose_directions: Pose blend shapes (vertices, 3, 207), or None where the file has none.
+        shape_directions, joint_directions: Displacement per unit of beta, metres.
+        pose_directions: Pose blend shapes, or None where the file has none.
     """
 
     family: str
@@ -56,12 +54,9 @@ class BodyModel:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShapedBody:
-    """One person's body at rest.
+    """One person's body at rest: vertices and joints in metres.
 
-    Attributes:
-        body: The model.
-        vertices: Rest vertices, metres.
-        joints: Rest joints, metres; `joints[0]` is the pelvis J0 that the root turns about.
+    `joints[0]` is the pelvis J0 that the root turns about.
     """
 
     body: BodyModel
@@ -260,11 +255,7 @@ SHAPED_BODY_KEYS = ("family", "vertices", "joints")
 
 
 def write_shaped_body(path: Path, person: ShapedBody) -> None:
-    """Writes the resting vertices and joints, and whose betas would shape the body.
-
-    Raises:
-        OSError: If the disk is full.
-    """
+    """Write the resting vertices and joints, and whose betas would shape the body."""
     np.savez(
         path,
         family=np.array(person.body.family),
@@ -274,14 +265,10 @@ def write_shaped_body(path: Path, person: ShapedBody) -> None:
 
 
 def read_shaped_body(path: Path, body: BodyModel) -> ShapedBody:
-    """The person that `write_shaped_body` wrote, on the same body.
-
-    Args:
-        path: The file.
-        body: What the user names now (--body), or the embedded body.
+    """Read the person that `write_shaped_body` wrote, on the same body.
 
     Raises:
-        InputError: If it is another body than then, or the file cannot be read.
+        InputError: If `body` is another one than then, or the file cannot be read.
     """
     arrays = read_npz(path)
     if not set(SHAPED_BODY_KEYS) <= arrays.keys() or arrays["joints"].shape != (24, 3):

@@ -46,8 +46,7 @@ class ProportionSpace:
 
     Attributes:
         shaped: The shape at which all coefficients are 0.
-        vertex_directions: Displacement of each rest vertex per coefficient, metres.
-        joint_directions: Displacement of each rest joint per coefficient, metres.
+        vertex_directions, joint_directions: Displacement at rest per coefficient, metres.
     """
 
     shaped: ShapedBody
@@ -125,9 +124,7 @@ def shape_for_motion(body: BodyModel, motion: Motion) -> ShapedBody:
 
     A body that is not SMPL's takes the rest joints of SMPL's mean shape if the poses are SMPL's:
     then its joints move exactly as SMPL's do. Its skin goes along, each vertex with its joints.
-
-    Raises:
-        InputError: If the motion's proportions are of another number than the body's.
+    Proportions of another number than the body's are an InputError.
     """
     if motion.proportions is not None and motion.body_model == body.family:
         space = ProportionSpace.around(body.with_shape())

@@ -29,8 +29,8 @@ class CameraTrack:
 
     Attributes:
         cameras: One for all frames, or one for each in order.
-        source: Where they come from, for the report.
-        note: What was changed to make them fit, if anything.
+        source: Their origin, for the report.
+        note: Changes that made them fit, if any.
         frames_without_camera: Numbers of frames that have no camera and cannot be used.
     """
 
@@ -41,7 +41,7 @@ class CameraTrack:
 
     @property
     def is_moving(self) -> bool:
-        """Whether each frame has a camera of its own."""
+        """Return whether each frame has a camera of its own."""
         return len(self.cameras) > 1
 
     def __getitem__(self, frame_index: int) -> Camera:
@@ -55,7 +55,7 @@ class CameraTrack:
 
 
 def resolve_camera_path(path: Path) -> Path:
-    """The cameras.npz of a capture folder, where the folder was named; else what was named."""
+    """The cameras.npz of a capture folder, if `path` is one; else `path` itself."""
     own = path / "cameras.npz"
     return own if own.is_file() else path
 
@@ -63,7 +63,7 @@ def resolve_camera_path(path: Path) -> Path:
 def read_cameras(
     path: Path, size_px: tuple[int, int] | None, source: FrameSource | None = None
 ) -> CameraTrack:
-    """Read cameras: an .npz of ours, or what another program wrote (`camera_registry`).
+    """Read cameras: an .npz of ours, or a file of another program (`camera_registry`).
 
     The .npz holds intrinsic (3, 3), extrinsic (4, 4) camera-from-world, or N of each; optional:
     height and width (of the images that the matrices belong to), distortion (OpenCV's
@@ -116,7 +116,7 @@ def _read_npz_cameras(path: Path, size_px: tuple[int, int] | None) -> CameraTrac
 
 
 def write_cameras(path: Path, track: CameraTrack) -> None:
-    """Writes cameras in the keys that `read_cameras` reads; all have the first one's lens."""
+    """Write cameras in the keys that `read_cameras` reads; all have the first one's lens."""
     first, rows = track.cameras[0], range(len(track.cameras))
     extrinsics = np.stack([camera.camera_from_world for camera in track.cameras])
     np.savez(
@@ -161,16 +161,9 @@ def _fit_to_frames(
     size_px: tuple[int, int] | None,
     missing: frozenset[int] = frozenset(),
 ) -> CameraTrack:
-    """Scale cameras to the frames' size.
+    """Scale cameras, each of its own image's size, to the frames' size.
 
-    Args:
-        cameras: Each of its own image's size.
-        path: Where they come from.
-        size_px: Width and height of the frames; None leaves the cameras as they are.
-        missing: Frames without a camera.
-
-    Raises:
-        InputError: If their images had another aspect ratio.
+    `size_px` None leaves them as they are; `missing` are frames without a camera.
     """
     note = None
     for stored in sorted({camera.size_px for camera in cameras}):

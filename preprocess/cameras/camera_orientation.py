@@ -1,4 +1,4 @@
-"""Cameras of upright images: of those that a rotation flag turns, and before poses are known."""
+"""Cameras of upright images: of images that a rotation flag turns, and before poses are known."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -15,20 +15,13 @@ from preprocess.capture_paths import find_stream_cameras
 
 
 def read_upright_cameras(path: Path, source: FrameSource) -> CameraTrack:
-    """The cameras of frames that were turned to stand upright, by a video's or an image's flag.
+    """Read the cameras of frames that a video's or an image's flag turned upright.
 
-    Cameras that were made for the images as they are stored are turned with them. Which they were
-    made for, their width and height tell; where an .npz states none, their principal point does.
+    Cameras that were made for the images as they are stored are turned with them. Their width and
+    height tell which they were made for; where an .npz states none, their principal point does.
     Photographs that hang upside down have one size either way: there COLMAP's cameras are known to
     be those of the stored ones, as COLMAP leaves tags alone, and others are left as they are (so
-    are those of videos, as what takes videos apart turns their images).
-
-    Args:
-        path: See `read_cameras`.
-        source: The frames; see `read_cameras`.
-
-    Raises:
-        InputError: As `read_cameras`.
+    are those of videos, as programs that extract images from videos turn them).
     """
     if source.quarter_turns % 2 == 0:
         track = _read(path, source, source.size_px)
@@ -63,7 +56,7 @@ def _rotate(stored: CameraTrack, path: Path, source: FrameSource) -> CameraTrack
 
 
 def _principal_point_offset_px(track: CameraTrack) -> float:
-    """How far the first camera's principal point is from the middle of its image, pixels."""
+    """Distance of the first camera's principal point from the middle of its image, pixels."""
     camera = track.cameras[0]
     return float(np.abs(np.array(camera.center_px) - np.array(camera.size_px) / 2.0).sum())
 
@@ -71,13 +64,8 @@ def _principal_point_offset_px(track: CameraTrack) -> float:
 def assume_camera(video: Path, named: str | None, source: FrameSource) -> Camera:
     """A camera at the origin: the first one of a file, or a phone's where there is none.
 
-    Args:
-        video: The video, beside which cameras may lie.
-        named: Value of --cameras; see `find_stream_cameras`.
-        source: The video's frames.
-
-    Raises:
-        InputError: If a file of cameras cannot be read.
+    `named` is the value of --cameras; without it cameras are looked for beside the video (see
+    `find_stream_cameras`).
     """
     path = find_stream_cameras(video, named)
     if path is None:

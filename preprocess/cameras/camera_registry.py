@@ -24,11 +24,9 @@ READABLE_FORMATS = (
 
 
 def read_named_cameras(path: Path, size_px: tuple[int, int] | None = None) -> list[NamedCamera]:
-    """The cameras of a file or a folder.
+    """Read the cameras of a file or a folder.
 
-    Args:
-        path: The file or folder.
-        size_px: Width and height of the images, for files that do not state them.
+    `size_px` is the images' width and height, for files that do not state them.
 
     Raises:
         InputError: If nothing there holds cameras.
@@ -50,7 +48,7 @@ def read_named_cameras(path: Path, size_px: tuple[int, int] | None = None) -> li
 
 
 def is_colmap_model(path: Path) -> bool:
-    """Whether a folder holds a COLMAP model, or a file belongs to one."""
+    """Return whether a folder holds a COLMAP model, or a file belongs to one."""
     if path.is_dir():
         return find_colmap_model(path) is not None
     return path.suffix.lower() in (".bin", ".txt") and find_colmap_model(path.parent) is not None

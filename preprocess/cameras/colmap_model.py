@@ -44,7 +44,7 @@ ImageRow = tuple[str, str, list[float]]
 
 
 def find_colmap_model(folder: Path) -> Path | None:
-    """The folder in which a COLMAP model lies, if one does."""
+    """The folder in which a COLMAP model lies, if there is one."""
     for place in MODEL_SUBFOLDERS:
         for ending in (".bin", ".txt"):
             found = folder / place
@@ -56,8 +56,7 @@ def find_colmap_model(folder: Path) -> Path | None:
 def read_colmap_model(folder: Path) -> list[NamedCamera]:
     """The registered images of a model, by name; its world and its unit stay COLMAP's.
 
-    Raises:
-        InputError: If it cannot be read, is empty, or has a camera that OpenCV does not have.
+    An InputError if it cannot be read, is empty, or has a camera that OpenCV does not have.
     """
     with explain_camera_errors(folder, "a COLMAP model"):
         if (folder / "cameras.bin").is_file():

@@ -69,7 +69,7 @@ def read_multi_view_camera(
     """The camera of a video, or of a folder of images, that is named like it.
 
     Args:
-        rig: What `find_multi_view_cameras` found.
+        rig: Result of `find_multi_view_cameras`.
         video: The video or folder; None if there are only poses, and one camera is expected.
         size_px: Width and height of its frames, for files that state none; None for twice the
             principal point.

@@ -1,6 +1,6 @@
 """The camera of one image, by the image's name, out of numbers that another program wrote.
 
-Which frame an image is, is found later (`preprocess.frame_association`).
+The frame of the image is found later (`preprocess.frame_association`).
 """
 
 from collections.abc import Iterator
@@ -26,17 +26,15 @@ FILE_ERRORS = (
     ArithmeticError, AttributeError, BadZipFile, LookupError, OSError, RuntimeError, TypeError,
     ValueError,
 )  # fmt: skip
-"""What reading a damaged or foreign file may raise."""
+"""Exceptions of reading a damaged or foreign file."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class NamedCamera:
-    """One image's camera.
+    """One image's camera, of the image's own size.
 
-    Attributes:
-        name: Of the image's file, with its folders if it says so and without its ending; None
-            where there is only an order.
-        camera: Of the image's own size.
+    `name` is that of the image's file, with its folders if the source has them and without its
+    ending; None where there is only an order.
     """
 
     name: str | None
@@ -45,14 +43,9 @@ class NamedCamera:
 
 @contextmanager
 def explain_camera_errors(path: Path, kind: str) -> Iterator[None]:
-    """Turn whatever a damaged or foreign file causes in a block into one message.
+    """Turn any error of a damaged or foreign file in a block into one InputError that names it.
 
-    Args:
-        path: The file or folder that is read.
-        kind: What it was taken for.
-
-    Raises:
-        InputError: Naming the file.
+    `kind` is the format that the file was taken for.
     """
     try:
         yield
@@ -84,11 +77,7 @@ def camera_from_opengl(world_from_camera: Float[np.ndarray, "4 4"]) -> Float[np.
 
 
 def checked_rigid(numbers: object) -> Float[np.ndarray, "*batch 4 4"]:
-    """One or many 3x4 or 4x4 matrices as rigid transforms.
-
-    Raises:
-        ValueError: If they are something else.
-    """
+    """One or many 3x4 or 4x4 matrices as rigid transforms; a ValueError if they are none."""
     found = np.array(numbers, dtype=np.float64)
     if found.ndim < 2 or found.shape[-2:] not in ((3, 4), (4, 4)) or not np.isfinite(found).all():
         raise ValueError(f"expected finite 4x4 matrices, found the shape {found.shape}")

@@ -44,14 +44,9 @@ POLYCAM_KEYS = tuple(f"t_{row}{column}" for row in range(3) for column in range(
 
 
 def read_json_cameras(path: Path, size_px: tuple[int, int] | None) -> list[NamedCamera]:
-    """The cameras of a transforms.json, or of Record3D's metadata.
+    """The cameras of a transforms.json, or of Record3D's metadata; an InputError if it is neither.
 
-    Args:
-        path: The file.
-        size_px: Width and height of the images, if the file does not state them.
-
-    Raises:
-        InputError: If it is neither.
+    `size_px` is the images' width and height, if the file does not state them.
     """
     with explain_camera_errors(path, "JSON of nerfstudio (`frames`) or Record3D (`poses`)"):
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -61,17 +56,13 @@ def read_json_cameras(path: Path, size_px: tuple[int, int] | None) -> list[Named
 
 
 def read_r3d(path: Path) -> list[NamedCamera]:
-    """The cameras of a whole .r3d recording.
-
-    Raises:
-        InputError: If it is none.
-    """
+    """The cameras of a whole .r3d recording."""
     with explain_camera_errors(path, "a Record3D recording"), zipfile.ZipFile(path) as archive:
         return _read_record3d(json.loads(archive.read("metadata")))
 
 
 def _read_transforms(content: dict[str, Any], size_px: tuple[int, int] | None) -> list[NamedCamera]:
-    """Sorted by their images' names.
+    """Cameras of a transforms.json, sorted by their images' names.
 
     ns-process-data turns COLMAP's world by `applied_transform`; that is undone.
     """
@@ -112,7 +103,7 @@ def _transforms_camera(
 
 
 def _image_size(numbers: dict[str, Any], size_px: tuple[int, int] | None) -> tuple[float, float]:
-    """As stated; else the frames' own, unless the principal point is the middle of another size."""
+    """The stated size; else the frames', unless the principal point is the middle of another."""
     if {"w", "h"} <= numbers.keys():
         return float(numbers["w"]), float(numbers["h"])
     if "cx" in numbers and "cy" in numbers:
@@ -156,11 +147,7 @@ def find_polycam(folder: Path) -> Path | None:
 
 
 def read_polycam(folder: Path) -> list[NamedCamera]:
-    """A file for each image: t_00 … t_23 (world-from-camera), fx, fy, cx, cy, width, height.
-
-    Raises:
-        InputError: If one holds something else.
-    """
+    """A file for each image: t_00 … t_23 (world-from-camera), fx, fy, cx, cy, width, height."""
     named = []
     for path in sorted(folder.glob("*.json"), key=natural_sort_key):
         with explain_camera_errors(path, "a camera of Polycam"):
