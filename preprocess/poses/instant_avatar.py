@@ -37,22 +37,22 @@ KEY_ALIASES = {
     "K": ("cam_intrinsics", "intrinsics"),
     "camera": ("cam_extrinsics", "extrinsics"),
 }
-"""What other programs call the same numbers: ExAvatar, ARAH, EMDB, CLIFF, HumanNeRF and more."""
+"""Names of the same numbers in other programs: ExAvatar, ARAH, EMDB, CLIFF, HumanNeRF and more."""
 
 SMPLX_KEYS = frozenset(
     {"left_hand_pose", "lhand_pose", "jaw_pose", "leye_pose", "expression", "expr"}
 )
 """Keys of which one is enough to know the body."""
 MODEL_BY_JOINT_COUNT = {52: "smpl", 55: "smplx"}
-"""Bodies by how many joints a pose has, hands and face included."""
+"""Bodies by the number of joints of a pose, hands and face included."""
 
 SIBLING_KEYS = ("frame", "time", "valid", "K", "camera")
-"""What may lie beside `smpl`."""
+"""Keys that may lie beside `smpl`."""
 RECOGNIZED_KEYS = (
     *{key: None for keys in POSE_KEY_LAYOUTS for key in keys}, *CAMERA_KEYS, "betas", "frame",
     "time", "valid", "K", "model", "space", "scale", "proportions", *KEYPOINT_SHAPES,
 )  # fmt: skip
-"""What is taken of a file; whatever else is in it is left there."""
+"""Keys that are read of a file; all others are left there."""
 CLIFF_FOCAL = RelativeFocalLength(ratio=1.0, reference="diagonal")
 """The camera in which CLIFF's `global_t` is."""
 
@@ -144,7 +144,7 @@ def collect_arrays(named: Mapping[str, Any], path: Path) -> dict[str, Shaped[np.
 
 
 ROTATION_MATRIX_SIZES = frozenset(9 * joints for joints in (1, 21, 22, 23, 24, 52, 55))
-"""How many numbers a row of rotation matrices has; 63 of body_pose are axis-angles."""
+"""Numbers in a row of rotation matrices; 63 of body_pose are axis-angles."""
 ROTATION_KEYS = ("global_orient", "body_pose", "thetas", "poses")
 """Keys of rotations."""
 
@@ -175,7 +175,7 @@ def parse_per_frame(content: Any, path: Path, default_model: str) -> MotionByPer
 
 
 def _parse_row(item: Any) -> dict[str, Any] | None:
-    """One row by the house's keys; None if it is none."""
+    """One row by our keys; None if it is none."""
     if not isinstance(item, dict):
         return None
     named = normalize_keys(item)

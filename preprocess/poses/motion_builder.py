@@ -2,7 +2,7 @@
 
 A tracker's poses are about its own body (where the pelvis rests), its own focal length, its own
 camera's or world's axes. Brought to the body and the cameras that are really used, rotations stay;
-what changes is where the root is.
+only the root's place changes.
 """
 
 from dataclasses import replace
@@ -43,12 +43,12 @@ def build_motion(
     """Poses of one person, rows in the order of their frames.
 
     Args:
-        rotations: What holds the rotations, root first; see `joint_rotations`.
-        translations: Where the root is, one row a pose, metres.
+        rotations: Parts of the rotations, root first; see `stack_axis_angles`.
+        translations: Places of the root, one row a pose, metres.
         betas: One row, or one row a pose: then their median.
         frames: The frames' numbers; of a number that comes twice the first row counts.
         times_s: Times in seconds.
-        lost: Which rows the tracker itself calls lost.
+        lost: Rows that the tracker itself calls lost.
         body_model, space, anchor: See `Motion`.
         lens: The camera matrix K, or one per pose; or the focal length that the tracker assumed.
 
@@ -122,13 +122,9 @@ MAX_GAP_FRAMES = 12
 def fill_gaps(motion: Motion, max_gap: int = MAX_GAP_FRAMES) -> Motion:
     """The motion with short gaps filled in: slerp for rotations, straight lines for places.
 
-    A gap is a run of frames without a valid row between two frames with one; longer gaps stay.
+    A gap is a run of at most `max_gap` frames without a valid row between two frames with one.
     Motions without frame numbers are taken as one row a frame. Those with cameras of their own are
     bridged only where each frame has its row, and so its camera.
-
-    Args:
-        motion: One row a frame at most.
-        max_gap: Longest gap that is filled, frames.
     """
     if motion.camera_from_world is not None and motion.frames is not None:
         return motion  # the cameras of the missing frames are unknown
@@ -183,7 +179,7 @@ def _fill_gap(
 
 
 SMPLX_PELVIS = np.array([0.0031, -0.3514, 0.0120])
-"""Where SMPL-X's neutral mean shape has its pelvis at rest, metres (its joint regressor's)."""
+"""Pelvis of SMPL-X's neutral mean shape at rest, metres (its joint regressor's)."""
 
 FOCAL_TOLERANCE = 0.01
 """Focal lengths and principal points nearer than this share are one."""
@@ -194,11 +190,7 @@ def place_in_camera_world(
 ) -> Motion:
     """The motion as SMPL's: about the body's pelvis, in the world of the cameras.
 
-    Args:
-        motion: As it was read.
-        shaped: The person's body.
-        cameras: Of the frames' size.
-        cameras_given: Whether the user gave them; if not, a file's own cameras count.
+    Cameras are of the frames' size. Unless the user gave them, a file's own cameras count.
     """
     motion = anchor_at_pelvis(motion, shaped.joints)
     if motion.space == "camera":
@@ -251,11 +243,11 @@ def refocus_translation(
     intrinsic: Float[np.ndarray, "3 3"],
     camera: Camera,
 ) -> Float[np.ndarray, "3"]:
-    """How far a body must be moved so that another camera sees it where the tracker's saw it.
+    """Shift of a body so that another camera sees it where the tracker's saw it.
 
     Args:
         joints: In the tracker's camera, metres.
-        intrinsic: The tracker's K, for pictures of the camera's size.
+        intrinsic: The tracker's K, for images of the camera's size.
         camera: The true one; its place does not matter.
     """
     pixels = joints[:, :2] / joints[:, 2:] * intrinsic[[0, 1], [0, 1]] + intrinsic[:2, 2]
@@ -267,13 +259,13 @@ def place_by_pixels(
     pixels: Float[np.ndarray, "joints 2"],
     camera: Camera,
 ) -> Float[np.ndarray, "3"]:
-    """How far a body must be moved so that a camera sees its joints at given pixels.
+    """Shift of a body so that a camera sees its joints at given pixels.
 
     Linear least squares over the joints, rows f t_x - (u - c) t_z = (u - c) z - f x.
 
     Args:
         joints: In the camera's axes, metres, from any place.
-        pixels: Where each is to be seen.
+        pixels: Target of each joint.
         camera: Without distortion; its place does not matter.
     """
     middle = joints.mean(axis=0)

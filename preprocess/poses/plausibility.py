@@ -1,4 +1,4 @@
-"""Plausibility of poses: which numbers cannot be a body's pose, and which are only odd.
+"""Plausibility of poses: numbers that cannot be a body's pose, and numbers that are only odd.
 
 Every command that reads poses checks them here:
 
@@ -31,19 +31,15 @@ MAX_TURN_RAD_PER_S = 16.0
 MAX_FLIP_FRAMES = 8
 """Most poses in a row that are flipped."""
 MAX_DETOUR_RAD = 0.25
-"""How far the root may stray from its usual speed between the poses around a flip."""
+"""Largest deviation of the root from its usual speed between the poses around a flip."""
 MAX_FLIP_SHARE = 0.1
-"""Largest share of flipped poses; if there are more, these are no frames of a film."""
+"""Largest share of flipped poses; if there are more, these are no frames of a video."""
 ASSUMED_FPS = 30.0
 """Rate that is assumed where poses have times but no frame numbers."""
 
 
 def require_plausible(motion: Motion, path: Path | str) -> Motion:
     """Return the motion with impossible rows marked as not valid.
-
-    Args:
-        motion: As it was read.
-        path: The file, for the message.
 
     Raises:
         InputError: If the numbers cannot be poses of a body in radians and metres.
@@ -154,7 +150,7 @@ def _angles_between(
 
 
 def _times_s(motion: Motion) -> Float[np.ndarray, "poses"]:
-    """Times of the poses, or what they are at the assumed rate."""
+    """Times of the poses, by the assumed rate where there are none."""
     if motion.times_s is not None:
         return motion.times_s
     numbers = np.arange(len(motion)) if motion.frames is None else motion.frames

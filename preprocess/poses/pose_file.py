@@ -33,21 +33,17 @@ Arrays = dict[str, Shaped[np.ndarray, "..."]]
 
 
 def read_motion(path: Path, *, default_model: str = "body24") -> Motion:
-    """Reads poses: axis-angles and metres, one row a pose.
+    """Read poses: axis-angles and metres, one row a pose.
 
     Keys: global_orient (N, 3) and body_pose (N, 69), or thetas or poses (N, 72); transl or trans
     (N, 3); optional betas (B,), (1, B) or (N, B), frame (N), time (N), valid (N), K (3, 3) or
-    (N, 3, 3), camera (4, 4) or (N, 4, 4) camera-from-world, model, space ("world", or "camera":
-    each row is in the camera of its frame), proportions (see `Motion`), and the arrays of
-    `KeypointTrack`. Rows with NaN are marked as not valid. Rotations may be 3x3 matrices; a
-    body_pose of 63 numbers has no hands.
+    (N, 3, 3), camera (4, 4) or (N, 4, 4) camera-from-world, model (else `default_model`), space
+    ("world", or "camera": each row is in the camera of its frame), proportions (see `Motion`), and
+    the arrays of `KeypointTrack`. Rows with NaN are marked as not valid. Rotations may be 3x3
+    matrices; a body_pose of 63 numbers has no hands.
 
-    A .jsonl file holds the same numbers of one frame in each line, `frame` among them if it likes;
-    a last line that is half written is left out.
-
-    Args:
-        path: The .npz or .jsonl file.
-        default_model: Body family of files that do not say theirs.
+    A .jsonl file holds the same numbers of one frame in each line, optionally with `frame`; a last
+    line that is half written is left out.
 
     Raises:
         InputError: If there is no such file, or it holds no such poses.
@@ -104,7 +100,7 @@ def motion_from_arrays(arrays: Arrays, path: Path, *, default_model: str = "body
 
 
 def _read_lines(path: Path) -> Arrays:
-    """One array for each key that every line has; of words, what the first line says."""
+    """One array for each key that every line has; texts are those of the first line."""
     try:
         text = path.read_text(encoding="utf-8")
         whole = text[: text.rfind("\n") + 1]
@@ -118,7 +114,7 @@ def _read_lines(path: Path) -> Arrays:
 
 
 def write_motion(path: Path, motion: Motion) -> None:
-    """Writes a motion in the keys that `read_motion` reads; reading gives the same numbers."""
+    """Write a motion in the keys that `read_motion` reads; reading gives the same numbers."""
     arrays = {
         "betas": motion.betas,
         "global_orient": motion.root_rotations,
@@ -232,7 +228,7 @@ def _intrinsic(arrays: Arrays, path: Path) -> Float[np.ndarray, "3 3"] | None:
 
 
 def _space(arrays: Arrays, path: Path) -> PoseSpace:
-    """Where the poses are."""
+    """The space of the poses."""
     said = str(arrays["space"]) if "space" in arrays else "world"
     if said == "world" or said == "camera":
         return said

@@ -29,12 +29,12 @@ TRACKERS: dict[str, Callable[[Any, bool], MotionByPerson | None]] = {
     "SLAHMR or 3DPW": mocap_formats.parse_slahmr,
     "AMASS or AIST++": mocap_formats.parse_amass,
 }
-"""Trackers by name, in the order in which they are asked whether a file is theirs."""
+"""Trackers by name, in the order in which they try to read a file."""
 
 MALFORMED_FILE_ERRORS = (
     ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, MemoryError,
 )  # fmt: skip
-"""What adapters raise for a file that is nearly theirs: they read it as if it were whole."""
+"""Exceptions of adapters for a file that is nearly theirs: they read it as if it were whole."""
 
 
 def read_poses(
@@ -57,8 +57,7 @@ def read_poses(
         prefer_world: Reads poses in the world rather than in a camera, to drive an avatar.
 
     Raises:
-        InputError: If there is no such file, it holds no known poses, or no person of
-            that name.
+        InputError: If there is no such file, it holds no known poses, or no person of that name.
     """
     path = resolve_pose_path(path)
     refuse_pipe(path)
@@ -83,7 +82,7 @@ def read_poses(
 def _recognize(
     content: Any, path: Path, default_model: str, driving: bool
 ) -> tuple[str | None, MotionByPerson]:
-    """Whose file it is (None: in the house's own keys), and the people in it."""
+    """The tracker of the file (None: in our own keys), and the people in it."""
     for tool, tracks in TRACKERS.items():
         try:
             people = tracks(content, driving)
@@ -117,7 +116,7 @@ def _recognize(
 
 
 def _describe_content(content: Any) -> str:
-    """Tell what a file holds instead of poses."""
+    """Describe the content of a file that holds no poses."""
     if isinstance(content, np.ndarray):
         return f"it is an array of the shape {content.shape}"
     if isinstance(content, dict):
@@ -126,7 +125,7 @@ def _describe_content(content: Any) -> str:
 
 
 def _select_person(people: MotionByPerson, person: str | None, path: Path) -> Motion:
-    """The person that is wanted, or the one with most poses."""
+    """The requested person, or the one with most poses."""
     if person is not None and person not in people:
         raise InputError(
             f"{path} holds no person called {person!r} (--person); it holds {_list_people(people)}."

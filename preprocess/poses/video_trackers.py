@@ -44,7 +44,7 @@ MAX_LINK_STEP_M = 1.0
 
 
 def _hold_keys(people: Any, keys: set[str]) -> bool:
-    """Whether a content is people by their names, each with all of the keys."""
+    """Return whether a content is people by their names, each with all of the keys."""
     return (
         isinstance(people, dict)
         and len(people) > 0
@@ -53,7 +53,7 @@ def _hold_keys(people: Any, keys: set[str]) -> bool:
 
 
 def _choose_view(rows: dict[str, Any], views: tuple[str, str], prefer_world: bool) -> str:
-    """The key of the poses in the camera or in the world, whichever is there and preferred."""
+    """The key of the poses in the camera or in the world, by preference and existence."""
     return next(key for key in (views[::-1] if prefer_world else views) if key in rows)
 
 
@@ -314,7 +314,7 @@ def _link_people(frames: list[dict[str, Any]], numbers: Any) -> MotionByPerson:
 def _nearest_person(
     place: Float[np.ndarray, "3"], last: dict[str, Float[np.ndarray, "3"]], taken: set[str]
 ) -> str | None:
-    """Who was nearest before; depth counts a third, for it is the least certain."""
+    """The nearest person of the frames before; depth counts a third: it is the least certain."""
     gaps = {
         name: float(np.linalg.norm((place - before) * np.array([1.0, 1.0, 1.0 / 3.0])))
         for name, before in last.items()

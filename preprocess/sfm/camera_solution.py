@@ -17,18 +17,15 @@ from capture.source import FrameSource
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SparseModel:
-    """What structure from motion found.
+    """The result of structure from motion, in a world of unknown unit.
 
     Attributes:
         frames: Number of the frame that each camera belongs to, ascending.
-        camera_from_world: Rigid transforms; the world's unit is unknown.
-        focal_px: Focal length.
         center_px: Principal point; the first pixel's centre is at (0.5, 0.5).
         radial_distortion: First coefficient of radial distortion.
-        size_px: Width and height of the pictures.
-        points: What the cameras see.
+        size_px: Width and height of the images.
         observation_camera, observation_point: Rows of each observation's camera and point.
-        pixels: Where it was seen.
+        pixels: Place of each observation in its image.
     """
 
     frames: Int[np.ndarray, "cameras"]
@@ -43,7 +40,7 @@ class SparseModel:
     pixels: Float[np.ndarray, "observations 2"]
 
     def camera(self, camera_from_world: Float[np.ndarray, "4 4"]) -> Camera:
-        """The lens, standing somewhere."""
+        """The lens as a camera with a pose."""
         return Camera(
             focal_px=(self.focal_px, self.focal_px),
             center_px=self.center_px,
@@ -53,12 +50,12 @@ class SparseModel:
         )
 
     def camera_centers(self) -> Float[np.ndarray, "cameras 3"]:
-        """Where the cameras stand."""
+        """Positions of the cameras in the world."""
         turned, moved = self.camera_from_world[:, :3, :3], self.camera_from_world[:, :3, 3]
         return -np.einsum("cba,cb->ca", turned, moved)
 
     def reprojection_errors_px(self) -> Float[np.ndarray, "observations"]:
-        """How far from each observation its point is projected, in pixels."""
+        """Distance of each observation from the projection of its point, pixels."""
         off = np.zeros(len(self.pixels))
         for row, transform in enumerate(self.camera_from_world):
             mine = self.observation_camera == row
@@ -87,14 +84,9 @@ class SparseModel:
 
 @dataclass(frozen=True, kw_only=True)
 class QualityGate:
-    """One figure and its bound.
+    """One figure and its bound; `name` is its key in the report.
 
-    Attributes:
-        name: Key in the report.
-        value: Measured figure.
-        bound: Threshold that it is compared with.
-        passed: Whether it is good enough.
-        failure_reason: What it means if it is not.
+    `failure_reason` says what it means if it has not passed.
     """
 
     name: str
@@ -116,11 +108,10 @@ class CameraSolution:
         is_static: Whether the camera stood still; then there is no model.
         background_motion: Largest shift of the background, as a fraction of the image's longer
             side; NaN if it was lost.
-        gates: What the solution has passed.
+        gates: The gates that the solution has passed.
         model: The key frames' cameras and the points; None if it stood still.
         camera_from_solved: One for every frame of the file.
-        frame_status: What each of them is: MISSING, INTERPOLATED, PLACED or KEY.
-        keyframe_count: Number of key frames.
+        frame_status: MISSING, INTERPOLATED, PLACED or KEY for each of them.
         costs: Wall and core seconds, and the peak of memory in MB.
     """
 
@@ -146,7 +137,7 @@ class CameraSolution:
         )  # fmt: skip
 
     def lens(self, size_px: tuple[int, int]) -> Camera:
-        """The lens, for pictures of the frames' size."""
+        """The lens, for images of the frames' size."""
         assert self.model is not None
         return self.model.camera(np.eye(4)).resize(size_px)
 
@@ -185,12 +176,7 @@ def find_outlier_cameras(model: SparseModel) -> Bool[np.ndarray, "cameras"]:
 
 
 def evaluate_gates(model: SparseModel, keys: int) -> list[QualityGate]:
-    """Every gate that one model can pass by itself.
-
-    Args:
-        model: Without its doubtful cameras.
-        keys: How many key frames there were.
-    """
+    """Evaluate the gates of a model without its doubtful cameras, made from `keys` key frames."""
     registered = len(model.frames) / keys
     residual = float(np.mean(model.reprojection_errors_px())) if len(model.pixels) else np.inf
     focal = model.focal_px / max(model.size_px)
@@ -227,7 +213,7 @@ def evaluate_gates(model: SparseModel, keys: int) -> list[QualityGate]:
 
 
 def _rotation_jumps(model: SparseModel) -> Bool[np.ndarray, "cameras"]:
-    """Cameras whose rotation is far off what their neighbours' would be in between."""
+    """Cameras whose rotation is far off the one between their neighbors."""
     count = len(model.frames)
     jumps = np.zeros(count, dtype=bool)
     if count < 5:

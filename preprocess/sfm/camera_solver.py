@@ -68,7 +68,7 @@ STAGE_SHARES = {
 
 @dataclass(frozen=True, kw_only=True)
 class SolverSettings:
-    """What a solution depends on, beside the images.
+    """Settings of a solution.
 
     Attributes:
         focal_ratio: Known focal length as a fraction of the image's longer side, if any.
@@ -89,16 +89,16 @@ def solve_cameras(
     settings: SolverSettings,
     report_progress: Callable[[float], None],
 ) -> CameraSolution:
-    """Solve the cameras of all wanted frames; takes minutes.
+    """Solve the cameras of all selected frames; takes minutes.
 
     Args:
         source: The frames.
-        person_mask: Where the person is, who moves and must not be looked at.
-        settings: What it depends on.
+        person_mask: Finds the person, who moves and is ignored.
+        settings: Seed, threads and the known focal length.
         report_progress: Called with the fraction of the work that is done.
 
     Raises:
-        InputError: If pycolmap is missing, or no solution can be vouched for.
+        InputError: If pycolmap is missing, or no solution passes all gates.
     """
     colmap_mapping.require_pycolmap()
     wall_s, cpu_s = time.perf_counter(), time.process_time()
@@ -166,7 +166,7 @@ def _report_stage(report_progress: Callable[[float], None], name: str, share: fl
 
 
 def _parallax(workspace: ColmapWorkspace, keys: int) -> QualityGate:
-    """Whether enough pairs of pictures show depth."""
+    """The gate of image pairs that show depth."""
     pairs, share = colmap_mapping.parallax_fraction(workspace.database)
     if pairs < MIN_REGISTERED_FRACTION * (keys - 1):
         return QualityGate(
@@ -188,11 +188,7 @@ def _map(
     seed: int,
     report_progress: Callable[[float], None],
 ) -> tuple[SparseModel, list[QualityGate]]:
-    """Return the model without its outlier cameras, and the gates that it has passed.
-
-    Raises:
-        InputError: If there is none, or it fails a gate.
-    """
+    """Return the model without its outlier cameras, and the gates that it has passed."""
     folder.mkdir()
     model = colmap_mapping.map_incrementally(workspace, folder, seed, report_progress)
     if model is None:
@@ -206,7 +202,7 @@ def _map(
 
 
 def _unsolved_error(failed: list[QualityGate]) -> InputError:
-    """Tell what went wrong and what can be done about it."""
+    """Explain the failure and its remedies."""
     reasons = "; ".join(gate.failure_reason for gate in failed[:3]) or "no two images fit together"
     return InputError(
         f"The cameras could not be solved with certainty: {reasons}. Film with the surroundings in "
@@ -217,7 +213,7 @@ def _unsolved_error(failed: list[QualityGate]) -> InputError:
 
 
 def _tracking_gate(between: ResectionResult, keys: int) -> QualityGate:
-    """Whether points that were followed land where the next key frame's camera sees them."""
+    """The gate of tracked points that land where the next key frame's camera sees them."""
     misses = np.array(list(between.keyframe_errors_px.values()))
     known = misses[np.isfinite(misses)]
     share = len(known) / max(keys - 1, 1)
@@ -241,7 +237,7 @@ def _drop_small_distortion(model: SparseModel) -> SparseModel:
 def _cameras_of_all_frames(
     source: FrameSource, model: SparseModel, between: ResectionResult
 ) -> tuple[Float[np.ndarray, "frames 4 4"], Int[np.ndarray, "frames"]]:
-    """A camera for each frame of the file, and what each is; short gaps are filled in."""
+    """A camera for each frame of the file, and its status; short gaps are filled in."""
     total = max(source.frames_in_file, int(model.frames.max()) + 1)
     status = np.full(total, INTERPOLATED)
     known = dict.fromkeys(between.cameras, PLACED)

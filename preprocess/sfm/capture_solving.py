@@ -32,16 +32,8 @@ def solve_capture_cameras(
 ) -> CameraSolution:
     """Solve the cameras of a capture whose poses are in the camera of each frame.
 
-    A focal length that the poses state is where the solver starts.
-
-    Args:
-        capture: As it was opened.
-        seed: Seed of everything random.
-        threads: Threads for features; the result does not depend on it.
-        report_progress: Called with the fraction of the work that is done.
-
-    Raises:
-        InputError: If pycolmap is missing, or the cameras cannot be solved with certainty.
+    A focal length that the poses state is where the solver starts. The result does not depend on
+    the number of threads; progress is the fraction of the work that is done.
     """
     stated = capture.motion.intrinsic is not None
     ratio = capture.cameras[0].focal_px[0] / max(capture.source.size_px) if stated else None
@@ -50,7 +42,7 @@ def solve_capture_cameras(
 
 
 def make_person_mask(capture: Capture) -> PersonMaskFn:
-    """Return where the person is: by the masks, or by the posed body with room for clothes."""
+    """Make the function that finds the person: by the masks, or by the posed body and a margin."""
     source = capture.source
     if capture.masks is not None or source.has_alpha:
         row_of = associate_masks(capture.masks, source)
@@ -84,12 +76,7 @@ def make_person_mask(capture: Capture) -> PersonMaskFn:
 def apply_camera_solution(capture: Capture, solved: CameraSolution) -> Capture:
     """Return the capture in the world of its solved cameras; unchanged if the camera stood still.
 
-    Args:
-        capture: With poses in the camera of each frame.
-        solved: What the images say.
-
-    Raises:
-        InputError: If nothing tells the size of the world.
+    Poses are in the camera of each frame before.
     """
     if solved.is_static:
         note = (

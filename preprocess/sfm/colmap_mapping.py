@@ -44,18 +44,12 @@ PERSON_MARGIN = 0.015
 """Width of the ignored border around the person; a fraction of the image's width."""
 
 PersonMaskFn = Callable[[Frame, tuple[int, int]], Bool[np.ndarray, "height width"] | None]
-"""Where the person is in a frame, in pixels of a given size; None if unknown."""
+"""Pixels of the person in a frame, in an image of a given size; None if unknown."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SfmKeyframe:
-    """One picture that is solved by features.
-
-    Attributes:
-        index: Number of the frame.
-        gray: The image.
-        person_mask: Pixels that are ignored: the person, and a margin.
-    """
+    """One image that is solved by features; in `person_mask` are ignored pixels with a margin."""
 
     index: int
     gray: UInt8[np.ndarray, "height width"]
@@ -63,13 +57,13 @@ class SfmKeyframe:
 
 
 def feature_image_size(size_px: tuple[int, int]) -> tuple[int, int]:
-    """The size in which pictures are worked on: that of the frames, at most `FEATURE_IMAGE_PX`."""
+    """The size of images that are worked on: that of the frames, at most `FEATURE_IMAGE_PX`."""
     scale = min(1.0, FEATURE_IMAGE_PX / max(size_px))
     return max(1, round(size_px[0] * scale)), max(1, round(size_px[1] * scale))
 
 
 def to_grayscale(frame: Frame, size_px: tuple[int, int]) -> UInt8[np.ndarray, "height width"]:
-    """A frame's brightness in the size that is worked in."""
+    """A frame's brightness at a size."""
     grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
     if frame.size_px == size_px:
         return grey
@@ -84,13 +78,8 @@ def select_keyframes(
 ) -> Iterator[SfmKeyframe]:
     """The sharpest frame of each of some equal stretches of the video, in order.
 
-    Sharpness is the variance of the picture's Laplacian.
-
-    Args:
-        source: The frames.
-        person_in: Where the person is; frames without an answer are skipped.
-        report_progress: Called with the fraction of the video that was examined.
-        max_keyframes: Largest number of key frames.
+    Sharpness is the variance of the image's Laplacian. Frames without an answer from `person_in`
+    are skipped; progress is the fraction of the video that was examined.
     """
     total = source.frame_count or source.frames_in_file
     stretches = min(max_keyframes, total, max(MIN_TARGET_KEYFRAMES, total // MIN_KEYFRAME_SPACING))
@@ -129,7 +118,7 @@ def dilate_person(person: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, 
 
 
 def write_keyframes(keys: Iterator[SfmKeyframe], images: Path, masks: Path) -> list[SfmKeyframe]:
-    """Writes pictures and masks (0 where nothing is looked at), named by the frames' numbers.
+    """Write images and masks (0 where pixels are ignored), named by the frames' numbers.
 
     Raises:
         InputError: If there are too few.
@@ -183,10 +172,9 @@ class ColmapWorkspace:
     """Key frames on disk and the database that features and matches go to.
 
     Attributes:
-        images: Pictures named by their frame's number.
-        masks: For each an 8-bit picture, 0 where nothing is to be looked at.
-        database: COLMAP's.
-        focal_px: What is known of the focal length, else None.
+        images: Folder of images named by their frame's number.
+        masks: Folder of an 8-bit image for each, 0 where pixels are ignored.
+        focal_px: The known focal length, else None.
         threads: Of extraction and matching.
     """
 
@@ -198,11 +186,7 @@ class ColmapWorkspace:
 
 
 def require_pycolmap() -> None:
-    """Whether cameras can be solved here.
-
-    Raises:
-        InputError: If pycolmap is missing.
-    """
+    """Raise an InputError if pycolmap is missing."""
     if importlib.util.find_spec("pycolmap") is None:
         raise InputError(
             "--cameras solve needs pycolmap, which is not installed: pip install pycolmap. Or give "
@@ -211,7 +195,7 @@ def require_pycolmap() -> None:
 
 
 def extract_features(workspace: ColmapWorkspace, report_progress: ProgressFn) -> None:
-    """Finds SIFT features (Lowe 2004) outside the masked parts."""
+    """Find SIFT features (Lowe 2004) outside the masked parts."""
     colmap = _colmap()
     width, height = _size(workspace)
     reader, options = colmap.ImageReaderOptions(), colmap.FeatureExtractionOptions()
@@ -241,7 +225,7 @@ def extract_features(workspace: ColmapWorkspace, report_progress: ProgressFn) ->
 
 
 def match_features(workspace: ColmapWorkspace, report_progress: ProgressFn) -> None:
-    """Matches features between pictures that were taken one soon after the other."""
+    """Match features between images that were taken one soon after the other."""
     colmap = _colmap()
     options = colmap.FeatureMatchingOptions()
     options.num_threads, options.use_gpu = 1, False
@@ -261,7 +245,7 @@ def match_features(workspace: ColmapWorkspace, report_progress: ProgressFn) -> N
 
 
 def parallax_fraction(database: Path) -> tuple[int, float]:
-    """How many pairs match, and what share no homography explains: 0 of a camera that only turns.
+    """Number of matched pairs, and the share that no homography explains: 0 of a mere turn.
 
     A plane, too, is seen by homographies; neither says where the camera was.
     """
@@ -277,7 +261,7 @@ def parallax_fraction(database: Path) -> tuple[int, float]:
 def map_incrementally(
     workspace: ColmapWorkspace, out: Path, seed: int, report_progress: ProgressFn
 ) -> SparseModel | None:
-    """One camera after the other; None if it fails."""
+    """Register one camera after the other; None if it fails."""
     colmap = _colmap()
     options = colmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = 1, seed
@@ -317,7 +301,7 @@ def _size(workspace: ColmapWorkspace) -> tuple[int, int]:
 
 
 def _largest_model(models: dict[int, Any], stated_px: float | None) -> SparseModel | None:
-    """The model with most cameras, in plain numbers; with the stated lens, if that may be."""
+    """The model with most cameras as plain arrays; with the stated focal length, if it fits."""
     if not models:
         return None
     best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
@@ -328,7 +312,7 @@ def _largest_model(models: dict[int, Any], stated_px: float | None) -> SparseMod
 
 
 def _adjust_to_focal(found: Any, focal_px: float) -> None:
-    """Moves cameras and points until all is seen by a lens of a known focal length."""
+    """Move cameras and points until a lens of a known focal length sees all."""
     colmap = _colmap()
     for lens in found.cameras.values():
         lens.params = [focal_px, *lens.params[1:]]

@@ -41,12 +41,10 @@ MIN_VIEWS = 3
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FloorPlane:
-    """A plane: normal · x + offset = 0, the normal pointing up to the cameras.
+    """A plane: normal · x + offset = 0, the unit normal pointing up to the cameras.
 
-    Attributes:
-        normal: Unit vector.
-        offset: In the world's own unit.
-        points: How many points lie on it; 0 if it was not seen, and only up is known.
+    `offset` is in the world's own unit; `points` on it are 0 if it was not seen and only up is
+    known.
     """
 
     normal: Float[np.ndarray, "3"]
@@ -54,7 +52,7 @@ class FloorPlane:
     points: int
 
     def heights_above(self, places: Float[np.ndarray, "places 3"]) -> Float[np.ndarray, "places"]:
-        """How far above it places are."""
+        """Signed distances of places from the plane, up."""
         return places @ self.normal + self.offset
 
 
@@ -67,11 +65,8 @@ def mean_camera_up(model: SparseModel) -> Float[np.ndarray, "3"]:
 def fit_floor_plane(model: SparseModel, up: Float[np.ndarray, "3"]) -> FloorPlane | None:
     """The largest plane below the cameras that is nearly level and has next to nothing below it.
 
-    RANSAC (Fischler & Bolles 1981) over triples of points, then least squares over what is near.
-
-    Args:
-        model: Cameras and points.
-        up: A first guess.
+    RANSAC (Fischler & Bolles 1981) over triples of points, then least squares over near points;
+    `up` is a first guess.
     """
     views = np.bincount(model.observation_point, minlength=len(model.points))
     points = model.points[views >= MIN_VIEWS]
@@ -183,9 +178,8 @@ class MetricScale:
     """Metres per unit of the solved world.
 
     Attributes:
-        metres_per_unit: The scale.
-        cues: Which cues made it: "ground", "in place".
-        ground, place: What each would say alone; None where it says nothing.
+        cues: The cues that made it: "ground", "in place".
+        ground, place: The scale by each alone; None where it says nothing.
         spread: Of the frames' own values by ground contact, relative; NaN without ground.
         rejection_reason: Why it is not to be believed; None if it is.
     """
@@ -199,12 +193,7 @@ class MetricScale:
 
 
 def estimate_metric_scale(standing: PersonInCameras, floor: FloorPlane | None) -> MetricScale:
-    """The scale by all cues that hold.
-
-    Args:
-        standing: The person, and the cameras that see it.
-        floor: The floor of the solved world; None if it was not seen.
-    """
+    """Estimate the scale by all cues that hold; `floor` is None if it was not seen."""
     contact = np.zeros(0)
     heights = np.zeros(0)
     if floor is not None and floor.points and len(standing.centers) >= MIN_FRAMES:
@@ -267,7 +256,7 @@ def _static_person_rows(
 def _scale_from_static_person(
     moves: Float[np.ndarray, "rows"], stays: Float[np.ndarray, "rows"]
 ) -> tuple[float | None, float]:
-    """The scale for which the person moves least, and how far from its place it is (r.m.s.)."""
+    """The scale for which the person moves least, and the r.m.s. distance from its place."""
     square = float((moves**2).sum())
     if len(moves) < 3 * MIN_FRAMES or square <= 0.0:
         return None, float("inf")
@@ -280,7 +269,10 @@ def _scale_from_static_person(
 def _fit_scale_huber(
     rows: Float[np.ndarray, "rows"], right: Float[np.ndarray, "rows"], start: float
 ) -> float:
-    """Least squares of rows · s = right, far ones weighing less (Huber 1964)."""
+    """Least squares of rows · s = right, far ones weighing less (Huber 1964).
+
+    Iteratively reweighted: s = Σ w a b / Σ w a², w = min(1, threshold / |a s - b|).
+    """
     scale = start
     for _ in range(IRLS_ITERATIONS):
         off = np.abs(rows * scale - right)

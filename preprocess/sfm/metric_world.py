@@ -47,13 +47,10 @@ def to_metric_world(
     floor: FloorPlane,
     person: Float[np.ndarray, "3"],
 ) -> Float[np.ndarray, "cameras 4 4"]:
-    """The same cameras in the metric world.
+    """The same cameras in the metric world; all arguments are of the solved one, in its unit.
 
-    Args:
-        camera_from_solved: Rigid transforms of the solved world, in its own unit.
-        scale: Metres per unit.
-        floor: Of the solved world.
-        person: Where the person is in the solved world, in its unit.
+    A place X becomes s U (X - o): `scale` s in metres per unit, U upright axes, and o the point of
+    the floor below the person.
     """
     turned, moved = camera_from_solved[:, :3, :3], camera_from_solved[:, :3, 3]
     centers = -np.einsum("cba,cb->ca", turned, moved)
@@ -74,11 +71,7 @@ MAX_LEAN_DEG = 30.0
 class MetricPlacement:
     """A capture in a world of metres, y up, the floor at 0.
 
-    Attributes:
-        cameras: One a frame.
-        motion: In that world.
-        scale: How the size was found.
-        floor_points: Points of the floor that were seen; 0 if the soles had to tell.
+    `floor_points` counts the points of the floor that were seen; 0 if the soles had to tell.
     """
 
     cameras: CameraTrack
@@ -97,7 +90,7 @@ def place_in_metric_world(
     """Cameras in metres and the poses in their world.
 
     Args:
-        solved: Cameras of unknown size.
+        solved: Cameras of unknown scale.
         motion: Each row in the camera of its frame, metres.
         tracker_camera: Camera that the poses were made for, at its world's origin; None if unknown:
             then they are taken to be right for the solved focal length.
@@ -105,7 +98,7 @@ def place_in_metric_world(
         source: The frames.
 
     Raises:
-        InputError: If nothing tells the size of the world.
+        InputError: If nothing tells the scale of the world.
     """
     lens = solved.lens(source.size_px)
     if tracker_camera is not None:
@@ -212,7 +205,7 @@ def _floor_below_soles(
 def solution_report(
     solved: CameraSolution, place: MetricPlacement | None, source: FrameSource
 ) -> dict[str, object]:
-    """What report.json says of the cameras."""
+    """The entry of report.json about the cameras."""
     wanted = [i for i in range(len(solved.frame_status)) if source.selection.contains(i)]
     marks = solved.frame_status[wanted]
     content: dict[str, object] = {

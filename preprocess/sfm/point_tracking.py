@@ -41,13 +41,9 @@ def track_points(
     pixels: Float[np.ndarray, "points 2"],
     guess: Float[np.ndarray, "points 2"] | None = None,
 ) -> tuple[Float[np.ndarray, "points 2"], Bool[np.ndarray, "points"]]:
-    """Where points of one picture are in another, and which were found again.
+    """Places of an image's points in another one, and which were tracked there and back.
 
-    Args:
-        start: The picture that the points were chosen in.
-        picture: The other one.
-        pixels: The points; the first pixel's centre is at (0.5, 0.5).
-        guess: Where they may be in the other one; where they were, if None.
+    The first pixel's centre is at (0.5, 0.5). `guess` holds likely places, by default the old ones.
     """
     if not len(pixels):
         return pixels.copy(), np.zeros(0, dtype=bool)
@@ -105,12 +101,10 @@ COMPARED_KEYFRAMES = 12
 
 @dataclass(frozen=True, kw_only=True)
 class StaticCameraTest:
-    """How far the background moves in the picture.
+    """Result of the test for a static camera.
 
-    Attributes:
-        is_static: Whether the camera counts as standing.
-        background_motion: Largest shift of the background between the first key frame and another
-            (median over its points), as a fraction of the image's longer side; NaN if it was lost.
+    `background_motion` is the largest shift of the background between the first key frame and
+    another (median over its points), as a fraction of the image's longer side; NaN if it was lost.
     """
 
     is_static: bool
@@ -118,7 +112,7 @@ class StaticCameraTest:
 
 
 def detect_static_camera(keys: list[SfmKeyframe]) -> StaticCameraTest:
-    """Follows points of the first key frame's background into others."""
+    """Track points of the first key frame's background into others."""
     first = keys[0]
     pixels = detect_corners(first.gray, ~first.person_mask, MAX_CORNERS)
     longer, moved = max(first.gray.shape), 0.0
@@ -157,7 +151,7 @@ MAX_BUFFERED_FRAMES = 256
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ResectionResult:
-    """What following points has found.
+    """Result of placing frames by tracked points.
 
     Attributes:
         cameras: Camera-from-world by the frame's number; key frames' own are not among them.
@@ -175,13 +169,10 @@ def resect_intermediate_frames(
     keys: list[SfmKeyframe],
     report_progress: Callable[[float], None],
 ) -> ResectionResult:
-    """Cameras for all frames that have none.
+    """Place all frames that have no camera.
 
-    Args:
-        source: The frames.
-        model: The key frames' cameras, for pictures of the key frames' size.
-        keys: The key frames; those without a camera in the model are placed like any other frame.
-        report_progress: Called with how much of the video is done.
+    `model` is for images of the key frames' size; those of `keys` without a camera in it are placed
+    like any other frame. Progress is the fraction of the video that is done.
     """
     own = {key.index: key for key in keys}
     anchors = [
@@ -214,10 +205,7 @@ def resect_camera(
 ) -> Float[np.ndarray, "4 4"] | None:
     """The camera that sees known points where they were seen; None if most contradict it.
 
-    Args:
-        points: In the world.
-        pixels: Where each was seen; some may be wrong.
-        lens: With the focal length, and where the camera may be.
+    Some pixels may be wrong; of `lens` only the intrinsics and the distortion count.
     """
     if len(points) < MIN_PNP_POINTS:
         return None
@@ -267,7 +255,7 @@ class _KeyframePoints:
         )
 
     def follow(self, pictures: list[tuple[int, GrayImage]], seen: "_PointTracks") -> None:
-        """Follows the points through pictures that come one after the other."""
+        """Track the points through images that come one after the other."""
         guess, alive = self.pixels.copy(), np.ones(len(self.pixels), dtype=bool)
         for frame, grey in pictures:
             rows = np.flatnonzero(alive)
@@ -278,7 +266,7 @@ class _KeyframePoints:
 
 
 class _PointTracks:
-    """Which points were seen where, by the frame's number."""
+    """Places of points by the frame's number."""
 
     def __init__(self) -> None:
         self._seen: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
