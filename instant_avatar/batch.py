@@ -47,14 +47,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def batch(arguments: BatchArguments, ingest_words: Sequence[str], console: Console) -> int:
     """Find the captures, learn those that are missing, and sum up.
 
-    Args:
-        arguments: Of the command.
-        ingest_words: Words for ia-ingest, for all captures.
-        console: Shows what has ended.
-
-    Raises:
-        InputError: If no capture is found, or an option is wrong; nothing was started then.
-        OSError: If the disk is full.
+    `ingest_words`: options of ia-ingest for all captures. After an `InputError` nothing was
+    started.
     """
     for module in ("torch", "ray", "fsspec"):
         if find_spec(module) is None:

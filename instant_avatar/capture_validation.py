@@ -72,11 +72,9 @@ class CaptureValidation:
     """Outcome of validating a capture.
 
     Attributes:
-        recording: The capture.
         hypothesis: Its poses and cameras as stored.
         images: Images in which the person was tracked.
         objective: Masks of some frames and key points of some images.
-        diagnosis: Corrections tested and found.
         refusal: Why ia-ingest would refuse the capture; None if it would not.
         anomalies: Sentences about implausible numbers.
         mask_iou: Mean IoU of body and masks as ia-ingest would read them; None without masks.
@@ -110,14 +108,14 @@ class CaptureValidation:
 
     @property
     def is_usable_after_fix(self) -> bool:
-        """Whether the corrected capture can be trained on."""
+        """True if the corrected capture can be trained on."""
         if self.objective.masks is None:
             return (self.keypoint_score(self.diagnosis.corrected) or 0.0) >= GOOD_KEYPOINT_SCORE
         return self.corrected_iou >= USABLE_IOU
 
     @property
     def unexplained(self) -> str:
-        """What may be wrong if no correction helps."""
+        """Sentence on what may be wrong if no correction helps."""
         masks = self.objective.masks
         if masks is None or masks.are_boxes:
             return NO_KNOWN_MISTAKE
@@ -132,7 +130,7 @@ class CaptureValidation:
 
     @property
     def is_auto_corrected(self) -> bool:
-        """Whether ia-ingest corrects everything that is wrong automatically."""
+        """True if ia-ingest corrects everything that is wrong automatically."""
         masks = self.recording.masks
         return self.causes == ("mask_polarity",) and masks is not None and masks.inverted
 
@@ -179,17 +177,13 @@ class CaptureValidation:
         return float("nan") if masks is None else mean_score(masks.frame_scores(geometry))
 
     def keypoint_score(self, geometry: CaptureGeometry) -> float | None:
-        """How well tracked key points match the body, in [0, 1]; None if no person was found."""
+        """Agreement of tracked key points with the body, in [0, 1]; None if no person was found."""
         keypoints = self.objective.keypoints
         return None if keypoints is None else mean_score(keypoints.frame_scores(geometry))
 
 
 def check_capture(inputs: CaptureInputs) -> CaptureValidation:
-    """Open a capture, with its video rotated if that explains an error, and validate it.
-
-    Raises:
-        InputError: If a part is missing or unreadable.
-    """
+    """Open a capture, with its video rotated if that explains an error, and validate it."""
     try:
         return check_opened_capture(*_open_inputs(inputs))
     except InputError as error:
@@ -204,15 +198,7 @@ def check_capture(inputs: CaptureInputs) -> CaptureValidation:
 def check_opened_capture(
     recording: Capture, polarity_error: str | None = None
 ) -> CaptureValidation:
-    """Validate an opened capture.
-
-    Args:
-        recording: The capture.
-        polarity_error: Why the masks' polarity is unknown; None if it is known.
-
-    Raises:
-        InputError: If a part is unreadable.
-    """
+    """Validate an opened capture; `polarity_error` says why the masks' polarity is unknown."""
     hypothesis = _stored_hypothesis(recording)
     source, masks = recording.source, recording.masks
     refused = implausibility_reason(recording.motion) or polarity_error
@@ -244,10 +230,7 @@ def check_opened_capture(
 
 
 def passes_quick_check(recording: Capture) -> bool:
-    """Check a few masks within a few hundredths of a second.
-
-    Poses that are one or two frames late are detected as well.
-    """
+    """Check a few masks in a few hundredths of a second, also for poses a frame or two late."""
     if recording.live is not None or not (recording.masks or recording.source.has_alpha):
         return True  # nothing to compare with
     try:
@@ -326,12 +309,7 @@ def _open_inputs(inputs: CaptureInputs) -> tuple[Capture, str | None]:
 
 
 def check_command(inputs: CaptureInputs, *, fix: bool = True) -> str:
-    """Return the ia-check command line for the user's inputs, ready for a shell.
-
-    Args:
-        inputs: Inputs as the user named them.
-        fix: Whether to write a corrected copy to a new folder.
-    """
+    """Return an ia-check command for a shell; with `fix`, it writes a corrected copy."""
     named = ("poses", "masks", "cameras", "body", "person")
     options = option_words({name: getattr(inputs, name) for name in named})
     words = ["ia-check", str(inputs.video), *options]
@@ -351,14 +329,10 @@ def preflight_check(
 ) -> None:
     """Check a few masks; diagnose the capture only if they and the poses disagree.
 
-    Args:
-        recording: The capture; live sources are not checked.
-        inputs: Inputs as the user named them, for the suggested command.
-        console: Shows warnings.
-        force: Whether to warn of an unusable capture instead of refusing it.
+    Live sources are not checked. `inputs` are for the suggested command.
 
     Raises:
-        InputError: If the capture is unusable.
+        InputError: If the capture is unusable; with `force` the user is only warned.
     """
     if passes_quick_check(recording):
         return

@@ -75,21 +75,13 @@ class CheckArguments(CaptureArguments):
     """Replace the files that --sheet and --json name, if they exist."""
 
     def capture_inputs(self) -> CaptureInputs:
-        """Return the inputs to open.
-
-        Raises:
-            InputError: If arguments contradict each other.
-        """
+        """Return the inputs to open; refuse a camera."""
         if camera_address(self.video) is not None:
             raise InputError(f"{self.video} is a camera, but ia-check needs a recording.")
         return super().capture_inputs()
 
     def check_outputs(self) -> None:
-        """Check that the outputs can be written.
-
-        Raises:
-            InputError: If one cannot.
-        """
+        """Refuse outputs that cannot be written."""
         inputs = self.capture_inputs().input_paths()
         if self.json is not None:
             check_output_file(self.json, "--json", inputs, overwrite=self.overwrite)
@@ -105,7 +97,7 @@ class CheckArguments(CaptureArguments):
 
     @property
     def may_replace_sheet(self) -> bool:
-        """Whether the sheet may replace a file: with --overwrite, or an earlier default one."""
+        """True if the sheet may replace a file: with --overwrite, or an earlier default one."""
         path = self.sheet_path()
         return self.overwrite or (
             self.sheet is None and OutputFileList(path.parent).owns(path.name)
@@ -123,12 +115,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def check(arguments: CheckArguments, console: Console) -> int:
-    """Diagnose a capture, draw the contact sheet, and write a corrected copy for --fix.
-
-    Raises:
-        InputError: If the capture cannot be read, or --fix finds nothing to correct.
-        OSError: If an output cannot be written.
-    """
+    """Diagnose a capture, draw the contact sheet, and write a corrected copy for --fix."""
     inputs = arguments.capture_inputs()
     arguments.check_outputs()
     if not needs_tracking(inputs):

@@ -34,18 +34,10 @@ def write_contact_sheet(
     """Draw a few frames with the outlines of mask (white) and body (orange) and their IoU.
 
     Tracked key points are cyan. A second row shows the corrected capture, if there are corrections.
-
-    Args:
-        path: Image to write.
-        check: The validated capture.
-        replace: Whether an existing file may be replaced, as in `atomic_file`.
-        listed: Whether to list the sheet in its folder, so that a later one may replace it.
+    `replace` is that of `atomic_file`; a `listed` sheet may be replaced by a later one.
 
     Returns:
-        Whether any frame could be drawn.
-
-    Raises:
-        OSError: If the image cannot be written.
+        False if no frame could be drawn.
     """
     if not check.images:
         return False
@@ -66,7 +58,6 @@ def write_contact_sheet(
 
 
 def _draw_row(check: CaptureValidation, geometry: CaptureGeometry, title: str, iou: float) -> Rgb:
-    """Draw a row of frames."""
     body = MeshSilhouette(check.recording.shaped)
     masks = check.recording.masks
     mask_of = None if masks is None else mask_lookup(check.recording, masks)
@@ -88,12 +79,7 @@ def _draw_cell(
 ) -> Rgb:
     """Draw one frame with both outlines.
 
-    Args:
-        image: The frame.
-        geometry: Poses, cameras and video transform.
-        seen: The same in the video's own frame numbers (`CaptureGeometry.in_video_frames`).
-        body: The person.
-        mask_of: From a frame number and a size to the mask; None without masks.
+    `seen` is `geometry` in the video's own frame numbers (`CaptureGeometry.in_video_frames`).
     """
     video = geometry.video_transform
     picture = image.thumbnail.copy()

@@ -32,11 +32,7 @@ JPEG_OPTIONS = [cv2.IMWRITE_JPEG_QUALITY, 98, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 
 
 
 def check_new_or_empty(out: Path) -> None:
-    """Check that a capture can be written to a folder.
-
-    Raises:
-        InputError: If the folder has content, or cannot be written to.
-    """
+    """Refuse a folder that has content, or cannot be written to."""
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"--fix {out} already exists; choose a new or empty folder.")
     check_writable(out, "--fix")
@@ -51,7 +47,6 @@ def write_corrected_capture(check: CaptureValidation, out: Path) -> None:
 
     Raises:
         InputError: If no correctable mistake was found.
-        OSError: If the disk is full; then nothing is written.
     """
     if not check.causes:
         raise InputError("No correctable mistake was found; --fix wrote nothing.")
@@ -128,13 +123,10 @@ def _write_masks(check: CaptureValidation, masks: Masks, folder: Path) -> None:
 
 
 def renumber_motion(hypothesis: CaptureGeometry, frames: int, *, resampled: bool) -> Motion:
-    """Assign frame numbers to poses.
+    """Assign the frame numbers of the video to poses, after all corrections.
 
-    Args:
-        hypothesis: After all corrections.
-        frames: Number of frames of the video.
-        resampled: Whether poses have another rate than the video. Then, and where rows fall between
-            frames, each frame's pose is interpolated spherically between neighboring rows.
+    If poses are `resampled` (have another rate than the video), and where rows fall between frames,
+    each frame's pose is interpolated spherically between neighboring rows.
     """
     if (
         not resampled

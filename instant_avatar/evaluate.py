@@ -35,12 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def evaluate(arguments: EvaluateArguments, console: Console) -> int:
-    """Score avatars, print the table, and write the files that were asked for.
-
-    Raises:
-        InputError: If an input is missing, unreadable or does not match the others.
-        OSError: If the disk is full.
-    """
+    """Score avatars, print the table, and write the files that were asked for."""
     arguments.validate()
     with console.status("loading torch"):
         from avatar.evaluation.perceptual import Lpips
@@ -155,8 +150,7 @@ def _train_subject(
 ) -> bool:
     """Train a subject like ia-ingest, on all of its training frames.
 
-    Returns:
-        Whether training is complete; after Ctrl-C the next evaluation continues it.
+    Return False after Ctrl-C; the next evaluation continues the training.
     """
     from instant_avatar.evaluation.evaluation_frames import is_trained
 

@@ -91,13 +91,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def export(arguments: ExportArguments, console: Console) -> int:
-    """Write a package or a mesh.
-
-    Raises:
-        InputError: If there is no readable checkpoint, or no folder to write to.
-        OSError: If the disk is full.
-        CommandExit: If there is nothing to draw.
-    """
+    """Write a package or a mesh."""
     if arguments.out.suffix.lower() != f".{arguments.to}":
         raise InputError(f"--out is {arguments.out}, but must end in .{arguments.to}.")
     if not arguments.out.resolve().parent.is_dir():

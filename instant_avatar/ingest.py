@@ -39,10 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def ingest(arguments: IngestArguments, console: Console) -> int:
     """Open, track, solve cameras, align, stream, train, bake, report.
 
-    Raises:
-        InputError: If the input cannot be used; nothing was written then.
-        OSError: If the disk is full; the newest checkpoint is kept.
-        CommandExit: If there is no usable avatar.
+    After an `InputError` nothing was written; on a full disk the newest checkpoint is kept.
     """
     started_at = time.perf_counter()
     if find_spec("torch") is None:  # said before minutes of tracking

@@ -103,11 +103,7 @@ class TrackArguments:
         return self.out or Path("runs") / f"{capture_name(self.video)}-tracked" / "poses.npz"
 
     def capture_inputs(self) -> CaptureInputs:
-        """Return the inputs to open.
-
-        Raises:
-            InputError: If they cannot be tracked.
-        """
+        """Return the inputs to open; refuse those that cannot be tracked."""
         if camera_address(self.video) is not None:
             raise InputError(f"{self.video} is a camera, but ia-track needs a recording.")
         if self.person is not None and self.person < 1:
@@ -128,11 +124,7 @@ class TrackArguments:
         )
 
     def check_outputs(self) -> None:
-        """Check that the outputs can be written.
-
-        Raises:
-            InputError: If one cannot.
-        """
+        """Refuse outputs that cannot be written, or would replace the files of others."""
         poses, inputs = self.poses_path(), self.capture_inputs()
         folder, masks = poses.parent, poses.parent / "masks"
         if poses.suffix.lower() != ".npz":
@@ -187,11 +179,7 @@ def next_command(arguments: TrackArguments, frames: slice | None) -> list[str]:
 
 @contextmanager
 def claim_outputs(folder: Path, console: Console) -> Iterator[None]:
-    """Make and lock a folder during a block, in which the files of ia-track are listed.
-
-    Raises:
-        CommandExit: If another command is writing here.
-    """
+    """Make and lock a folder during a block, in which the files of ia-track are listed."""
     with claim_folder(folder, console):
         listing = OutputFileList(folder)
         listing.create()
@@ -203,12 +191,7 @@ def claim_outputs(folder: Path, console: Console) -> Iterator[None]:
 
 
 def track(arguments: TrackArguments, console: Console) -> int:
-    """Track the person, and write poses, masks, film and grades.
-
-    Raises:
-        InputError: If the video cannot be read, or no person is found in it.
-        OSError: If the disk is full.
-    """
+    """Track the person, and write poses, masks, film and grades."""
     inputs, poses = arguments.capture_inputs(), arguments.poses_path()
     arguments.check_outputs()
     saving = "writing what was found so far"
@@ -253,16 +236,7 @@ Rgb = UInt8[np.ndarray, "height width 3"]
 def write_skeleton_film(path: Path, capture: Capture, doubts: Mapping[int, str]) -> int:
     """Draw skeleton, body and mask over each frame, and why a frame is doubtful.
 
-    Args:
-        path: Video to write, .webm.
-        capture: The video with its tracked poses and masks.
-        doubts: Why frames are doubtful, by their numbers.
-
-    Returns:
-        Number of frames drawn.
-
-    Raises:
-        OSError: If it cannot be written.
+    `doubts` are sentences by frame number. Return the number of frames drawn.
     """
     source = capture.source
     count, duration = source.frame_count or 1, source.duration_s

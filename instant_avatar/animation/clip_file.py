@@ -33,9 +33,7 @@ BackgroundBlend = Callable[[Rgba], Rgb]
 def background_compositor(color_or_path: str) -> BackgroundBlend:
     """Return a function that composites images with straight alpha over a background.
 
-    Args:
-        color_or_path: A color ("white", "#203040", "rgb(10, 20, 30)"), or the path of an image, of
-            which the center is shown.
+    A color ("white", "#203040", "rgb(10, 20, 30)"), or an image file, of which the center is shown.
     """
     try:
         color = np.array(ImageColor.getrgb(color_or_path)[:3], dtype=np.uint8)
@@ -87,12 +85,10 @@ def check_clip_path(path: Path, inputs: Iterable[Path], *, overwrite: bool) -> N
 
 @dataclass(frozen=True, kw_only=True)
 class ClipFormat:
-    """How a clip is written.
+    """A way to write a clip, with a description for the user.
 
-    Attributes:
-        description: What is written, and where it plays, for the user.
-        write: Takes the path, images of one size (RGB, or RGBA with straight alpha) and the frame
-            rate; returns the number of images written.
+    `write` takes the path, images of one size (RGB, or RGBA with straight alpha) and the frame
+    rate; it returns the number of images written.
     """
 
     description: str
@@ -128,17 +124,10 @@ def write_clip(
     blend: BackgroundBlend | None,
     replace: bool | None = None,
 ) -> int:
-    """Encode images as a clip, whole or not at all.
+    """Encode images as a clip, whole or not at all; return their number.
 
-    Args:
-        path: File or folder to write.
-        images: With straight alpha, all of one size; at least one.
-        fps: Frames per second.
-        blend: The background; None keeps alpha.
-        replace: Whether an existing file may be replaced, as in `atomic_file`.
-
-    Returns:
-        The number of frames written.
+    The images, at least one, are of one size and have straight alpha; it is kept without `blend`.
+    `replace` is that of `atomic_file`.
     """
     encoding = clip_format(path, transparent=blend is None)
     is_file = path.suffix.lower() in CLIP_SUFFIXES

@@ -23,7 +23,7 @@ TURNTABLE_FPS = 30.0
 
 
 Shot = tuple[BodyPose, Camera]
-"""What one image shows."""
+"""Pose and camera of one image."""
 
 
 def plan_render(
@@ -70,13 +70,9 @@ def plan_render(
 def load_cameras(
     path: Path, poses: int, rows: list[int], size: int | tuple[int, int] | None
 ) -> list[Camera]:
-    """Read the cameras of some poses as pinhole cameras of a size.
+    """Read the cameras of some rows of a motion of `poses` poses as pinhole cameras.
 
-    Args:
-        path: Camera file, as in ia-ingest.
-        poses: Number of poses of the motion.
-        rows: Poses that are shown.
-        size: Longer side, or width and height, pixels; None for the file's own.
+    `size` is the longer side, or width and height, in pixels; None for the file's own.
     """
     from preprocess.cameras.camera_file import read_cameras
 

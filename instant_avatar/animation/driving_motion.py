@@ -96,9 +96,7 @@ class ResampledMotion:
     """A motion sampled at a constant frame rate.
 
     Attributes:
-        motion: The motion.
-        valid_rows: Rows of its valid poses, in order.
-        fps: Frames per second.
+        valid_rows: Rows of the valid poses, in order.
         positions: Position of each frame in `valid_rows`; fractional between two rows.
     """
 
@@ -111,14 +109,10 @@ class ResampledMotion:
     def of(
         cls, motion: Motion, *, fps: float | None, speed: float = 1.0, max_fps: float = np.inf
     ) -> "ResampledMotion":
-        """Resample a motion; without times, it has one pose per frame.
+        """Resample a motion with a valid pose; without times, it has one pose per frame.
 
-        Args:
-            motion: Has at least one valid pose.
-            fps: Frames per second; None for the motion's own rate, divided by an integer to stay
-                within `MAX_FPS`.
-            speed: Factor on the speed of the motion.
-            max_fps: Largest frame rate of the output.
+        Without `fps` the motion's own rate is used, divided by an integer to stay within `MAX_FPS`.
+        `speed` is a factor on the speed of the motion; `max_fps` limits the result.
         """
         rows, rate = np.flatnonzero(motion.valid), pose_rate(motion)
         pace = min(fps or rate / float(np.ceil(rate / MAX_FPS - 1e-6)), max_fps)
@@ -178,12 +172,9 @@ class FollowingCamera:
     Trackers do not know the vertical; the first pose of a body mostly shows it.
 
     Attributes:
-        size_px: Width and height.
         level_axes: Rows: right, down and forward of a level image from the front, in the world.
-        player: Player of the avatar.
         height_m: Height of the standing person.
         center_above_pelvis_m: Height of the person's center above the pelvis.
-        viewpoint: Where the camera stands.
     """
 
     size_px: tuple[int, int]
@@ -203,11 +194,7 @@ class FollowingCamera:
     ) -> "FollowingCamera":
         """Build the camera for a motion; measure the person in a small image of a standing pose.
 
-        Args:
-            player: Renders that image.
-            motion: Its first valid pose defines front and up.
-            size_px: Width and height; one number for a square.
-            viewpoint: Where the camera stands; None for the front.
+        The first valid pose defines front and up. One number for `size_px` is the side of a square.
         """
         first = int(np.flatnonzero(motion.valid)[0])
         guess = cls(

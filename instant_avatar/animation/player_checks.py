@@ -1,4 +1,4 @@
-"""What ia-play --verify and --bench find: whether rendering is right here, and how fast it is."""
+"""Checks of ia-play --verify and --bench: whether rendering is right here, and how fast it is."""
 
 import json
 import time
@@ -100,18 +100,12 @@ class PlayerTiming:
     """Cost of an image: kinematics, graph and 8-bit output, without encoding.
 
     Attributes:
-        format: Version of this record.
-        tier: Quality tier of the package.
         size: Longer side, pixels.
-        frames: Number of timed images.
         pixels_covered: Mean fraction of pixels with any alpha.
         cpu_ms_per_frame: Mean CPU time per image.
         wall_ms_per_frame: Mean wall time per image.
         load_ms: Wall time of opening the package.
         reference_ms: Median CPU time of the reference graph.
-        provider: onnxruntime's execution provider.
-        workers: Images rendered in parallel.
-        pictures_per_second: Images per second of wall time.
     """
 
     format: int = 1

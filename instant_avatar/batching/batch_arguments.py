@@ -62,11 +62,7 @@ class BatchArguments:
     """Keep checkpoints, too, about 35 MB each: ia-ingest --resume continues from them."""
 
     def validate(self) -> None:
-        """Check ranges and combinations.
-
-        Raises:
-            InputError: Naming the option.
-        """
+        """Check ranges and combinations; an `InputError` names the option."""
         if not self.captures:
             raise InputError("No captures were named; name a folder, a video or a table.")
         for name, least in (("cores", 1), ("retries", 0), ("limit", 0), ("memory", 0)):

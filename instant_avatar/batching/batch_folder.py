@@ -42,12 +42,7 @@ def folder_of(name: str, status: str) -> str:
 
 @final
 class BatchFolder:
-    """The output folder of a batch.
-
-    Attributes:
-        place: Path or URL.
-        records: All results, in the order of their ends.
-    """
+    """The output folder of a batch, a path or URL; `records` are in the order of their ends."""
 
     def __init__(self, place: str) -> None:
         """Name the folder; `claim` creates it."""
@@ -63,7 +58,6 @@ class BatchFolder:
         """Create the folder, lock it if it is local, and read the results, during a block.
 
         Raises:
-            CommandExit: If another batch is writing here.
             InputError: If it holds files of another program.
         """
         with ExitStack() as held:
@@ -87,12 +81,7 @@ class BatchFolder:
     def settled(self, capture: BatchCapture, *, again: bool) -> AttemptRecord | None:
         """Return the result that stands for a capture; None if it is to be learnt.
 
-        Args:
-            capture: With the fingerprints of its files and options.
-            again: Whether it is learnt if it was refused or has failed before.
-
-        Raises:
-            InputError: If files of another program lie where it would be written.
+        With `again` it is learnt if it was refused or has failed before.
         """
         latest = self._latest.get(capture.name)
         if latest is not None and latest.key == (capture.input_key, capture.options_key):
@@ -157,7 +146,6 @@ class BatchFolder:
             self._save()
 
     def _save(self) -> None:
-        """Write all results."""
         self._saved_at = time.monotonic()
         self.write_text(RESULTS_NAME, "".join(map(_line, self.records)))
 

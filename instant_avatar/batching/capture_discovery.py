@@ -1,4 +1,4 @@
-"""Finds captures, in folders and in tables, with the options of each."""
+"""Find captures, in folders and in tables, with the options of each."""
 
 import csv
 import functools
@@ -22,7 +22,7 @@ from instant_avatar.run.ingest_arguments import IngestArguments
 from preprocess.capture_paths import CAMERA_NAMES, MASK_NAMES, POSE_FILE_NAMES
 
 PART_NAMES = frozenset((*POSE_FILE_NAMES, *MASK_NAMES, *CAMERA_NAMES))
-"""What lies beside the video of a capture folder."""
+"""Names of files and folders beside the video of a capture folder."""
 PATH_OPTIONS = ("--poses", "--masks", "--cameras", "--body")
 """Options whose values are paths."""
 KEYWORDS = re.compile(r"static|solve|segmenter:.*")
@@ -66,14 +66,9 @@ class BatchCapture:
 
 
 def find_captures(places: Iterable[str], common: Iterable[str] = ()) -> list[BatchCapture]:
-    """Find the captures in folders, files, tables and URLs.
+    """Find the captures in folders, files, tables and URLs, in order of their names.
 
-    Args:
-        places: Paths or URLs.
-        common: Options for all captures, as words of ia-ingest; a capture's own take precedence.
-
-    Returns:
-        Captures in order of their names.
+    Options in `common` are for all captures; a capture's own take precedence.
 
     Raises:
         InputError: If a place holds no capture, or two captures have the same name.
@@ -119,9 +114,7 @@ def parse_options(words: tuple[str, ...]) -> IngestArguments:
 def split_paths(words: Iterable[str], base: str) -> Options:
     """Separate the options of ia-ingest that are paths from all others.
 
-    Args:
-        words: Options and values, also as --option=value.
-        base: Folder or URL that relative paths start from.
+    Values may follow as --option=value. Relative paths start from `base`, a folder or URL.
     """
     paths, others, rest = {}, [], deque(words)
     while rest:
@@ -173,15 +166,11 @@ def _fingerprint(content: object) -> str:
 def _folder_captures(
     place: str, files: Mapping[str, ListedFile], prefix: str = ""
 ) -> Iterator[Row]:
-    """Yield the captures at a place and below it.
+    """Yield the captures at a place and below it, of which `files` are all files.
 
     A folder is a capture as a whole if it has images/, a video with poses, masks or cameras, or
-    pictures and no video; otherwise each video in it, and its folders are searched.
-
-    Args:
-        place: Absolute path, or URL, of a file or folder.
-        files: All files there.
-        prefix: Start of names: those of the folders above, with hyphens.
+    pictures and no video; otherwise each video in it, and its folders are searched. Names start
+    with `prefix`: the folders above, with hyphens.
     """
     if list(files) == [place]:
         yield Path(place).stem, place, ({}, ()), files

@@ -32,7 +32,7 @@ from instant_avatar.cli.hardware import describe_machine
 from instant_avatar.run.ingest_arguments import IngestArguments
 
 LOG_NAME = "ingest.log"
-"""What ia-ingest printed."""
+"""Output of ia-ingest."""
 ANIMATION_NAME = "turning.webp"
 """The animation of the report."""
 PACKAGE_NAME = "avatar.iavatar"
@@ -53,8 +53,6 @@ class AttemptRecord:
     """A line of results.jsonl.
 
     Attributes:
-        capture: Name of the capture.
-        video: Where it lies.
         attempt: Number of the line for this input with these options, from 1.
         status: "done", "refused" (bad input, never tried again) or "failed".
         exit_code: Of ia-ingest; null if it was killed or lost.
@@ -132,11 +130,6 @@ def record_of(
 
 def learn_capture(capture: BatchCapture, arguments: BatchArguments, scratch: str | None) -> Attempt:
     """Fetch a capture, run ia-ingest on it in this process, and collect what it wrote.
-
-    Args:
-        capture: What to learn.
-        arguments: Of the batch.
-        scratch: Folder for temporary files; None for that of the machine.
 
     Raises:
         AttemptFailure: If there is no avatar although the input is good.

@@ -32,13 +32,6 @@ def run_attempts(
     """Learn captures, and yield the last attempt at each as it ends.
 
     Closing the iterator ends what runs.
-
-    Args:
-        captures: To learn.
-        arguments: Of the batch.
-
-    Raises:
-        InputError: If there is no cluster, or no node has room for a capture.
     """
     import ray
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from capture.input_error import InputError
 
 VERSION_KEYS = ("ETag", "etag", "md5Hash", "LastModified", "updated", "mtime", "created")
-"""What tells that a remote file has changed, best first."""
+"""Keys that tell whether a remote file has changed, best first."""
 
 
 class RemoteFileError(OSError):
@@ -27,7 +27,7 @@ class ListedFile(NamedTuple):
 
 
 def is_url(place: str) -> bool:
-    """Whether a path is a URL."""
+    """True if a path is a URL."""
     return "://" in place
 
 
@@ -57,11 +57,7 @@ def open_remote(url: str) -> Iterator[tuple[Any, str]]:
 def list_files(place: str) -> dict[str, ListedFile]:
     """List a file, or all files below a folder, by path or URL; hidden ones are left out.
 
-    Args:
-        place: Path or URL. Nothing is listed if it does not exist.
-
-    Raises:
-        InputError: If the URL cannot be listed.
+    Nothing is listed if it does not exist.
     """
     if not is_url(place):
         return {file.as_posix(): _local_state(file) for file in _walk(Path(place))}
@@ -99,11 +95,7 @@ def _local_state(file: Path) -> ListedFile:
 
 
 def read_text(place: str) -> str:
-    """Read a text file by path or URL.
-
-    Raises:
-        InputError: If it cannot be read.
-    """
+    """Read a text file by path or URL."""
     try:
         if not is_url(place):
             return Path(place).read_text(encoding="utf-8-sig")
@@ -116,13 +108,7 @@ def read_text(place: str) -> str:
 def fetch_files(roots: Iterable[str], sources: Iterable[str], folder: Path) -> dict[str, str]:
     """Fetch files and folders; return the local path of each.
 
-    Args:
-        roots: URLs of files and folders.
-        sources: URLs of the files at or below them.
-        folder: Where to write.
-
-    Raises:
-        RemoteFileError: If a file cannot be fetched.
+    `roots` are URLs of files and folders, `sources` those of the files at or below them.
     """
     local = {
         root: f"{folder}/{number}/{root.rsplit('/', 1)[1]}" for number, root in enumerate(roots)

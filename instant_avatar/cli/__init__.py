@@ -1,1 +1,1 @@
-"""What all commands share: console, exit codes, output paths."""
+"""Shared by all commands: console, exit codes, output paths."""

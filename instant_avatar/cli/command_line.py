@@ -186,7 +186,7 @@ def _system_failure(error: OSError) -> tuple[int, str] | None:
 
 
 def is_disk_full(error: OSError) -> bool:
-    """Whether a write failed because the disk is full."""
+    """True if a write failed because the disk is full."""
     return error.errno in DISK_FULL_ERRNOS
 
 
@@ -199,12 +199,7 @@ Arguments = TypeVar("Arguments")
 def parse_arguments(
     arguments_type: type[Arguments], program: str, argv: Sequence[str] | None = None
 ) -> Arguments:
-    """Parse the arguments of a command; --help and --version print and exit.
-
-    Args:
-        arguments_type: A dataclass; its docstrings are the --help.
-        program: Name of the command.
-        argv: Words of the command line; None for those of the process.
+    """Parse the arguments of a command, a dataclass whose docstrings are the --help.
 
     Raises:
         SystemExit: With 0 after --help or --version, with 2 if the words cannot be parsed.

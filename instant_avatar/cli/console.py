@@ -48,11 +48,7 @@ class StderrConsole(RichConsole):
 
 @final
 class Console:
-    """Messages on stderr; stdout is reserved for results.
-
-    Attributes:
-        warnings: The first `MAX_KEPT_WARNINGS` warnings.
-    """
+    """Messages on stderr, and the first `MAX_KEPT_WARNINGS` warnings; stdout is for results."""
 
     def __init__(self, console: RichConsole | None = None) -> None:
         """Write to stderr, unless another console is given."""
@@ -61,7 +57,7 @@ class Console:
 
     @property
     def is_terminal(self) -> bool:
-        """Whether stderr is a terminal."""
+        """True if stderr is a terminal."""
         return self._rich.is_terminal
 
     def info(self, message: str) -> None:
@@ -94,11 +90,7 @@ class Console:
 
     @contextmanager
     def status(self, message: str) -> Iterator[Callable[[str], None]]:
-        """Show a spinner on a terminal, or a line in a log, during a block.
-
-        Yields:
-            A function that shows progress next to the spinner.
-        """
+        """Show a spinner (a line in a log) during a block; yield what shows progress next to it."""
         if not self.is_terminal:
             self.info(message)
             yield lambda _: None

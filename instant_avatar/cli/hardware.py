@@ -20,17 +20,14 @@ CGROUP = Path("/sys/fs/cgroup")
 
 @dataclass(frozen=True, kw_only=True)
 class Hardware:
-    """Where and when.
+    """The machine, the software and the time of a measurement.
 
     Attributes:
         commit: Of this checkout; "+" if tracked files differ from it; "unknown" of an installation.
         date: When the measurement began, UTC.
-        processor: As the machine calls it.
         cores: That this process may use.
         load: How many processes wanted a core in the last minute, before the measurement; above
             a few tenths of `cores`, wall times include other programs.
-        memory_gb: Of the machine.
-        software: Versions.
     """
 
     commit: str

@@ -78,11 +78,7 @@ def capture_name(video: Path) -> str:
 
 
 def parse_frame_range(text: str) -> slice | None:
-    """Parse START:STOP:STEP as a slice; None for all frames.
-
-    Raises:
-        InputError: If the text has another form.
-    """
+    """Parse START:STOP:STEP as a slice; None for all frames."""
     if not re.fullmatch(r"\d*(:\d*){0,2}", text) or ":" not in text:
         raise InputError(
             f"--frames is {text!r}, but must be START:STOP:STEP counted from 0, as in 0:120:2 or "
@@ -105,14 +101,9 @@ def option_words(values: Mapping[str, object]) -> list[str]:
 
 
 def check_writable(path: Path, flag: str) -> None:
-    """Check by trial that a path can be written; nothing is left behind.
+    """Refuse a file or folder that a trial shows cannot be written; nothing is left behind.
 
-    Args:
-        path: A file or a folder; it and its parents need not exist yet.
-        flag: The argument that names the path.
-
-    Raises:
-        InputError: If the path cannot be written.
+    It and its parents need not exist yet; `flag` is the argument that names it.
     """
     place = Path(os.path.abspath(path))
     while not place.exists() and place != place.parent:
@@ -137,17 +128,9 @@ def check_output_file(
     overwrite: bool = False,
     below: bool = True,
 ) -> None:
-    """Check that an output file may be written.
+    """Refuse an output file that exists already, cannot be written, or lies in an input.
 
-    Args:
-        path: The file to write.
-        flag: The argument that names the file.
-        inputs: Files and folders that the command reads; an output may not lie in one of them.
-        overwrite: Whether an existing file may be replaced.
-        below: Whether the file may lie in a folder within an input.
-
-    Raises:
-        InputError: If the file may not be written.
+    With `below` it may lie in a folder within an input; `flag` is the argument that names it.
     """
     if path.is_dir():
         raise InputError(f"{flag} is {path}, which is a folder, but must be a file.")
@@ -169,16 +152,7 @@ def check_output_file(
 
 
 def check_output_folder(path: Path, flag: str, inputs: Iterable[Path] = ()) -> None:
-    """Check that an output folder may be written; an older one is replaced if all of it is ours.
-
-    Args:
-        path: The folder to write.
-        flag: The argument that names the folder.
-        inputs: Files and folders that the command reads.
-
-    Raises:
-        InputError: If the folder may not be written.
-    """
+    """Refuse a folder that overlaps an input, cannot be written, or holds files of others."""
     check_disjoint_from_inputs(path, flag, inputs)
     check_replaceable_folder(path)
     check_writable(path, flag)
@@ -216,7 +190,7 @@ def _describe_overlap(folder: Path, given: Path) -> str | None:
 
 
 def _is_same_file(one: Path, other: Path) -> bool:
-    """Whether two paths are one file, also by links, or on case-insensitive file systems."""
+    """True if two paths are one file, also by links, or on case-insensitive file systems."""
     if _real_path(one) == _real_path(other):
         return True
     try:

@@ -43,7 +43,6 @@ class SplitFrames:
     """The frames of one split.
 
     Attributes:
-        folder: Capture folder.
         poses: Pose file; None for the one in the folder.
         frames: Frames of the folder, START:STOP:STEP counted from 0.
     """
@@ -58,7 +57,6 @@ class DatasetSubject:
     """A subject of a data set, found in a folder.
 
     Attributes:
-        name: Name of its folder.
         open_splits: Returns the training and the test frames. Frames that no capture folder holds
             are written below the given folder first, once.
         size_px: Longer side of the images that are compared; None for the original size.
@@ -79,12 +77,8 @@ def _write_splits(
 ) -> tuple[SplitFrames, SplitFrames]:
     """Write the capture folders "train" and "test" of a subject; those that exist stay.
 
-    Args:
-        folder: Folder above them.
-        splits: Frame numbers of "train" and of "test".
-        write_frames: Writes the frames of a split into a folder, with poses and cameras, and yields
-            their numbers while it does.
-        console: Shows progress.
+    `splits` are frame numbers. `write_frames` writes the frames of a split into a folder, with
+    poses and cameras, and yields their numbers while it does.
     """
     for name, numbers in splits.items():
         if (folder / name).is_dir():  # written whole or not at all
@@ -134,7 +128,7 @@ LONGER_SIDE_PX = 540
 TRAIN_POSES, TEST_POSES = Path("poses/anim_nerf_train.npz"), Path("poses/anim_nerf_test.npz")
 """Anim-NeRF's poses, one row per listed frame; the capture's own replace missing ones."""
 CAMERA_KEYS = ("camera_f", "camera_c", "camera_k", "width", "height")
-"""What is read of camera.pkl: focal lengths, principal point, OpenCV's distortion, size."""
+"""Keys read of camera.pkl: focal lengths, principal point, OpenCV's distortion, size."""
 Lens = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "k"]]
 """Intrinsic matrix and OpenCV's distortion."""
 
@@ -159,7 +153,7 @@ def find_people_snapshot(folder: Path) -> list[DatasetSubject]:
 
 
 def _is_raw(folder: Path) -> bool:
-    """Whether a folder has the layout in which the data set is distributed."""
+    """True if a folder has the layout in which the data set is distributed."""
     return (folder / "camera.pkl").is_file() and not (folder / "images").is_dir()
 
 

@@ -15,7 +15,7 @@ POSES = {
     "given": "given (of the capture, as fitted before training)",
     "fitted": "fitted (to each scored frame, with its exposure; the avatar is frozen)",
 }
-"""What the kinds of poses are."""
+"""Kinds of poses, for the reader of the page."""
 
 
 def evaluation_conditions(evaluations: Sequence[AvatarEvaluation], lpips: Lpips) -> dict[str, str]:

@@ -23,12 +23,7 @@ PATH_ARGUMENTS = ("video", "poses", "masks", "body", "out", "json")
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class EvaluationFrames:
-    """Frames of a capture.
-
-    Attributes:
-        recording: The capture.
-        frame_indices: Numbers of the frames to score; None for all.
-    """
+    """Frames of a capture: those numbered in `frame_indices`, or all if it is None."""
 
     recording: Capture
     frame_indices: frozenset[int] | None = None
@@ -60,22 +55,15 @@ class EvaluationFrames:
 def capture_frames(
     inputs: CaptureInputs, body_file: Path | None, size_px: int | None
 ) -> EvaluationFrames:
-    """Open all frames of a capture.
+    """Open all frames of a capture, with the poses retargeted to the avatar's body.
 
-    Args:
-        inputs: Inputs as the user named them.
-        body_file: Body of the avatar, to which poses are retargeted.
-        size_px: Longer side; None for the original size.
+    `size_px` is the longer side of the images; None for the original size.
     """
     return EvaluationFrames(recording=open_capture(inputs, size_px=size_px, avatar_body=body_file))
 
 
 def held_out_frames(run: RunFolder, size_px: int | None) -> EvaluationFrames:
-    """Open the held-out frames of a run from its original capture.
-
-    Raises:
-        InputError: If its report or its capture is missing.
-    """
+    """Open the held-out frames of a run from its original capture."""
     report = read_report(run)
     given = _run_arguments(report, run)
     if given.live or str(given.video).startswith("camera:"):
@@ -120,7 +108,7 @@ def trained_longer_side_px(run: RunFolder) -> int | None:
 
 
 def is_trained(run: RunFolder, *, seconds: float, steps: int | None) -> bool:
-    """Whether a run was trained for the steps, or else for the seconds, by its report."""
+    """True if a run was trained for the steps, or else for the seconds, by its report."""
     if not (run.has_checkpoint() and run.report_json.is_file()):
         return False
     training = read_report(run)["training"]
@@ -128,11 +116,7 @@ def is_trained(run: RunFolder, *, seconds: float, steps: int | None) -> bool:
 
 
 def read_report(run: RunFolder) -> dict[str, Any]:
-    """Read a run's report.json.
-
-    Raises:
-        InputError: If it is missing or damaged.
-    """
+    """Read a run's report.json."""
     try:
         report = json.loads(run.report_json.read_text(encoding="utf-8"))
         if isinstance(report["command"], dict) and isinstance(report["held_out"]["frames"], list):

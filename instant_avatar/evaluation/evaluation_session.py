@@ -41,19 +41,12 @@ BEST_TIER = "hq"
 FIT_BATCH_FRAMES = 25
 """Number of frames whose poses are fitted together."""
 VOLUME_RENDERER = "renderer"
-"""What the rows of the volume renderer are drawn by."""
+"""Name of the volume renderer in the table."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class EvaluationSession:
-    """One call of ia-evaluate.
-
-    Attributes:
-        arguments: As given.
-        console: Shows progress.
-        stop: Set by Ctrl-C; ends scoring early.
-        lpips: LPIPS with the weights that were found.
-    """
+    """One call of ia-evaluate; `stop`, set by Ctrl-C, ends scoring early."""
 
     arguments: EvaluateArguments
     console: Console
@@ -75,12 +68,7 @@ class EvaluationSession:
     ) -> AvatarEvaluation:
         """Score renderer and player of a run.
 
-        Args:
-            name: Name of the avatar in the table.
-            run: The run.
-            frames: Frames to score.
-            backgrounds: Backgrounds behind the person, if the user names none.
-            paper: Scores in the paper, if the subject is in it.
+        `backgrounds` apply if the user names none; `paper` holds a paper's scores of this subject.
         """
         with self.console.status(f"loading {run.checkpoint}"):
             trainer = checkpoint.load(run.checkpoint)[0]
@@ -173,7 +161,7 @@ class EvaluationSession:
 
 @final
 class FrameScorer:
-    """Scores the frames of one avatar.
+    """Scorer of the frames of one avatar.
 
     Attributes:
         rows: Scores by renderer, poses and background.
@@ -196,7 +184,6 @@ class FrameScorer:
             renderers: What draws given poses, by name.
             fitted: Holds the avatar to which poses are fitted; None not to fit any.
             backgrounds: Names of `BACKGROUNDS`.
-            lpips: LPIPS; None to leave it out.
             keeps_pictures: Whether `shown` is filled.
         """
         self._renderers, self._trainer, self._lpips = renderers, fitted, lpips
@@ -216,7 +203,7 @@ class FrameScorer:
 
     @property
     def fits_poses(self) -> bool:
-        """Whether fitted poses are scored."""
+        """True if fitted poses are scored."""
         return self._trainer is not None
 
     def score_frame(self, observation: Observation) -> None:

@@ -73,15 +73,7 @@ def score_picture(
     *,
     cpu_ms: float = float("nan"),
 ) -> FrameScore:
-    """Compare a rendering with its frame, both on a background of `BACKGROUNDS`.
-
-    Args:
-        observation: The frame.
-        picture: The rendering.
-        background: Name of the background.
-        lpips: LPIPS; None to leave it out.
-        cpu_ms: CPU time that the rendering took.
-    """
+    """Compare a rendering with its frame, both on a background of `BACKGROUNDS`."""
     gray, box = BACKGROUNDS[background], _bounding_box(observation)
     truth = ground_truth_over(observation, gray)
     shown = np.clip(composite_over(picture, gray), 0.0, 1.0)
@@ -100,7 +92,6 @@ class ShownFrame:
     """A frame with its rendering and the error between them.
 
     Attributes:
-        score: Scores of the frame.
         width: Width of each image, pixels.
         truth, rendering, error: The images, as data URIs.
     """
@@ -149,9 +140,7 @@ def choose_shown(frames: Sequence[ShownFrame]) -> list[ShownFrame]:
 def _bounding_box(observation: Observation, *, margin: float = 0.0) -> tuple[slice, slice]:
     """Return rows and columns of the person; of the whole image without one.
 
-    Args:
-        observation: The frame.
-        margin: Width of the rim around the person, as a fraction of the box.
+    `margin` is the width of the rim around the person, as a fraction of the box.
     """
     silhouette, spans = silhouette_of(observation), []
     for axis in (1, 0):

@@ -20,7 +20,6 @@ class ScoreRow:
         renderer: "renderer", "player hq" or "player lite".
         poses: "given" or "fitted".
         background: "white" or "black".
-        scores: Scores of each frame.
     """
 
     renderer: str
@@ -59,13 +58,8 @@ class AvatarEvaluation:
     """Scores of an avatar on a capture.
 
     Attributes:
-        name: Name of the avatar in the table.
-        capture: Path of the video.
         size: Width and height of the images; None without any.
-        rows: Scores by renderer and poses, at least one.
         paper: Scores in the paper, if the subject is in it.
-        shown: Frames with their renderings, for the page.
-        report: Content of the run's report.json, if there is one.
         dances: Animations of novel poses as data URIs, by name.
     """
 

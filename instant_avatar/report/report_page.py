@@ -16,15 +16,7 @@ SHOWN_VALUES = ("frames", "training", "held_out", "stream", "package", "machine"
 
 @dataclass(frozen=True, kw_only=True)
 class ComparisonPair:
-    """A held-out frame and its rendering.
-
-    Attributes:
-        frame: Frame number in the video.
-        psnr: PSNR of the whole image, dB.
-        verdict: Verdict on the frame.
-        truth: The video's image as a data URI.
-        render: The avatar's rendering as a data URI.
-    """
+    """A held-out frame and its rendering as data URIs; `psnr` of the whole image, dB."""
 
     frame: int
     psnr: float
@@ -48,15 +40,9 @@ def report_page(
     """Return the page as HTML.
 
     Args:
-        report: The values to show.
-        name: Name of the video, for the heading.
         body_map: SVG of the body coverage (`CoverageMap.svg`).
-        pairs: Held-out frames and their renderings.
         animation: Animation of novel poses as a data URI.
-        warnings: Warnings shown to the user.
-        failure: Why the avatar has failed, if it has.
         present_files: Names of the files next to the page; the page refers to no others.
-        play_command: Command that plays the package, if there is one.
     """
     content = asdict(report)
     return render_template(

@@ -36,7 +36,6 @@ class FrameStats:
     """Number of frames by use.
 
     Attributes:
-        read: Read from the video.
         used: Trained on.
         held_out: Scored, never trained on.
         dropped: Skipped, each with its reason.
@@ -63,9 +62,6 @@ class TrainingStats:
         cpu_contention_seconds: Wall time of training steps above their CPU time: at least so long
             did other programs hold the cores; a resumed run counts its own part only.
         startup_seconds: Before training: imports, opening and checking the capture, kernels.
-        steps: Training steps.
-        rays: Rays trained on.
-        rays_per_second: Rays per second of wall time.
         samples_per_ray: Mean number of samples per ray.
         peak_memory_mb: Peak resident memory of the process.
     """
@@ -98,7 +94,6 @@ class HeldOutStats:
             measurable one.
         overlap: Median soft IoU of rendered alpha and mask.
         lpips: Not measured.
-        background: Color behind the alpha.
         poses: Poses that the frames were rendered in: given, or fitted.
         whole_images: Number of frames of which the whole image was scored. The scores of the others
             are estimates from a sample of their pixels, and `ssim` leaves them out.
@@ -140,12 +135,9 @@ class CurvePoint:
     Its scores are estimates from a sample of each frame's pixels, the same ones every time.
 
     Attributes:
-        wall_seconds: Training time up to here, wall clock.
-        cpu_seconds: Training time up to here, CPU.
+        wall_seconds, cpu_seconds: Training time up to here.
         frames_seen: Frames trained on up to here.
-        psnr: Mean PSNR of the whole images of the frames scored here, dB.
-        psnr_mask: Mean PSNR inside their masks, dB.
-        verdict: Verdict on the scores (`avatar.evaluation.image_metrics`).
+        psnr, psnr_mask: Mean PSNR of the frames scored here, whole and inside their masks, dB.
         frames: Frame number in the video and PSNR of the whole image of each frame scored here.
             Evaluations may score different frames, so only a frame's own scores show a drop.
         video: Number of the video that the frames are from, 1 for the first.
@@ -225,7 +217,6 @@ class CoverageStats:
     Attributes:
         seen: Fraction of the skin seen, in [0, 1].
         well: Fraction seen within 53° of the surface normal.
-        advice: What to film next, in a sentence.
         parts: Fraction seen of each body part under "seen", then of each of its sides. Left and
             right are the person's.
     """
@@ -252,13 +243,11 @@ class ForgettingStats:
 
     Attributes:
         videos: Names of the earlier videos, in order.
-        frames_trained: Number of their frames that were trained on.
+        frames_trained, replayed_key_frames: Numbers of their frames.
         wall_seconds: Training time before this video.
-        replayed_key_frames: Number of their key frames that were replayed.
         frames: Their held-out frames, by frame number in their own video.
         video_of_frame: Position in `videos`, from 1, of the video of each of these frames.
-        psnr_before: Mean PSNR of these frames before this video, dB.
-        psnr_after: Mean PSNR of these frames at the end, dB.
+        psnr_before, psnr_after: Mean PSNR of these frames before this video and at the end, dB.
         largest_drop: Largest drop in PSNR of one of these frames, dB; 0 if none dropped.
     """
 
@@ -320,13 +309,9 @@ def provisional_verdict(verdict: str | None) -> str | None:
 def format_psnr(
     psnr: float | None, verdict: str | None, *, digits: int = 2, provisional: bool = False
 ) -> str:
-    """Format a PSNR with its verdict: "22.78 dB (blurred)".
+    """Format a PSNR in dB with its verdict: "22.78 dB (blurred)"; None is "n/a".
 
-    Args:
-        psnr: In dB; None for "n/a".
-        verdict: Shown in brackets; None for none.
-        digits: After the decimal point.
-        provisional: Whether training continues, so that "failed" does not apply yet.
+    While training continues (`provisional`), the word "failed" does not apply yet.
     """
     if psnr is None:
         return "n/a"

@@ -102,17 +102,8 @@ def write_report(
 ) -> Report:
     """Write report.json, turning.webp and report.html; each appears whole or not at all.
 
-    Args:
-        result: Baked and scored.
-        capture: What the avatar was trained on.
-        run: Where the files go.
-        console: Holds the warnings, and shows progress.
-        command: Arguments of ia-ingest, as given.
-        startup_seconds: From the start of the command to the first frame.
-        threads: Of torch and numba.
-
-    Raises:
-        OSError: If the disk is full; what was written before is kept.
+    `result` is baked and scored; `command` holds the arguments of ia-ingest as given;
+    `startup_seconds` last until the first frame.
     """
     package = _package_stats(result, run, console)
     report = _build_report(
@@ -184,7 +175,7 @@ def _refusal(result: TrainingResult) -> str | None:
 
 
 def play_command(package: Path, poses: Path) -> str:
-    """What plays a package in the poses that it was learnt from, to be pasted into a shell."""
+    """Return the command that plays a package in the poses it was learnt from, for a shell."""
     return shlex.join(["ia-play", str(package), "--poses", str(poses)])
 
 

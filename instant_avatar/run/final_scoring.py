@@ -106,16 +106,10 @@ class TrainingResult:
     """A trained avatar and how it was trained.
 
     Attributes:
-        trainer: Holds the avatar.
-        held_out: Held-out frames that have arrived.
         curve: Learning curve, up to the final scores.
-        meter: Timing and counts of the frame stream.
-        coverage: Skin that the training frames show.
         frames_added: Frames of this capture that were trained on.
-        interrupted: Whether Ctrl-C ended training.
         package: Outcome of packaging; None before `TrainingSession.bake`.
         scores: Final scores of the held-out frames; empty before `bake`.
-        earlier_videos: Forgetting of earlier videos, if there were any.
     """
 
     trainer: Trainer
@@ -131,7 +125,7 @@ class TrainingResult:
 
     @property
     def is_trained(self) -> bool:
-        """Whether any step was made on any frame."""
+        """True if any step was made on any frame."""
         return self.trainer.steps > 0 and self.frames_added > 0
 
     def all_round_verdict(self) -> AllRoundVerdict:
@@ -158,16 +152,10 @@ class _ScoredFrame(NamedTuple):
 def score_finally(
     trainer: Trainer, held_out: list[HeldOutFrame], console: Console, *, fit_poses: bool
 ) -> FinalScores:
-    """Scores the held-out frames in about `SCORING_LIMIT_S`.
+    """Score the held-out frames in about `SCORING_LIMIT_S`; with `fit_poses` in fitted poses, too.
 
     After a given number of steps all are scored, whatever the time: the results of such a run do
     not depend on the machine.
-
-    Args:
-        trainer: After its last step.
-        held_out: Frames that were never trained on.
-        console: Shows the progress.
-        fit_poses: Whether to score in fitted poses, too.
     """
     if not held_out:
         return FinalScores()
@@ -198,7 +186,7 @@ def score_finally(
 def _score_in_given_poses(
     avatar: Avatar, held_out: list[HeldOutFrame], whole_until: float
 ) -> Iterator[_ScoredFrame]:
-    """Scores frames in an order of which every prefix is spread over the video."""
+    """Score frames in an order of which every prefix is spread over the video."""
     for count, frame in enumerate(coarse_to_fine_order(held_out)):
         late = count >= MIN_WHOLE_IMAGES and time.perf_counter() > whole_until
         if late or count >= MAX_WHOLE_IMAGES:
@@ -219,7 +207,7 @@ def _score_in_fitted_poses(
     until: float,
     progress: Callable[[float], None],
 ) -> Iterator[HeldOutScore]:
-    """Fits frames, a few at a time, and scores them as they were in the given poses."""
+    """Fit frames, a few at a time, and score them as they were in the given poses."""
     for first in range(0, len(scored), FRAMES_PER_FIT):
         if first and time.perf_counter() > until:
             return
@@ -241,11 +229,9 @@ class EarlierVideos:
     """
 
     def __init__(self, run: RunFolder, notes: dict[str, Any]) -> None:
-        """Load the frames of earlier videos, if there are any.
+        """Load the frames of earlier videos, if the run's checkpoint folder holds any.
 
-        Args:
-            run: Its checkpoint folder holds the frames.
-            notes: Stored with each checkpoint; updated with what an interrupted run needs.
+        `notes` are stored with each checkpoint; they receive what an interrupted run needs.
         """
         self._run, self._notes = run, notes
         began = "before" in notes  # otherwise the file is from a run that was killed at its start
@@ -300,13 +286,7 @@ class EarlierVideos:
     ) -> ForgettingStats | None:
         """Save frames for the next video; compare scores of earlier videos, if there are any.
 
-        Args:
-            trainer: After its last step.
-            held_out: Held-out frames of the current video.
-            console: Shows the result.
-
-        Raises:
-            OSError: If the disk is full.
+        Call it after the last step; `held_out` are frames of the current video.
         """
         kept = SavedFrames.of(trainer.replay, [*self.held_out, *held_out])
         kept.save(self._run.checkpoint / LAST_RUN_FILE)

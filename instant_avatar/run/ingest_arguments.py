@@ -121,11 +121,7 @@ class IngestArguments(CaptureArguments):
     """Write a copy of report.json to this file."""
 
     def validate(self) -> None:
-        """Check ranges, combinations and output files.
-
-        Raises:
-            InputError: Naming the option.
-        """
+        """Check ranges, combinations and output files; an `InputError` names the option."""
         if self.seconds is not None and not MIN_SECONDS <= self.seconds < float("inf"):
             raise InputError(
                 f"--seconds is {self.seconds}, but must be at least {MIN_SECONDS:g} "
@@ -185,7 +181,7 @@ class IngestArguments(CaptureArguments):
 
     @property
     def may_replace_json(self) -> bool:
-        """Whether --json may replace a file: with --overwrite, or if it is a report of a run."""
+        """True if --json may replace a file: with --overwrite, or if it is a report of a run."""
         return self.overwrite or (self.json is not None and is_run_report(self.json))
 
     def run_folder(self) -> RunFolder:
@@ -226,7 +222,7 @@ class IngestArguments(CaptureArguments):
 
     @property
     def tracks_stream(self) -> bool:
-        """Whether poses are missing and must be tracked while frames come."""
+        """True if poses are missing and must be tracked while frames come."""
         return needs_stream_tracking(self.capture_inputs(), realtime=self.realtime)
 
     def training_seconds(self, recording: Capture) -> float:

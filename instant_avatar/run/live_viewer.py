@@ -54,21 +54,10 @@ MAP_INTERVAL_S = 1.0
 
 @final
 class LiveViewer:
-    """A `TrainingObserver` that shows training in browsers.
-
-    Attributes:
-        page: The page in the browsers.
-    """
+    """A `TrainingObserver` that shows training in browsers."""
 
     def __init__(self, recording: Capture, run: RunFolder, console: Console, port: int) -> None:
-        """Open the page and print its address.
-
-        Args:
-            recording: Capture that is trained on.
-            run: Folder for packages.
-            console: Shows messages.
-            port: First port to try.
-        """
+        """Open the page, at `port` or a free one after it, and print its address."""
         self._recording, self._run, self._console = recording, run, console
         self._poser = PreviewPoses(recording)
         self.page = ViserPage(recording.paths.video.name, port)
@@ -256,11 +245,7 @@ def render_preview(
 ) -> UInt8[np.ndarray, "height width 3"]:
     """Render the avatar in its current state over the page's background.
 
-    Args:
-        avatar: The avatar.
-        pose: Pose in the camera's world.
-        camera: Also defines the image size.
-        cells: Correspondence grid of the pose.
+    The camera also defines the image size; `cells` is the correspondence grid of the pose.
     """
     rgba = render(avatar, pose, camera, cells=cells)
     mixed = rgba[..., :3] * 255.0 + (1.0 - rgba[..., 3:]) * np.array(

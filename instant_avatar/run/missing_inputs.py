@@ -1,4 +1,4 @@
-"""What a run's capture lacks: poses and masks tracked in its video, and cameras solved from it.
+"""Inputs that a capture lacks: poses and masks tracked in its video, and cameras solved from it.
 
 A video without poses is tracked first; a resumed run reads its own tracking. Then the cameras of a
 phone that was carried around the person are solved, and written next to the avatar.
@@ -44,8 +44,6 @@ def track_missing_poses(
 
     Raises:
         CommandExit: After Ctrl-C.
-        InputError: If the video cannot be read, or no person is found in it.
-        OSError: If the disk is full.
     """
     inputs = arguments.capture_inputs()
     if arguments.tracks_stream or not needs_tracking(inputs):
@@ -137,7 +135,6 @@ def _track(
 
 
 def _remove_tracking(run: RunFolder) -> None:
-    """Remove tracked poses and masks."""
     for folder in (run.tracking / "masks", run.tracking):
         OutputFileList(folder).remove_all()
         with suppress(OSError):  # not empty, or missing
@@ -145,7 +142,7 @@ def _remove_tracking(run: RunFolder) -> None:
 
 
 def _describe_request(arguments: IngestArguments) -> dict[str, Any]:
-    """What decides the tracked poses; poses of another request are tracked again."""
+    """Return what decides the tracked poses; those of another request are tracked again."""
     named = {
         name: None if value is None else str(value)
         for name, value in vars(arguments).items()
@@ -170,13 +167,7 @@ def solve_missing_cameras(
 ) -> Capture:
     """Return the capture in the world of cameras that are solved, if --cameras solve asks for it.
 
-    Args:
-        arguments: Of the command.
-        capture: As it was opened, with poses in the camera of each frame.
-        console: Shows progress.
-
-    Raises:
-        InputError: If pycolmap is missing, or the cameras cannot be solved with certainty.
+    The given capture has its poses in the camera of each frame.
     """
     if arguments.cameras != "solve":
         return capture
@@ -199,11 +190,7 @@ def write_solved_cameras(capture: Capture, run: RunFolder, console: Console) -> 
     """Write cameras.npz and poses.npz of the run, if its cameras were solved.
 
     Solving takes minutes: call it before training, so that the result is kept whatever follows.
-
-    Args:
-        capture: What `solve_missing_cameras` returned; `checkpoint/` holds the fit of its poses.
-        run: The run, which has begun.
-        console: Prints the paths.
+    The poses are those before the fit to the masks, which `checkpoint/` holds.
     """
     if capture.camera_report is None or capture.camera_report["verdict"] != "solved":
         return

@@ -1,4 +1,4 @@
-"""Tracks the person of a recording, fits poses, body and camera, and writes them as files."""
+"""Track the person of a recording, fit poses, body and camera, and write them as files."""
 
 import os
 import shutil
@@ -54,7 +54,6 @@ class PersonTracking:
     Attributes:
         capture: The recording with poses, masks, camera and body, fitted to each other.
         inputs: What opens the same from the files that were written.
-        grade: How good the poses are.
         interrupted: Whether tracking was stopped before the last frame.
     """
 
@@ -65,28 +64,19 @@ class PersonTracking:
 
 
 def needs_tracking(inputs: CaptureInputs) -> bool:
-    """Whether a recording comes without poses, so that its person must be tracked."""
+    """True if a recording comes without poses, so that its person must be tracked."""
     if inputs.is_live or inputs.poses is not None:
         return False
     return inputs.video.exists() and find_own_poses(inputs.video) is None
 
 
 def needs_stream_tracking(inputs: CaptureInputs, *, realtime: bool) -> bool:
-    """Whether the person must be tracked while frames come.
-
-    Args:
-        inputs: What the user named.
-        realtime: Whether a recording is played at its own speed.
-    """
+    """Return whether the person is tracked while frames come, as of a `realtime` recording."""
     return inputs.is_live or (realtime and needs_tracking(inputs))
 
 
 def open_stream(inputs: CaptureInputs, poses: Path, avatar_body: Path | None = None) -> Capture:
-    """Open a stream without poses with this project's tracker; see `open_tracked_stream`.
-
-    Raises:
-        InputError: If it or masks that were named cannot be read, or no person is found in it.
-    """
+    """Open a stream without poses with this project's tracker; see `open_tracked_stream`."""
     tracker = make_tracker(inputs.tracker or DEFAULT_TRACKER, person_number(inputs.person))
     return open_tracked_stream(inputs, tracker, MaskRefiner, poses, avatar_body=avatar_body)
 
@@ -107,22 +97,15 @@ def track_person(
     stop: threading.Event | None = None,
     resume: bool = False,
 ) -> PersonTracking:
-    """Track the person, and write poses and masks.
+    """Track the person, and write poses, and masks to the folder masks/ beside them.
 
     Masks that were given, or lie beside the video, are used instead of tracked ones (see
-    `masks_to_use`); so are cameras.
-
-    Args:
-        inputs: A recording without poses.
-        poses: File to write; masks are written to the folder masks/ beside it.
-        console: Shows progress.
-        stop: Ends tracking early once it is set; what was found until then is written.
-        resume: Whether `poses` and its masks hold the first frames, after which to go on.
+    `masks_to_use`); so are cameras. Setting `stop` ends tracking early; what was found until then
+    is written. With `resume`, `poses` and its masks hold the first frames, after which to go on.
 
     Raises:
         InputError: If the recording cannot be read, or no person is found in it.
         KeyboardInterrupt: If it was stopped before the person was found.
-        OSError: If the files cannot be written.
     """
     inputs = limit_frames(inputs, open_source(inputs.video, frames=inputs.frames))
     source = open_source(inputs.video, frames=inputs.frames)
@@ -157,11 +140,7 @@ def track_person(
 
 
 def _check_parts(source: FrameSource, inputs: CaptureInputs, masks: Path | None) -> None:
-    """Open body, camera and masks that the user named, before minutes of tracking.
-
-    Raises:
-        InputError: If one cannot be used.
-    """
+    """Open body, camera and masks that the user named, before minutes of tracking."""
     load_body_model(inputs.body)
     assume_camera(inputs.video, inputs.cameras, source)
     if masks is not None:
@@ -176,9 +155,7 @@ def _frames_up_to(source: FrameSource, last: int) -> slice:
 def masks_to_use(inputs: CaptureInputs, written: Path) -> Path | None:
     """Masks that the user named, or that lie beside the video; None if they are to be tracked.
 
-    Args:
-        inputs: A recording without poses.
-        written: Folder of tracked masks; older ones in it are replaced, not used.
+    Older tracked masks in the folder `written` are replaced, not used.
     """
     if segmenter_name(inputs.masks) is not None:
         return None
@@ -226,7 +203,7 @@ def _run_networks(
 def _earlier_frames(
     source: FrameSource, poses: Path, mask_folder: Path | None
 ) -> TrackedVideo | None:
-    """What was tracked up to the last frame with the person; its masks are copied.
+    """Read what was tracked up to the last frame with the person, and copy its masks.
 
     None if it is of another size, or masks are missing.
     """
@@ -247,7 +224,7 @@ def _earlier_frames(
 
 
 def _finds_again(tracker: PersonTracker, source: FrameSource, keypoints: KeypointTrack) -> bool:
-    """Whether a new tracker takes up the same person in the last frame that was tracked."""
+    """True if a new tracker takes up the same person in the last frame that was tracked."""
     last = int(keypoints.frames[-1])
     frame = next(iter(open_source(source.path, frames=slice(last, last + 1)).frames()), None)
     found = None if frame is None else tracker(frame.rgb)
@@ -262,14 +239,7 @@ def fit_tracked_video(
 ) -> Capture:
     """The recording with poses lifted from the key points and fitted to them and to the masks.
 
-    Args:
-        source: The recording.
-        tracked: What the networks found in it.
-        inputs: What the user named.
-        masks: Folder of tracked masks; None if others are used.
-
-    Raises:
-        InputError: If the parts cannot be opened.
+    `masks` is the folder of tracked masks; None if others are used.
     """
     shaped = load_body_model(inputs.body).with_shape()
     lifted = lift_keypoints(
@@ -302,11 +272,7 @@ def _without(motion: Motion, frames: Sequence[int]) -> Motion:
 
 
 def person_number(person: str | None) -> int | None:
-    """The number in --person, by which persons of a video without poses are named.
-
-    Raises:
-        InputError: If it is none.
-    """
+    """The number in --person, by which persons of a video without poses are named."""
     if person is not None and not person.isdecimal():
         raise InputError(
             f"--person is {person!r}, but the video comes without poses: expected a number counted "
@@ -323,12 +289,7 @@ def grade_capture(capture: Capture) -> TrackingGrade | None:
 
 
 def _grade(capture: Capture, frame_times_s: Mapping[int, float]) -> TrackingGrade:
-    """Grade tracked poses.
-
-    Args:
-        capture: The recording, with masks and tracked poses.
-        frame_times_s: Time of each frame that was looked at, by its number.
-    """
+    """Grade tracked poses; `frame_times_s` are the times of frames looked at, by their numbers."""
     source, keypoints = capture.source, capture.motion.keypoints
     assert keypoints is not None
     sampled = sample_masks(

@@ -32,14 +32,7 @@ def claim_folder(folder: Path, console: Console) -> Iterator[None]:
     """Create and lock a folder during a block; remove the folders it made if they stayed empty.
 
     After `kill -9` the lock file remains, but not the lock. File systems without locks cause a
-    warning.
-
-    Args:
-        folder: The folder.
-        console: Shows warnings.
-
-    Raises:
-        CommandExit: If another process has locked it.
+    warning; a lock of another process ends the command (`CommandExit`).
     """
     made = [each for each in (folder, *folder.parents) if not each.exists()]
     folder.mkdir(parents=True, exist_ok=True)
@@ -83,13 +76,7 @@ CHECKPOINT_FILES = (STATE_FILE, "person.npz", "fit.npz", "frames.tensors", "earl
 
 @dataclass(frozen=True, kw_only=True)
 class RunFolder:
-    """A folder that holds one run of ia-ingest.
-
-    Files that the user puts there stay.
-
-    Attributes:
-        path: The folder.
-    """
+    """A folder that holds one run of ia-ingest; files that the user puts there stay."""
 
     path: Path
 
@@ -125,7 +112,7 @@ class RunFolder:
 
     @property
     def fit_file(self) -> Path:
-        """What was fitted to the masks of the last video."""
+        """Body, poses and focal length fitted to the masks of the last video."""
         return self.checkpoint / "fit.npz"
 
     @property
@@ -161,20 +148,15 @@ class RunFolder:
         return (*top, *(self.checkpoint / name for name in CHECKPOINT_FILES))
 
     def has_run(self) -> bool:
-        """Whether any file of a run exists."""
+        """True if any file of a run exists."""
         return any(path.exists() for path in self.files)
 
     def has_checkpoint(self) -> bool:
-        """Whether training can continue from here."""
+        """True if training can continue from here."""
         return (self.checkpoint / STATE_FILE).is_file()
 
     def check_usable(self, inputs: Iterable[Path], *, resume: bool, overwrite: bool) -> None:
         """Check that a run can be written here; nothing is created yet.
-
-        Args:
-            inputs: Files and folders that the run reads.
-            resume: Whether to continue an existing run.
-            overwrite: Whether to replace an existing run.
 
         Raises:
             InputError: If the path is a file, overlaps an input, holds files of others but no run,
@@ -206,14 +188,8 @@ class RunFolder:
     def claim(self, console: Console, *, resume: bool, overwrite: bool) -> Iterator[None]:
         """Create, lock and mark the folder during a block; remove it if it stayed empty.
 
-        Args:
-            console: Shows warnings.
-            resume: Whether to continue an existing run.
-            overwrite: Whether to replace an existing run.
-
         Raises:
             InputError: If a run exists and neither flag is given.
-            CommandExit: If another run is writing here.
         """
         with claim_folder(self.path, console):
             if self.has_run() and not (resume or overwrite):
@@ -231,9 +207,6 @@ class RunFolder:
         """Mark the folders as ours; remove an older run unless it is resumed.
 
         Call it once the inputs have been found good.
-
-        Raises:
-            InputError: If foreign files have appeared since `check_usable`.
         """
         self.checkpoint.mkdir(parents=True, exist_ok=True)
         for folder in (self.path, self.checkpoint):
@@ -243,11 +216,7 @@ class RunFolder:
             self.remove(path)
 
     def remove(self, path: Path) -> None:
-        """Remove one of the run's files.
-
-        Raises:
-            InputError: If ia-ingest did not write the file.
-        """
+        """Remove one of the run's files; an `InputError` keeps those of other programs."""
         if not OutputFileList(path.parent).remove(path.name):
             raise InputError(f"{path} was not written by ia-ingest; it was kept.")
 
@@ -290,7 +259,7 @@ class RunFolder:
 
 
 def is_run_report(path: Path) -> bool:
-    """Whether a file is a report.json of ia-ingest."""
+    """True if a file is a report.json of ia-ingest."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):

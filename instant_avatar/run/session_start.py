@@ -31,8 +31,7 @@ from preprocess.capture_session import Capture
 def set_threads(requested: int | None) -> int:
     """Set the threads of torch and numba: as requested, else one per usable core.
 
-    Returns:
-        The number of threads; numba cannot exceed the number it started with.
+    Return their number; numba cannot exceed the number it started with.
     """
     threads = max(1, min(requested or usable_cores(), numba.get_num_threads()))
     torch.set_num_threads(threads)
@@ -46,7 +45,7 @@ if TYPE_CHECKING:  # viser is an optional extra
 EXPECTED_POSES = 60
 """Poses, evenly spread, that tell what a film will show of the person."""
 JOINT_TOLERANCE_M = 1e-3
-"""Largest difference of rest joints within one body, metres; more is another body."""
+"""Largest difference of rest joints within one body, meters; more is another body."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -54,7 +53,6 @@ class PreparedTrainer:
     """A trainer that is ready for the frames of a capture.
 
     Attributes:
-        trainer: New, or from the run's checkpoint.
         restore_count: Frames of this video that the trainer was trained on before.
         notes: Stored with each checkpoint.
     """
@@ -67,11 +65,7 @@ class PreparedTrainer:
 def prepare_trainer(
     arguments: IngestArguments, capture: Capture, run: RunFolder, console: Console
 ) -> PreparedTrainer:
-    """Build a new trainer, or load the run's checkpoint to resume it or to add a video.
-
-    Raises:
-        InputError: If the checkpoint cannot be read, or belongs to another body.
-    """
+    """Build a new trainer, or load the run's checkpoint to resume it or to add a video."""
     if arguments.resume and run.has_checkpoint():
         prepared = _load_trainer(arguments, capture, run, console)
     else:
@@ -93,9 +87,6 @@ def start_session(
     """Prepare trainer and viewer, start the run, and yield its session.
 
     Ctrl-C asks the session to stop. A viewer stays open after the block until Ctrl-C.
-
-    Raises:
-        InputError: If the checkpoint cannot be read, or belongs to another body.
     """
     with exit_on_interrupt(console, PROGRAM, run.release):
         start = prepare_trainer(arguments, capture, run, console)

@@ -38,12 +38,7 @@ class CheckpointWriter:
     """
 
     def __init__(self, run: RunFolder, capture: Capture) -> None:
-        """Writes nothing yet.
-
-        Args:
-            run: Folder of the run.
-            capture: Its body and its fit to the masks are written beside the first checkpoint.
-        """
+        """Write nothing yet; body and fit of the capture will go beside the first checkpoint."""
         self._run, self._capture, self._body_written = run, capture, False
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
         self._pending: Future[float] | None = None
@@ -51,15 +46,11 @@ class CheckpointWriter:
         self.restart_interval()
 
     def restart_interval(self) -> None:
-        """Counts the time to the next checkpoint from now."""
+        """Count the time to the next checkpoint from now."""
         self._last, self._cpu_last = time.perf_counter(), time.process_time()
 
     def is_due(self) -> bool:
-        """Whether the last checkpoint is written and old enough.
-
-        Raises:
-            OSError: If the last one could not be written; the one before it is kept.
-        """
+        """Return whether the last checkpoint is written and old enough; raise like `wait`."""
         if self._pending is not None:
             if not self._pending.done():
                 return False
@@ -69,15 +60,9 @@ class CheckpointWriter:
         return time.process_time() - self._cpu_last > self._cpu_interval_s
 
     def begin(self, trainer: Trainer, notes: dict[str, Any], *, trains_on: bool = True) -> None:
-        """Start to write a checkpoint, after the one before it.
+        """Start to write a checkpoint with `notes`, after the one before it; raise like `wait`.
 
-        Args:
-            trainer: In the state to save.
-            notes: Stored with it.
-            trains_on: Whether training goes on meanwhile, so that the state has to be copied.
-
-        Raises:
-            OSError: If the one before could not be written.
+        If training goes on meanwhile (`trains_on`), the state is copied.
         """
         self.wait()
         began = time.thread_time()
@@ -156,13 +141,9 @@ def write_package_snapshot(
         trainer: Holds the avatar; not in the middle of a step.
         path: The `.iavatar` file; an existing one is kept if the package is refused.
         views: Poses and cameras to validate the package with (`validation_views`).
-        curve_point: Latest scores of held-out frames, stored in the package.
         quick: Whether to skip the finest detail because the user waits (`prefer_final`).
         fine_tune: Whether to spend about ten seconds on fine-tuning the bricks.
         progress: Called with the fraction done, from 0 to 1.
-
-    Raises:
-        OSError: If the disk is full; an existing package is kept.
     """
     metrics = {
         "held_out": None if curve_point is None else asdict(curve_point),
@@ -184,11 +165,7 @@ def write_package_snapshot(
 
 
 def store_scores(snapshot: PackageSnapshot, scores: CurvePoint) -> PackageSnapshot:
-    """Replace the scores in the package that was written, if one was.
-
-    Raises:
-        OSError: If the disk is full; the package is kept as it was.
-    """
+    """Replace the scores in the package that was written, if one was."""
     exported = snapshot.export_report
     if exported is None:
         return snapshot

@@ -1,4 +1,4 @@
-"""How the frame stream of a run flows: counts, and how far behind its source training is."""
+"""Flow of a run's frame stream: counts, and how far behind its source training is."""
 
 import threading
 import time
@@ -25,9 +25,7 @@ class StreamMeter:
     """Counts frames on the producer's thread; read on the consumer's.
 
     Attributes:
-        frames_read: Frames that the source delivered.
         dropped: The first `MAX_DROPPED_LISTED` dropped frames.
-        dropped_count: Number of dropped frames.
         near_duplicates: Frames not trained on because they resemble the previous one.
         held_out_count: Held-out frames that have reached the trainer.
         first_frame_at: When the first frame was available, on `time.perf_counter`'s clock.
@@ -36,7 +34,6 @@ class StreamMeter:
         preparation_s: From decoding to ready for training, without waiting for the source.
         lateness_s: From the moment a frame was due until its preparation began.
         latency_s: From the moment a frame was available until the trainer had it.
-        current_latency_s: Latency of the newest frame.
         inbox_depth: Frames waiting in the inbox, sampled after each step.
         inbox_dropped: Frames that the inbox replaced by newer ones.
     """
@@ -127,11 +124,7 @@ class StreamMeter:
             )
 
     def stats(self, *, ready_at: float | None) -> StreamStats:
-        """Summarize the stream for the report.
-
-        Args:
-            ready_at: When the package was written, on `time.perf_counter`'s clock.
-        """
+        """Summarize the stream; the package was ready at `ready_at` of `perf_counter`'s clock."""
         ready = None
         if ready_at is not None and self.first_frame_at is not None:
             ready = ready_at - (self._clip_started_at + self.last_frame_s)

@@ -72,13 +72,7 @@ class TrainingObserver(Protocol):
 def notify_observers(
     items: Iterator[SplitItem], coverage: Coverage, observers: Sequence[TrainingObserver]
 ) -> Iterator[SplitItem]:
-    """Passes items on; observers see every observation, coverage those that are trained on.
-
-    Args:
-        items: Observations, of which the held-out ones are wrapped.
-        coverage: Adds the observations that are not held out.
-        observers: Receive all observations.
-    """
+    """Pass items on; observers see all observations, coverage those that are not held out."""
     for item in items:
         if isinstance(item, Observation):
             coverage.add(item)
@@ -92,16 +86,7 @@ def notify_observers(
 
 @final
 class TrainingSession:
-    """Training of one avatar on one capture.
-
-    Attributes:
-        trainer: Holds the avatar in its current state.
-        held_out: Held-out frames that have arrived.
-        curve: Learning curve up to now.
-        coverage: Skin that the training frames have shown.
-        meter: Timing and counts of the frame stream.
-        stop: Ends training as soon as it is set.
-    """
+    """Training of one avatar on one capture; it ends as soon as `stop` is set."""
 
     def __init__(
         self,
@@ -117,16 +102,9 @@ class TrainingSession:
     ) -> None:
         """Prepare the session; `train` starts it.
 
-        Args:
-            trainer: New, or from a checkpoint.
-            recording: Capture to train on.
-            run: Folder for checkpoints and package.
-            console: Shows progress and warnings.
-            stop: Ends training as soon as it is set.
-            notes: Stored with each checkpoint.
-            observers: Notified of frames and training events.
-            restore_count: Frames of this video that the trainer was trained on before; they are
-                read back into its replay buffer before the clock starts.
+        `trainer` is new, or from a checkpoint. `notes` are stored with each checkpoint. The trainer
+        was trained on `restore_count` frames of this video before; they are read back into its
+        replay buffer before the clock starts.
         """
         self.trainer, self._recording, self._run = trainer, recording, run
         self._console, self.stop, self._notes = console, stop, notes
@@ -144,15 +122,11 @@ class TrainingSession:
 
     @property
     def stop_requested(self) -> bool:
-        """Whether the user has asked to stop."""
+        """True if the user has asked to stop."""
         return self.stop.is_set()
 
     def train(self) -> TrainingResult:
-        """Train until the budget is used or the user stops; `bake` packages and scores.
-
-        Raises:
-            OSError: If a checkpoint cannot be written; the previous one is kept.
-        """
+        """Train until the budget is used or the user stops; `bake` packages and scores."""
         source = self._recording.source
         self._set_unpaced(self._restore_count > 0)
         self._inbox = inbox = Inbox(self._frame_stream(), paced=source.paced, live=source.live)
@@ -199,7 +173,6 @@ class TrainingSession:
 
         Raises:
             CommandExit: If the avatar was not trained.
-            OSError: If the disk is full; what was written before is kept.
         """
         self._check_trained(result)
         views = validation_views(self.held_out, self._recording)

@@ -46,12 +46,10 @@ class PreviewPoses:
         self._valid = np.flatnonzero(recording.motion.valid)
 
     def pose_at(self, choice: str, seconds: float, newest: Observation | None) -> BodyPose:
-        """Return the pose to show.
+        """Return the pose to show for one of `POSE_CHOICES`.
 
-        Args:
-            choice: One of `POSE_CHOICES`.
-            seconds: Time since the motion started; motions are looped.
-            newest: The newest frame; None before the first.
+        Motions are looped; `seconds` count from their start. `newest` is None before the first
+        frame.
         """
         if choice == FILMED:
             place = np.searchsorted(self._valid, _row_at(self._filmed, seconds))
@@ -98,7 +96,6 @@ def _row_at(motion: Motion, seconds: float) -> int:
 
 
 def _axis_angle(rotation: np.ndarray) -> np.ndarray:
-    """Convert a rotation matrix to axis-angle."""
     import cv2
 
     vector, _ = cv2.Rodrigues(rotation)
@@ -135,7 +132,6 @@ class BrowserCamera:
     """Camera of a browser, as viser reports it (OpenCV axes).
 
     Attributes:
-        world_from_camera: Rotation.
         position: Position in the world, meters.
         fov: Vertical field of view, radians.
         aspect: Width over height.
@@ -170,19 +166,12 @@ class ViserPage:
     Buttons are handled on viser's threads, where they only set fields that `LiveViewer` reads.
 
     Attributes:
-        paused: Whether training should pause.
-        save_requested: Whether the user has requested a package.
         pose_choice: Poses to show, one of `POSE_CHOICES`.
         chosen_at: Time of that choice, on `time.perf_counter`'s clock.
     """
 
     def __init__(self, name: str, port: int) -> None:
-        """Serve the page on the loopback address.
-
-        Args:
-            name: Name of the capture.
-            port: First port to try; the next free one is used. 0 for any.
-        """
+        """Serve the page on the loopback address, at a free port from `port` on; 0 for any."""
         from viser import ViserServer  # pyright: ignore[reportMissingImports]
 
         self.paused = self.save_requested = False
