@@ -79,14 +79,11 @@ class ExportReport:
     """Outcome of an export.
 
     Attributes:
-        path: The package.
-        bytes: Its size.
         seconds: Wall time of sampling, baking, checking and writing.
         psnr_to_renderer: Mean over the views, dB, by tier.
         fine_tuning_psnr: PSNR to the renderer before and after fine-tuning, dB, on pictures that it
             was not trained on; None without fine-tuning.
         largest_difference: Between graph and reference, in 1/255.
-        warnings: Weaknesses that the user should know.
     """
 
     path: Path
@@ -113,23 +110,18 @@ def export_avatar(
     """Write an avatar's package, or nothing.
 
     Args:
-        avatar: As training left it.
         path: The `.iavatar` file; replaced atomically if it exists.
-        views: Poses and cameras to check it with, at least one; the first is the preview, and
-            the first few become golden frames. Lens distortion is ignored.
+        views: Poses and cameras to check it with, at least one; the first is the preview, and the
+            first few become golden frames. Lens distortion is ignored.
         metrics: Training metrics, kept in the manifest (JSON).
-        renderer: Renders the exact picture of an avatar.
         config: Resolution; follows the field's finest cells if None.
         quick: Bake a coarser package of one tier, not fine-tuned, for a preview during training.
-        fine_tune_bricks: Fine-tune bricks against the renderer's pictures, some ten seconds; has
-            no effect on a quick package.
+        fine_tune_bricks: Takes some ten seconds; has no effect on a quick package.
         progress: Receives the fraction of the export that is done, from 0 to 1, while bricks are
             fine-tuned. Ctrl-C meanwhile ends only the fine-tuning.
 
     Raises:
-        ExportRefused: If there is nothing to draw, or this machine's onnxruntime does not compute
-            what the graph means.
-        OSError: If it cannot be written.
+        ExportRefused: If there is nothing to draw, or this onnxruntime computes something else.
     """
     occupied = avatar.rendering_grid().occupied.numpy()
     config = config or BakeConfig.for_sample_step(avatar.sample_step_m)
@@ -320,11 +312,7 @@ CHECK_PX = 256
 def check_graph(
     player: Player, package: AvatarPackage, tier: str, frames: Sequence[GoldenFrame]
 ) -> float:
-    """Compare a tier's graph with its reference.
-
-    Returns:
-        The largest difference over all frames, in 1/255.
-    """
+    """Return the largest difference of a tier's graph from its reference over frames, in 1/255."""
     tables, settings = package.tables[tier], package.manifest.tiers[tier].settings
     worst = 0.0
     for number, frame in enumerate(frames):

@@ -34,7 +34,6 @@ class SkeletonAnimation:
     """Translations and rotations of the skeleton's nodes over time.
 
     Attributes:
-        times_s: Seconds, ascending from 0.
         translations: Positions of the pelvis, metres.
         rotations: Quaternions x, y, z, w of every joint, whose signs do not jump.
     """
@@ -51,12 +50,6 @@ class SkeletonAnimation:
 
         glTF's axes are the body's own (y up, the front towards z); a tracker's world may have any
         orientation, so the first pose's root defines up, forward and the origin.
-
-        Args:
-            motion: In the tracker's world.
-            rows: Poses to convert.
-            fps: Poses a second.
-            pelvis: Rest pelvis, metres.
         """
         chosen = list(rows)
         roots = Rotation.from_rotvec(motion.root_rotations[chosen])

@@ -1,8 +1,4 @@
-"""What the player's graph is given: stored tables expanded for drawing, and inputs it can draw.
-
-Skinning nodes and the graph's initializers; checks of pose, camera and size; the resolution limit
-of close-ups.
-"""
+"""Inputs of the player's graph: expanded tables, checked poses and cameras, limits of close-ups."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -30,8 +26,6 @@ class SkinningNodes:
     At half the grid's step that is within some tenths of a millimetre of skinning itself.
 
     Attributes:
-        low: Corner of the grid, canonical metres.
-        step_m: Distance between nodes along x, y, z, metres.
         index: Row of each node, 0 where it or the next node along z is not stored. Rows are
             numbered in C order, so that the next row is the next node along z; one more row than
             there are nodes follows the last.
@@ -166,12 +160,7 @@ BAND_ROWS = 64
 
 
 def resize_camera(camera: Camera, size: int | np.integer | tuple[int, int] | None) -> Camera:
-    """Return the camera for a picture of another size.
-
-    Args:
-        camera: Its field of view is kept.
-        size: Longer side, or width and height, pixels; None for the camera's own size.
-    """
+    """Return the camera, its field of view kept, for a longer side or (width, height) in pixels."""
     if size is None:
         return camera
     sides: Any = np.asarray(size)
@@ -291,13 +280,7 @@ def downscale_camera(camera: Camera, factor: float) -> Camera:
 def upscale_picture(
     picture: UInt8[np.ndarray, "rows columns 4"], size_px: tuple[int, int], factor: float
 ) -> UInt8[np.ndarray, "height width 4"]:
-    """Enlarge a picture with straight alpha to the camera's size, bilinearly.
-
-    Args:
-        picture: Drawn by `downscale_camera(camera, factor)`.
-        size_px: Width and height of the camera.
-        factor: Its factor.
-    """
+    """Enlarge a picture of `downscale_camera(camera, factor)` to `size_px`, bilinearly."""
     width, height = size_px
     source = picture.astype(np.float32)
     source[..., :3] *= source[..., 3:] / np.float32(255.0)

@@ -57,15 +57,10 @@ MISSING_MESSAGE = (
 
 
 def install_runtime(tarball: bytes, folder: Path | None = None) -> None:
-    """Store what the page needs of npm's tarball.
-
-    Args:
-        tarball: Content of the pinned release's tarball.
-        folder: Where to store it; `RUNTIME_FOLDER` if None.
+    """Store what the page needs of npm's tarball in a folder, `RUNTIME_FOLDER` if None.
 
     Raises:
         InputError: If its checksum is another.
-        OSError: If the disk is full.
     """
     folder = folder or RUNTIME_FOLDER
     found = "sha512-" + base64.b64encode(hashlib.sha512(tarball).digest()).decode()
@@ -88,11 +83,7 @@ def install_runtime(tarball: bytes, folder: Path | None = None) -> None:
 
 
 def runtime_files(folder: Path | None = None) -> dict[str, bytes]:
-    """Read the stored files by name.
-
-    Raises:
-        InputError: If one is missing; the message has the command that fetches it.
-    """
+    """Read the stored files by name; `InputError` says how to fetch a missing one."""
     folder = folder or RUNTIME_FOLDER
     wanted = (*TARBALL_MEMBERS, *LICENCE_FILES)
     missing = [name for name in wanted if not (folder / name).is_file()]
@@ -132,7 +123,6 @@ class PageMotion:
 
     Attributes:
         poses: Root rotation, root translation and 23 joint rotations, one row a pose.
-        fps: Poses a second.
         start_view: View of the first pose from the front.
     """
 
@@ -152,11 +142,7 @@ def build_page(
 ) -> dict[str, bytes]:
     """Build all files of the page by relative path; index.html is the one to open.
 
-    Args:
-        path: The `.iavatar` package; the page has all its tiers.
-        clip: Motion to play.
-        name: Title of the avatar.
-        compression_level: Of zlib: 1 for a local browser, 6 for a host.
+    The page has all tiers of the package. zlib's level: 1 for a local browser, 6 for a host.
     """
     runtime = runtime_files()
     draft = _ArrayFiles(compression_level)

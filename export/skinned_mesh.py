@@ -74,10 +74,9 @@ class Texture:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SkinnedMesh:
-    """A closed mesh in the canonical pose.
+    """A closed mesh in the canonical pose, metres.
 
     Attributes:
-        positions: Canonical metres.
         normals: Outward, of length 1.
         colors: sRGB.
         faces: Counter-clockwise seen from outside.
@@ -112,17 +111,10 @@ def extract_mesh(
     triangles: int | None = None,
     textured: bool = False,
 ) -> SkinnedMesh:
-    """Extract the surface of baked bricks.
+    """Extract the surface of baked bricks, with a vertex about every `spacing_m`.
 
-    Args:
-        tables: The bricks, and the weights that move them.
-        spacing_m: Distance between vertices, about, metres.
-        triangles: Number of triangles to simplify the surface to (quadric error metrics, Garland
-            and Heckbert 1997); None keeps all.
-        textured: Whether to draw a texture.
-
-    Raises:
-        ModuleNotFoundError: If triangles are asked for, and fast-simplification is missing.
+    It is simplified to `triangles` (quadric error metrics, Garland and Heckbert 1997; needs
+    fast-simplification) unless that is None.
     """
     codes, low = _dense_grid(tables.bricks)
     voxel_m = tables.bricks.voxel_m
@@ -304,11 +296,8 @@ def make_texture(
 ) -> Texture:
     """Draw the texture of a mesh.
 
-    Args:
-        positions: Of the vertices, metres.
-        normals: Of the vertices.
-        faces: Triangles; the texture's vertices are their corners, in order.
-        color_at: Colors of points on the surface, by their positions and normals.
+    Its vertices are the triangles' corners, in order. `color_at` takes points on the surface and
+    their normals.
     """
     columns = int(np.ceil(np.sqrt(np.ceil(len(faces) / 2))))
     corners = positions[faces]
@@ -339,7 +328,7 @@ def make_texture(
 
 
 def _coordinates(faces: int, columns: int, side: int) -> Float32[np.ndarray, "vertices 2"]:
-    """Where the corners of all triangles lie in the image."""
+    """Return coordinates of all triangles' corners in the image."""
     leg = side - MARGIN_PX
     lower = np.array([[1.0, 1.0], [1.0 + leg, 1.0], [1.0, 1.0 + leg]])
     both = np.stack([lower, side - lower])[np.arange(faces) % 2]

@@ -89,7 +89,7 @@ def encode_weights(weights: Float32[np.ndarray, "nodes 24"]) -> UInt16[np.ndarra
 THICK_FAINT_FRACTION = 0.04
 """`BakeConfig.faint_fraction` of thick fields: haze of 10/m about a core of 120/m is seen."""
 THICK_SURFACE_DENSITY = 12.0
-"""`BakeConfig.surface_density` of thick fields, 1/m: ten centimetres of it hide 70 % of what lies
+"""`BakeConfig.surface_density` of thick fields, 1/m: ten centimetres hide 70 % of what is
 behind."""
 BRICK_MARGIN_M = 0.012
 """Distance outside the surface that bricks cover, metres."""
@@ -105,9 +105,8 @@ BRICK_BYTES = 2.4e6
 BYTES_EXPONENT = 2.5
 """Bytes of the bricks grow with this power of the number of voxels along a metre."""
 VOXEL_FACTORS = (0.62, 1.6)
-"""Bounds of the factor by which voxels of a thick field are finer or coarser. An avatar of few
-photographs is light: finer voxels gain 1 to 1.5 dB. In fog they gain 0.3 dB for three times the
-bytes."""
+"""Bounds of the factor on voxels of a thick field. Finer ones gain 1 to 1.5 dB on the light avatar
+of few photographs; in fog 0.3 dB for three times the bytes."""
 QUICK_VOXEL_FACTOR = 1.5
 """Factor on voxel size and surfel spacing of a quick package."""
 POSITION_CODE_STEP = 32
@@ -128,14 +127,10 @@ class BakeConfig:
     """Resolution and content of a package.
 
     Attributes:
-        voxel_m: Distance between brick voxels, metres.
-        surfel_spacing_m: Cell on which the surface is extracted, metres; enlarged until surfels can
-            be numbered.
-        surface_density: Density of the surface's level set, 1/m; less where the whole field is
-            faint.
-        faint_fraction: Upper bound of that level as a fraction of the 99th percentile of visible
-            density.
-        tiers: Quality tiers of the package; "hq" is always among them.
+        surfel_spacing_m: Cell of the surface's extraction; enlarged until surfels can be numbered.
+        surface_density: Density of the surface, 1/m; less where the whole field is faint.
+        faint_fraction: Upper bound of that, as a fraction of visible density's 99th percentile.
+        tiers: Quality tiers; "hq" is always among them.
         fine_tuning_pictures: Pictures on which bricks are fine-tuned; 0 for no fine-tuning.
     """
 
@@ -153,11 +148,7 @@ class BakeConfig:
         return cls(voxel_m=voxel_m, fine_tuning_pictures=FINE_TUNING_PICTURES)
 
     def for_thick_field(self, brick_bytes: float) -> "BakeConfig":
-        """Return the configuration with haze, and voxels whose bricks take about `BRICK_BYTES`.
-
-        Args:
-            brick_bytes: Deflated size of the bricks with this configuration.
-        """
+        """Add haze; scale voxels until bricks, now of `brick_bytes`, take about `BRICK_BYTES`."""
         factor = (brick_bytes / BRICK_BYTES) ** (1.0 / BYTES_EXPONENT)
         factor = float(np.clip(factor, *VOXEL_FACTORS))
         return replace(
@@ -185,7 +176,7 @@ def sample_field(
     occupied: UInt8[np.ndarray, "cx cy cz"],
     config: BakeConfig,
 ) -> FieldGrid:
-    """Evaluate the field, the first half of baking; arguments and errors as of `bake_field`."""
+    """Evaluate the field, the first half of baking; `ExportRefused` if it is empty."""
     if not occupied.any():
         raise ExportRefused(EMPTY_AVATAR_MESSAGE)
     return sample_field_grid(field_at, rig, occupied, config.voxel_m)
@@ -222,10 +213,7 @@ def _surface_within_surfel_limit(grid: FieldGrid, config: BakeConfig) -> ProxySu
 
 
 def _max_reach_m(rig: Rig) -> float:
-    """Bound the distance of any visible point from the pelvis in any pose, metres.
-
-    The longest chain of bones, and 0.35 m for hands, head and clothes.
-    """
+    """Bound the reach in any pose, metres: the longest chain of bones, 0.35 m for what is beyond."""
     along = np.zeros(len(rig.parents))
     for joint, parent in enumerate(rig.parents):
         if parent >= 0:

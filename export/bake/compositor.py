@@ -72,14 +72,7 @@ class SirtUpdate(NamedTuple):
 def composite_segments(
     segments: RaySegments, settings: RenderSettings, bricks: BrickTable, codes: VoxelCodes
 ) -> Float32[np.ndarray, "rays 4"]:
-    """Return premultiplied color and alpha of each ray, as the player draws them.
-
-    Args:
-        segments: Where rays sample the bricks.
-        settings: Transmittances at which a ray ends and below which it has no further layer.
-        bricks: Which brick covers each block.
-        codes: What the bricks hold, in place of `bricks.voxels`.
-    """
+    """Return rays' premultiplied color and alpha as the player draws them with these `codes`."""
     out = np.zeros((segments.num_rays, 4), dtype=np.float32)
     _run_kernel(segments, settings, bricks, codes, out, out, None)
     return out
@@ -92,12 +85,7 @@ def back_project(
     codes: VoxelCodes,
     target_colors: Float32[np.ndarray, "rays 4"],
 ) -> SirtUpdate:
-    """Return how the codes have to change for rays to show their targets.
-
-    Args:
-        segments, settings, bricks, codes: As of `composite_segments`.
-        target_colors: Premultiplied color and alpha that each ray should have.
-    """
+    """Return changes of codes that let rays show their targets, premultiplied color and alpha."""
     update = SirtUpdate.zeros(len(codes.density))
     out = np.zeros_like(target_colors)
     _run_kernel(segments, settings, bricks, codes, target_colors, out, update)
@@ -168,6 +156,7 @@ def _tetrahedron_weights(index, px, py, pz, voxels, shares):
     x, y, z = px - F32(i), py - F32(j), pz - F32(k)
     largest, smallest = max(x, y, z), min(x, y, z)
     middle = x + y + z - largest - smallest
+    # corners 000, one step along the largest fraction, all but the smallest's, 111
     shares[0], shares[1] = F32(1) - largest, largest - middle
     shares[2], shares[3] = middle - smallest, smallest
     fx = 1 if x == largest else 0
@@ -206,6 +195,7 @@ def _composite_ray(first, last, segments, limits, bricks, sampled, gathered):
             depth[sample] = F32(0)
             if code > F32(0.5):
                 depth[sample] = np.exp(code * LOG_DENSITY_PER_CODE + MIN_LOG_DENSITY) * step_m[p]
+            # weight T (1 - exp(-σ Δ)) of the transmittance T, of which the rest is left
             light[sample] = left
             seen = left * (F32(1) - np.exp(-depth[sample]))
             weight, mean, left = weight + seen, mean + seen * way, left - seen
@@ -244,6 +234,7 @@ def _back_project_color(there, gathered, error, update):
         for corner in range(4):
             share, voxel = shares[segment, corner] * weights[segment], voxels[segment, corner]
             for channel in range(3):
+                # mean of the errors on black, e, and on white, e - e_alpha
                 middle = error[channel] - F32(0.5) * error[3]
                 color[voxel, channel] += F32(255) * share * middle
             color_normalizer[voxel] += share * total
@@ -264,6 +255,8 @@ def _back_project_density(there, sampled, gathered, moves, error, behind, update
     total = F32(0)
     for segment in range(there - 1, -1, -1):
         for sample in range(bounds[segment + 1] - 1, bounds[segment] - 1, -1):
+            # d color / d code = d(σ Δ)/d code · (T behind the sample · its color - all behind it);
+            # alpha is the channel whose color is 1
             left = light[sample + 1]
             deeper = depth[sample] * LOG_DENSITY_PER_CODE
             alpha = deeper * (left - behind[3])

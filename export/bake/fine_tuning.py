@@ -51,7 +51,6 @@ class RenderTargets:
     """Several pictures as one list of rays.
 
     Attributes:
-        segments: Where the player samples.
         target_colors: The renderer's premultiplied RGBA at the same pixels.
         picture_offsets: First ray of each picture, and the number of rays.
         pixels: Pixels of each picture, covered or not.
@@ -134,15 +133,11 @@ ExportProgress = Callable[[float], None]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FineTuningInputs:
-    """What is fine-tuned, and against what.
+    """Baked tables to be fine-tuned, and the views and the renderer to tune them against.
 
     Attributes:
-        tables: As baked.
-        rig: What moves them.
-        settings: How the player draws them, by tier; "hq" is always among them. Rays of all tiers
-            are learnt from, and judge.
+        settings: Tiers' settings, "hq" among them; rays of all tiers are learnt from, and judge.
         renderer: Renders the exact picture, on the caller's thread alone.
-        views: Poses and cameras of the avatar.
         executor: Traces the player's rays meanwhile.
     """
 
@@ -160,16 +155,10 @@ class FineTuningInputs:
         tiers: Sequence[RenderSettings],
         on_picture: Callable[[], None] = lambda: None,
     ) -> list[RenderTargets]:
-        """Draw views with the renderer while the player's rays are traced beside it.
+        """Draw views with the renderer while the player's rays are traced beside it, for each tier.
 
-        Args:
-            codes: Voxel codes of the tables' bricks.
-            views: For each tier those, or the first of them that reach `MAX_SEGMENTS`.
-            tiers: How the player draws them.
-            on_picture: Called after each picture.
-
-        Returns:
-            The targets of each tier.
+        A tier gets all views, or the first of them that reach `MAX_SEGMENTS`; `on_picture` is
+        called after each picture.
         """
         drawn = [list[tuple[TracedPicture, RgbaPicture]]() for _ in tiers]
         for pose, camera in views:
@@ -199,11 +188,8 @@ class FineTuningInputs:
     ) -> list[PosedView]:
         """Perturb the views' poses and orbit their cameras to random azimuths.
 
-        Args:
-            count: Views to make, from the given ones in turn.
-            pose_noise_rad: Standard deviation of every joint's rotation.
-            generator: Source of randomness.
-            longest_px: Longer side of the pictures.
+        Takes the given views in turn; `pose_noise_rad` is the standard deviation of every joint's
+        rotation.
         """
         perturbed = list[PosedView]()
         for turn in range(count):
@@ -230,7 +216,6 @@ class FineTuningResult:
 
     Attributes:
         tables: Tuned; the given ones if tuning would lose more than `MAX_LOSS_DB`.
-        settings: Settings by tier that they are drawn with.
         psnr: To the renderer before and after, dB, on pictures that were not trained on; None if
             nothing was tuned. The mean over the tiers.
     """
@@ -304,14 +289,7 @@ def fine_tune(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _SirtSolver:
-    """Lowers the squared error of rays by SIRT rounds.
-
-    Attributes:
-        learnt: The rays, and how each tier draws them.
-        bricks: Which brick covers each block.
-        baked: Density codes before the first round; they stay within `MAX_DENSITY_CODE_CHANGE`.
-        executor: Runs over the tiers' rays.
-    """
+    """Lowers the squared error of rays by SIRT rounds; `baked` are the densities' first codes."""
 
     learnt: Sequence[tuple[RenderTargets, RenderSettings]]
     bricks: BrickTable
@@ -321,10 +299,8 @@ class _SirtSolver:
     def descend(self, codes: VoxelCodes, cells: Sequence[VoxelCells] | None) -> SirtUpdate:
         """Take a round's step, in place and not rounded; return the update of single voxels.
 
-        Args:
-            codes: Equal in all voxels of a cell.
-            cells: Voxels that share a code, for each of the `brick_chunks`; None if each has its
-                own.
+        Voxels of a cell have equal codes; there are `cells` for each of the `brick_chunks`, or
+        None.
         """
 
         def updates(learnt: tuple[RenderTargets, RenderSettings]) -> SirtUpdate:

@@ -26,14 +26,8 @@ def visible_depth_steps(
 ):
     """Count the steps along each inward normal until everything visible has been passed.
 
-    Args:
-        density: On nodes, 1/m.
-        low, voxel_m: Position of the first node and distance between nodes, metres.
-        positions, normals: Where to start, and the outward direction.
-        step: Distance between steps, metres.
-        max_steps: Steps to take.
-        opaque: Optical depth behind which nothing is visible.
-        fraction: Fraction of the optical depth of all steps that is enough, too.
+    `density` (1/m) lies on nodes, and `normals` point outwards. Nothing is visible behind the
+    optical depth `opaque`, or behind a `fraction` of the optical depth of all steps.
     """
     ends = np.empty(len(positions), dtype=np.int32)
     along = np.empty(max_steps, dtype=np.float32)
@@ -131,11 +125,7 @@ MIN_DENSITY = float(np.exp(LOG_DENSITY_RANGE[0]))
 class FieldGrid:
     """Density and color on nodes `low + voxel_m · (i, j, k)`; each count is a multiple of 8, + 1.
 
-    Attributes:
-        low: Corner, canonical metres.
-        voxel_m: Distance between nodes.
-        density: 1/m.
-        rgb: 8 bits; empty nodes next to visible ones hold the mean of these.
+    Canonical metres, and 1/m. Empty nodes next to visible ones hold the mean of their colors.
     """
 
     low: Float32[np.ndarray, "3"]
@@ -170,7 +160,6 @@ def sample_field_grid(
 def _occupied_bounds(
     occupied: UInt8[np.ndarray, "cx cy cz"],
 ) -> tuple[Int[np.ndarray, "3"], Int[np.ndarray, "3"]]:
-    """Return the first and the last occupied cell along each axis."""
     axes = [np.flatnonzero(occupied.any(axis=tuple({0, 1, 2} - {axis}))) for axis in range(3)]
     return np.array([a[0] for a in axes]), np.array([a[-1] for a in axes])
 
@@ -216,12 +205,10 @@ MAX_THICKNESS_M = 0.1
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ProxySurface:
-    """Points, normals and visible depth of a person's surface in canonical space.
+    """Canonical positions, outward unit normals and visible depth of a person's surface.
 
     Attributes:
-        spacing_m: Cell of the grid on which the level set was extracted, metres.
-        positions: Metres.
-        normals: Outward, of length 1.
+        spacing_m: Cell of the grid on which the level set was extracted.
         thickness: Depth along the inward normal to which the field is visible, metres.
     """
 
@@ -234,11 +221,8 @@ class ProxySurface:
 def extract_proxy_surface(grid: FieldGrid, *, level: float, spacing_m: float) -> ProxySurface:
     """Extract the outer level set of the blurred log-density, without floaters and cavities.
 
-    Args:
-        grid: The field.
-        level: Density in 1/m. A lower one lets invisible haze shape the surface; a higher one cuts
-            into the visible field.
-        spacing_m: Cell of the grid on which it is extracted, metres; surfels lie on cell edges.
+    A lower `level` (1/m) lets invisible haze shape the surface; a higher one cuts into the visible
+    field. Surfels lie on the edges of cells of `spacing_m`.
     """
     logs = resample_grid(_log_density(grid, level), spacing_m / grid.voxel_m)
     logs = ndimage.gaussian_filter(logs, SMOOTHING_M / spacing_m, truncate=3.0)
@@ -269,12 +253,7 @@ def _log_density(grid: FieldGrid, level: float) -> Float32[np.ndarray, "x y z"]:
 def _zero_crossings(
     logs: Float32[np.ndarray, "x y z"], smoothed: Float32[np.ndarray, "x y z"]
 ) -> tuple[Float32[np.ndarray, "surfels 3"], Float32[np.ndarray, "surfels 3"]]:
-    """Return the zero crossings of grid edges, in nodes, and unit normals.
-
-    Args:
-        logs: Positive inside.
-        smoothed: A smoother version, from which normals are taken.
-    """
+    """Return zero crossings of edges, in nodes, and unit normals of the smoother grid."""
     nodes, normals = [], []
     for axis in range(3):
         along = np.eye(3, dtype=int)[axis]
@@ -311,8 +290,7 @@ def _visible_thickness(
 ) -> Float32[np.ndarray, "surfels"]:
     """Return the visible depth under each point, metres, plus `THICKNESS_MARGIN_M`.
 
-    That is where the optical depth along the inward normal reaches `OPAQUE_OPTICAL_DEPTH` or 99.9 %
-    of its value at `MAX_THICKNESS_M`.
+    There the optical depth is `OPAQUE_OPTICAL_DEPTH`, or 99.9 % of that at `MAX_THICKNESS_M`.
     """
     step = np.float32(0.5 * grid.voxel_m)
     ends = visible_depth_steps(

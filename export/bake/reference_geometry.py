@@ -79,7 +79,6 @@ class RaySegments:
         start: Begin of each segment, in voxels of the brick grid.
         slope: Voxels from one sample to the next.
         step_m: Metres from one sample to the next along the ray.
-        count: Samples.
         layer: Depth layer, from 0.
     """
 
@@ -106,12 +105,8 @@ class RaySegments:
     ) -> "RaySegments":
         """March the first layer's rays to their ends, as if none ever became opaque.
 
-        Args:
-            rays: One for each covered pixel.
-            posed: Skinning nodes in this pose.
-            bricks: Whose voxels the samples address.
-            settings: Spacing and number of blocks.
-            samples: Density samples along `RenderSettings.sample_span_m`.
+        There is a ray for each covered pixel; `samples` are counted along
+        `RenderSettings.sample_span_m`.
         """
         blocks = list(_march_blocks(rays, posed, settings, samples))
         number = np.concatenate([ray for ray, _, _ in blocks])
@@ -137,12 +132,8 @@ class RaySegments:
     ) -> "RaySegments":
         """Make one segment for each ray of a further layer.
 
-        Args:
-            rays: The layer's rays.
-            ray_index: Ray of the first layer that each belongs to, ascending.
-            num_rays: Rays of the first layer.
-            bricks: Whose voxels the samples address.
-            count_and_layer: Samples of a segment, and the layer's number, from 1.
+        Ascending `ray_index` names the first layer's rays, of which there are `num_rays`; the last
+        argument has a segment's samples and the layer's number, from 1.
         """
         step_m = (rays.end - rays.begin) / np.float32(count_and_layer[0])
         offsets = np.searchsorted(ray_index, np.arange(num_rays + 1)).astype(np.int64)
@@ -244,7 +235,6 @@ class SurfelFootprints(NamedTuple):
     Attributes:
         side: Edge of a footprint, pixels.
         cell: Cells, numbered in a picture with a margin of `side` pixels.
-        key: Z-buffer keys.
         depth: Depths of surfels that may form a further layer, metres; 0 for the others.
     """
 

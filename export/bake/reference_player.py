@@ -52,8 +52,7 @@ class PlayerInputs:
 
     Attributes:
         bones: Camera-from-canonical matrices.
-        focal, center: Pixels.
-        size_px: Width and height.
+        focal, center, size_px: Pixels, (x, y).
         samples: Density samples along `RenderSettings.sample_span_m` of each ray.
     """
 
@@ -78,15 +77,13 @@ class PlayerInputs:
 
 
 class TracedPicture(NamedTuple):
-    """Where a picture's rays sample the bricks.
+    """Covered pixels of a picture, and where their rays sample the bricks.
 
     Attributes:
         pixel: Numbers of the covered pixels, ascending.
-        segments: Their rays, through all layers.
         doubtful: Whether the surfel that the pixel sees is folded, compressed along the ray or seen
             from behind.
         passed: Whether light passes the first layer, so that others are looked for.
-        footprint_px: Edge of a surfel's footprint.
     """
 
     pixel: Int64[np.ndarray, "pixels"]
@@ -98,11 +95,9 @@ class TracedPicture(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _PosedSurface:
-    """Skinning nodes and, linear in tetrahedra, surfels in the camera's frame.
+    """Skinning nodes and, linear in tetrahedra, surfels in the camera's frame, metres.
 
     Attributes:
-        nodes: Posed nodes of the skinning grid.
-        positions: Surfels in the camera's frame, metres.
         facing: Canonical ray to each surfel times its normal; negative where it faces the camera.
     """
 
@@ -113,13 +108,11 @@ class _PosedSurface:
 
 @dataclass(eq=False, kw_only=True)
 class _FrontLayer:
-    """What the next layer has to know of the layers before it, for each covered pixel.
+    """State of covered pixels after the layers so far, which the next layer depends on.
 
     Attributes:
-        transmittance: Fraction of light that is left.
         depth: Depth at which the last ray entered the surface, metres.
         end: End of the last ray, metres along it.
-        surfel: The last layer's surfel.
     """
 
     transmittance: Float32[np.ndarray, "pixels"]
@@ -176,11 +169,7 @@ def trace_picture(
 ) -> TracedPicture:
     """Find the segments of all layers' rays.
 
-    Args:
-        tables: What is drawn.
-        codes: Voxel codes of `tables.bricks`; pixels have further layers where they let light pass.
-        settings: How it is drawn.
-        inputs: The pose, the camera and the number of samples.
+    Pixels have further layers where `codes`, of the voxels of `tables.bricks`, let light pass.
     """
     posed = _pose_surface(tables, settings, inputs)
     splats = _splat_surfels(tables, settings, inputs, posed)
@@ -309,7 +298,6 @@ def _footprint_px(
 def _splat_surfels(
     tables: PlayerTables, settings: RenderSettings, inputs: PlayerInputs, posed: _PosedSurface
 ) -> SurfelFootprints:
-    """Splat every visible surfel onto the cells of its footprint."""
     side = _footprint_px(tables, settings, inputs, posed)
     width, height = inputs.size_px
     place, seen = _project_surfels(settings, inputs, posed, 0.5 * side)

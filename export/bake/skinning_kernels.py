@@ -23,11 +23,9 @@ class PosedNodes(NamedTuple):
 def skin_trilinear(
     posed: PosedNodes, points: Float32[np.ndarray, "points 3"]
 ) -> tuple[Float32[np.ndarray, "points 3"], Float32[np.ndarray, "points 3 3"]]:
-    """Skin canonical points, trilinear between posed nodes.
+    """Return camera positions and Jacobians of canonical points, trilinear between posed nodes.
 
-    Returns:
-        Positions in the camera's frame, and the Jacobian; it is 0, so that it is never inverted,
-        where one of the eight nodes is not stored.
+    The Jacobian is 0, so that it is never inverted, where one of the eight nodes is not stored.
     """
     return _run_skinning(_skin_trilinear, posed, points)
 
@@ -40,7 +38,6 @@ def skin_tetrahedral(
 
 
 def _run_skinning(kernel, posed: PosedNodes, points: Float32[np.ndarray, "points 3"]):
-    """Return positions and Jacobians as a kernel writes them into arrays of zeros."""
     moved = np.zeros((len(points), 3), dtype=np.float32)
     jacobian = np.zeros((len(points), 3, 3), dtype=np.float32)
     nodes = posed.nodes
@@ -67,6 +64,7 @@ def _place_in_grid(point, low, step_m, count):
 
 @compile_kernel(nogil=True, error_model="numpy")
 def _skin_trilinear(index, low, step_m, camera, points, moved, jacobian):
+    # Σ w(x, y, z) · node over eight corners, w = x y z of their shares; the Jacobian is its slope
     base, shares = np.zeros(3, dtype=np.int64), np.zeros((2, 3), dtype=np.float32)
     for p in range(len(points)):
         for axis in range(3):
@@ -111,6 +109,8 @@ def _skin_tetrahedral(index, low, step_m, camera, points, moved, jacobian):
         for last in (1, 2, 1):  # sorts three fractions; equal ones stay in order
             if part[order[last]] > part[order[last - 1]]:
                 order[last], order[last - 1] = order[last - 1], order[last]
+        # with fractions f0 ≥ f1 ≥ f2 the four corners weigh 1 - f0, f0 - f1, f1 - f2 and f2; the
+        # difference between consecutive ones is the Jacobian's column of the axis stepped along
         for turn in range(4):
             row = index[base[0] + corner[0], base[1] + corner[1], base[2]] + corner[2]
             share = 1.0 if turn == 0 else part[order[turn - 1]]

@@ -47,14 +47,9 @@ def prune_octrees(
 ) -> Int64[np.ndarray, "voxels"]:
     """Choose the cells that minimize squared error plus price times the number of cells.
 
-    Args:
-        codes: Of every brick's 8³ voxels.
-        weights: Squared error for a change of a voxel's code by 1. A cell's code is the weighted
-            mean of its voxels'; where all weights are 0, cells are as large as bricks.
-        price: Squared error that one code more has to save.
-
-    Returns:
-        The number of the first voxel of each voxel's cell.
+    Returns the first voxel of each voxel's cell; bricks have 8³ voxels. `weights` are squared
+    errors for a change of a voxel's code by 1: a cell's code is the weighted mean of its voxels'.
+    Where all weights are 0, cells are as large as bricks.
     """
     bricks = len(codes) // BRICK_SIZE**3
     shape = (bricks, BRICK_SIZE, BRICK_SIZE, BRICK_SIZE)
@@ -101,12 +96,7 @@ def sum_over_cells(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class VoxelCells:
-    """The cell of every voxel, as the number of its first voxel; bricks as in `VoxelCodes`.
-
-    Attributes:
-        density: Voxels that share a density.
-        color: Voxels that share a color.
-    """
+    """First voxel of every voxel's cell, whose voxels share a code; bricks as in `VoxelCodes`."""
 
     density: Int64[np.ndarray, "voxels"]
     color: Int64[np.ndarray, "voxels"]
@@ -132,11 +122,8 @@ def choose_cells(
 ) -> VoxelCells:
     """Choose the voxels that share codes, of some bricks.
 
-    Args:
-        codes: Tuned, each voxel alone.
-        update: Its normalizers tell how much each voxel shows.
-        baked: Density codes before tuning; empty voxels remain apart from others.
-        price: Squared error, 1/255², that one code more has to save.
+    The normalizers of `update` tell how much each voxel shows. Voxels that were empty before tuning
+    (`baked`) remain apart. `price`: the squared error, 1/255², that one code more has to save.
     """
     weights = _error_weights(update, baked)
     apart = np.where(baked > 0, codes.density, np.float32(SEPARATE_CODE))
@@ -190,12 +177,7 @@ def share_codes_within_budget(
 ) -> list[VoxelCells]:
     """Share codes, in place, at higher prices until bricks fit into `MAX_BRICK_BYTES`.
 
-    Args:
-        bricks: Which brick covers each block.
-        codes, update, baked, price: As of `choose_cells`, for all bricks.
-
-    Returns:
-        The cells of each of the `brick_chunks`.
+    Returns the cells of each of the `brick_chunks`; arguments as of `choose_cells`, for all bricks.
     """
     shared = VoxelCodes(np.empty_like(codes.density), np.empty_like(codes.color))
     for raised in price * PRICE_FACTOR ** np.arange(MAX_PRICES):
@@ -213,13 +195,7 @@ def share_codes_within_budget(
 def quantize_bricks(
     bricks: BrickTable, codes: VoxelCodes, baked: Float32[np.ndarray, "voxels"]
 ) -> BrickTable:
-    """Round codes to those that are stored in bricks of the same blocks; keep voxels visible.
-
-    Args:
-        bricks: Which brick covers each block.
-        codes: Tuned.
-        baked: Density codes before tuning.
-    """
+    """Round codes to stored ones; voxels that were visible before tuning (`baked`) stay visible."""
     core = np.empty((len(baked), 4), dtype=np.uint8)
     for chunk in brick_chunks(len(baked)):
         color = np.round(codes.color[chunk]).astype(np.uint8)

@@ -41,9 +41,7 @@ def remove_floaters_and_cavities(
 ) -> Bool[np.ndarray, "x y z"]:
     """Remove small components and fill what the others enclose; the first node is outside.
 
-    Args:
-        solid: Nodes inside; components are connected through faces.
-        min_fraction: Least volume of a component as a fraction of the largest one's.
+    Components are connected through faces, and have `min_fraction` of the largest one's volume.
     """
     parts = _label_components(solid)
     sizes = np.bincount(parts.ravel())
@@ -73,9 +71,6 @@ def extract_isosurface(
     Every cell that the zero set crosses has one vertex, the mean of its crossings of the cell's
     edges; every crossed grid edge has a quad between its four cells (Gibson 1998, "Constrained
     elastic surface nets", without the relaxation). The surface is closed if the border is negative.
-
-    Args:
-        values: Positive inside.
     """
     inside = values > 0.0
     cells = _crossed_cells(inside)
@@ -100,7 +95,6 @@ def _mean_crossings(
     inside: Bool[np.ndarray, "x y z"],
     cells: Int64[np.ndarray, "cells 3"],
 ) -> Float32[np.ndarray, "cells 3"]:
-    """Return the mean of each cell's edge crossings."""
     total = np.zeros((len(cells), 3), dtype=np.float64)
     count = np.zeros(len(cells), dtype=np.int64)
     for axis in range(3):

@@ -161,7 +161,6 @@ class BlockValues:
 
     Attributes:
         end: End of the block along the ray, metres.
-        end_canonical: Canonical position there.
         transmittance: Transmittance of the ray after the block.
         color: Premultiplied color that the block adds.
     """
@@ -178,13 +177,11 @@ def march_segments(
     segment: SegmentValues,
     close_up: GraphValue,
 ) -> tuple[VectorValue, GraphValue]:
-    """Composite rays front to back, a block of samples at a time.
+    """Composite rays front to back; return premultiplied color and transmittance, in [0, 1].
 
-    After each block, rays that have ended are dropped; a Newton step moves the others back onto
-    their camera rays and updates their directions. The last block takes the rest of a ray.
-
-    Returns:
-        Premultiplied color, and the transmittance, in [0, 1].
+    After each block of samples, rays that have ended are dropped; a Newton step moves the others
+    back onto their camera rays and updates their directions. The last block takes the rest of a
+    ray.
     """
     graph, settings = context.graph, context.settings
     usual = settings.sample_span_m / context.samples.cast(np.float32)

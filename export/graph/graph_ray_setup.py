@@ -44,9 +44,7 @@ class DepthLayer:
         surfel: Surfel that each ray sees.
         canonical_position, camera_position: Its position in both frames, metres.
         color: Premultiplied.
-        transmittance: In [0, 1].
-        enter: Distance at which the ray enters the surface, metres.
-        end: Distance at which it ends, metres.
+        enter, end: Distances at which the ray enters the surface and ends, metres.
         doubtful: Whether the surfel is folded (its Jacobian is not inverted), compressed (in a
             close-up a metre along the ray crosses more than `MAX_TRUSTED_COMPRESSION` metres of
             canonical space) or seen from behind.
@@ -91,17 +89,11 @@ def trace_depth_layer(
     ray: VectorValue,
     front: DepthLayer | None,
 ) -> DepthLayer:
-    """Trace rays through one depth layer.
+    """Trace unit rays of the camera's frame through one depth layer.
 
     Skinning is linearized about the surfel that a ray sees: the inverse Jacobian carries the ray to
     where it enters the surface. Where the skin is folded or compressed, look along its normal.
-
-    Args:
-        context: Tables, settings and inputs.
-        surface: In its pose.
-        keys: Z-buffer key of each ray.
-        ray: Unit directions in the camera's frame.
-        front: The layer in front of the same rays; None for the first layer.
+    `front` is the layer in front of the same rays; None for the first layer.
     """
     graph, surfel = context.graph, keys.bitwise_and(SURFEL_MASK)
     cells = surface.surfels.cell
@@ -170,13 +162,8 @@ def _segment_bounds(
 ) -> tuple[GraphValue, GraphValue, GraphValue]:
     """Return the distances at which rays enter the tangent plane, begin and end.
 
-    Args:
-        context: Settings.
-        normal: Canonical normals of the surfels.
-        thickness: Their visible depths, metres.
-        direction: Canonical metres per metre along each ray.
-        beside: Canonical offset from each surfel to the closest point of its ray.
-        along: Distance of that point along the ray, metres.
+    In canonical space, `direction` is metres per metre along each ray, and `beside` the offset from
+    each surfel to the closest point of its ray, `along` metres along it.
     """
     graph, settings = context.graph, context.settings
     falling = dot(normal, direction)
@@ -240,14 +227,8 @@ def filter_specks(
     or shows it from behind (`DepthLayer`): there a ray sees the surfel's own color or a wrong place
     of the cloth. A speck is a pixel whose ray passed the first layer, which should have stopped it:
     it lies inside of the avatar and differs from what is about it. Both are smaller than a
-    footprint. The reference is `export.bake.reference_player.filter_specks`.
-
-    Args:
-        context: Settings.
-        splats: All surfels.
-        cell: The z-buffer's cell of each covered pixel.
-        first: First layer, of the same pixels.
-        channels: Premultiplied color and transmittance.
+    footprint. The reference is `export.bake.reference_player.filter_specks`. Covered pixels have a
+    z-buffer `cell` each, and `channels` premultiplied color and transmittance.
     """
     graph, window = context.graph, splats.window
     passed = first.transmittance > context.settings.layer_min_transmittance

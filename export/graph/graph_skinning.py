@@ -37,11 +37,8 @@ class GraphContext:
     """A graph being built, its tables and its inputs.
 
     Attributes:
-        graph: The graph.
         tables: Their sizes and scales become constants.
         table_values: Values of `export.player_inputs.graph_initializers`, by name.
-        settings: How the tables are drawn.
-        camera: Pose and camera.
         samples: Density samples along `RenderSettings.sample_span_m`, int64 scalar.
     """
 
@@ -141,11 +138,7 @@ def locate_skinning_cell(context: GraphContext, canonical: VectorValue) -> Skinn
 def skin_points(
     context: GraphContext, posed: VectorValue, place: SkinningCell
 ) -> tuple[VectorValue, MatrixValue]:
-    """Skin points, trilinear between the eight nodes about each.
-
-    Returns:
-        Positions in the camera's frame, and the Jacobian's rows in metres per step between nodes.
-    """
+    """Return trilinear positions in the camera's frame, and Jacobian rows, metres per node step."""
     rows = [row for lower in place.rows for row in (lower, lower + 1)]
     point, derivative = [], []
     for table in posed:
@@ -222,7 +215,6 @@ class PosedSurfels:
     """Surfels of the proxy surface: values of the graph, one entry a surfel.
 
     Attributes:
-        cell: Cells of the skinning grid, the same in all poses.
         rows: Rows of the four nodes of each surfel's tetrahedron, the same in all poses.
         normal: Normals per step along the edges of these, the same in all poses.
         camera_positions: Positions in the camera's frame, linear in tetrahedra.
@@ -275,11 +267,9 @@ def faces_camera(
 def _surfel_tetrahedra(
     context: GraphContext, place: SkinningCell
 ) -> tuple[list[GraphValue], list[GraphValue], VectorValue]:
-    """Find the tetrahedra about surfels, walked as in `BrickTetrahedra`.
+    """Return rows of the four nodes about surfels, their weights, and the normal along their edges.
 
-    Returns:
-        Rows of the four nodes, their weights in a surfel's position, and its normal along their
-        edges.
+    Tetrahedra are walked as in `BrickTetrahedra`.
     """
     graph, (x, y, z) = context.graph, place.fraction
     low, along_y, along_x, along_both = place.rows

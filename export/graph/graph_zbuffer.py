@@ -46,7 +46,6 @@ class SurfelSplats:
     """Surfels on their way into a z-buffer: values of the graph, one entry a surfel.
 
     Attributes:
-        window: Window of the buffer.
         footprint_px: Edge of every surfel's footprint, pixels, int64 scalar.
         cell: Upper left cell of the footprint in the buffer; `SplatWindow.cells` for none.
         key: Depth code and surfel number; the least one wins.
@@ -193,13 +192,7 @@ def _min_over_footprint(
 class HiddenSplats:
     """Surfels that may lie behind the first layer, on their way into further z-buffers.
 
-    One entry for each pixel of a footprint: values of the graph.
-
-    Attributes:
-        window: Window of the buffers.
-        cell: Cell of the buffer.
-        key: As in `SurfelSplats`.
-        depth: Metres along z.
+    One entry for each pixel of a footprint: values of the graph, as in `SurfelSplats`.
     """
 
     window: SplatWindow
@@ -225,12 +218,7 @@ def hidden_splats(
 ) -> HiddenSplats:
     """Select surfels that face the camera and are deeper than a limit on their footprint.
 
-    Args:
-        context: Tables, settings and inputs.
-        posed: Skinning nodes in the camera's frame.
-        surfels: All surfels.
-        splats: All surfels, projected.
-        limits: Limits of the second layer (`depth_limits`); those of later layers are deeper.
+    `limits` are the second layer's (`depth_limits`); those of later layers are deeper.
     """
     graph, window, side = context.graph, splats.window, splats.footprint_px
     lowest = _min_over_footprint(context, limits, splats) - sheet_slack_m(context)
@@ -267,13 +255,7 @@ def keys_behind_limits(
 ) -> GraphValue:
     """Return the least key deeper than the limits, for some cells of the buffer.
 
-    Args:
-        context: Tables, settings and inputs.
-        surfels: All surfels.
-        hidden: Candidates, from `hidden_splats`.
-        limits: From `depth_limits`.
-        cell: Cells of the buffer.
-        front_surfel: Surfel of the layer in front, for each of them.
+    `front_surfel` is the surfel of the layer in front, for each of these cells.
     """
     graph, window = context.graph, hidden.window
     limit = limits.gather(hidden.cell)

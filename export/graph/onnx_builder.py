@@ -27,10 +27,7 @@ ONNX_TYPES = {
 def _operator(kind: str, dtype: Any = None, **attributes: Any) -> Callable[..., "GraphValue"]:
     """Return a method that adds a node of ONNX's operator `kind` to a value and its operands.
 
-    Args:
-        kind: Name of the operator.
-        dtype: Element type of the result; None for that of the value.
-        attributes: Attributes of the node.
+    The result has the element type `dtype`; None for that of the value.
     """
 
     def add_node(self: "GraphValue", *others: "Operand") -> "GraphValue":
@@ -217,7 +214,7 @@ class GraphBuilder:
         return self.node("Range", limits[0], count, limits[1])
 
     def size(self, value: GraphValue) -> GraphValue:
-        """How many elements a value has, int64 scalar."""
+        """Number of elements of a value, int64 scalar."""
         return self.node("Size", value, dtype=np.int64)
 
     def concatenate(self, values: Sequence[GraphValue], axis: int = 0) -> GraphValue:
@@ -300,4 +297,4 @@ def _vector_info(value: GraphValue) -> onnx.ValueInfoProto:
 
 
 Operand = GraphValue | float | int | np.generic | np.ndarray
-"""What a value may be combined with: another one, or a number."""
+"""Another value, or a number, that a value is combined with."""

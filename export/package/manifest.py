@@ -1,4 +1,4 @@
-"""manifest.json: what a package holds, in which units, and how to check it."""
+"""manifest.json: the content of a package, its units, and how to check it."""
 
 import json
 from dataclasses import asdict, dataclass, fields
@@ -70,8 +70,6 @@ class Manifest:
         canonical_rotations: Axis-angles of joints 1 … 23 in the canonical pose, radians.
         tiers: Quality tiers by name; "hq" comes first and always exists.
         golden: Golden frames, drawn by "hq" with its own number of samples.
-        metrics: Training metrics, as JSON.
-        licence: Note on who may use the package.
         sha256: Checksums of every entry but the manifest, hexadecimal, by name.
     """
 
@@ -103,11 +101,7 @@ class Manifest:
 
     @classmethod
     def from_json(cls, text: bytes) -> "Manifest":
-        """Parse manifest.json.
-
-        Raises:
-            InputError: If it is not JSON, has another format, or lacks or misstates a value.
-        """
+        """Parse manifest.json; `InputError` if its format, a key or a value is not as expected."""
         content = _parse_json(text)
         try:
             return cls(

@@ -41,7 +41,6 @@ class AvatarPackage:
     """Content of a package, from which an avatar is drawn without torch.
 
     Attributes:
-        manifest: Skeleton, settings, checks.
         graphs: ONNX model of each tier; its tables are external.
         tables: Tables of each tier, the same object for all.
         golden: Pictures of `manifest.golden`, straight alpha.
@@ -71,26 +70,14 @@ def golden_entry(number: int) -> str:
 
 
 def write_package(package: AvatarPackage, path: Path) -> int:
-    """Write a package under a temporary name, flush it to the disk and rename it.
-
-    Returns:
-        Its size in bytes.
-    """
+    """Write a package under a temporary name, flush it to the disk, rename it; return its bytes."""
     with PackageWriter(path) as draft:
         draft.add_tables(package.tables["hq"])
         return draft.finish(package)
 
 
 def update_metrics(path: Path, metrics: Mapping[str, Any]) -> int:
-    """Write other training metrics into a package's manifest, which keeps the rest of them.
-
-    Args:
-        path: A package that this program has just written.
-        metrics: Metrics to add or to replace, by name (JSON).
-
-    Returns:
-        The new size in bytes.
-    """
+    """Add or replace metrics in a package that was just written; return its new size in bytes."""
     with zipfile.ZipFile(path) as old, PackageWriter(path) as draft:
         manifest = Manifest.from_json(old.read(MANIFEST_ENTRY))
         draft.copy_entries(old)
@@ -122,11 +109,7 @@ class PackageWriter:
             self._add(stream_entry(name), stream)
 
     def finish(self, package: AvatarPackage) -> int:
-        """Add graphs, golden frames, preview and manifest, and rename the package.
-
-        Returns:
-            Its size in bytes.
-        """
+        """Add graphs, golden frames, preview and manifest; rename it; return its size in bytes."""
         for tier, graph in package.graphs.items():
             self._add(graph_entry(tier), graph)
         self._add(PREVIEW_ENTRY, package.preview)
@@ -141,11 +124,7 @@ class PackageWriter:
                 self._add(name, archive.read(name))
 
     def close(self, manifest: Manifest) -> int:
-        """Add the manifest with the checksums of what was added, and rename the package.
-
-        Returns:
-            Its size in bytes.
-        """
+        """Add the manifest with checksums of all entries; rename it; return its size in bytes."""
         manifest = replace(manifest, sha256=dict(self._sums))
         self._add(MANIFEST_ENTRY, manifest.to_json().encode())
         self._archive.close()
@@ -169,11 +148,7 @@ class PackageWriter:
 
 
 def read_package(path: Path, *, tier: str | None = "hq") -> AvatarPackage:
-    """Read a package; check each entry's size before reading it and its checksum after.
-
-    Args:
-        path: The `.iavatar` file.
-        tier: Tier to read; None for all.
+    """Read one tier, or all if None; check entries' sizes before reading them and checksums after.
 
     Raises:
         InputError: If the file is missing, truncated, altered or not a package, or lacks the tier.
@@ -213,7 +188,6 @@ class _BoundedFile:
         self._file, self.max_read_bytes = file, max_read_bytes
 
     def read(self, size: int = -1) -> bytes:
-        """Read as a file does."""
         if self.max_read_bytes is not None and not 0 <= size <= self.max_read_bytes:
             content = self._file.read(self.max_read_bytes + 1)
             if len(content) > self.max_read_bytes:

@@ -203,11 +203,9 @@ class SurfelTable:
 class BrickTable:
     """Color and log-density on a voxel grid, stored only near the surface.
 
-    Grid node (i, j, k) lies at `low + voxel_m · (i, j, k)`.
+    Grid node (i, j, k) lies at `low + voxel_m · (i, j, k)`, canonical metres.
 
     Attributes:
-        low: Corner of the grid, canonical metres.
-        voxel_m: Distance between nodes.
         index: Number of the brick that covers each 8×8×8 block of nodes; 0 is the empty one.
         voxels: RGB and log-density codes of each brick's 9×9×9 nodes.
     """
@@ -222,11 +220,10 @@ class BrickTable:
 class SkinningGrid:
     """Skinning weights on the nodes of a grid, stored only about visible density.
 
-    Node (i, j, k) lies at `low + step_m · (i, j, k)`; between nodes weights are trilinear.
+    Node (i, j, k) lies at `low + step_m · (i, j, k)`, canonical metres; between nodes weights are
+    trilinear.
 
     Attributes:
-        low: Corner of the grid, canonical metres.
-        step_m: Distance between nodes along x, y, z.
         index: Column of the codes for each node, numbered in C order; 0 for none.
         weight_codes: Weights × `WEIGHT_SCALE`. Column 0 is the root alone.
     """
@@ -247,11 +244,8 @@ class PlayerTables:
     """Everything that a tier of the player draws.
 
     Attributes:
-        surfels: The proxy surface.
-        bricks: Color and density under it.
-        skinning: Weights that move both.
         pelvis: Rest pelvis in canonical space, metres: the middle of the z-buffer's depth range.
-        reach_m: Largest distance of a surfel from the pelvis in any pose, metres.
+        reach_m: Largest distance of a surfel from the pelvis in any pose.
     """
 
     surfels: SurfelTable

@@ -28,18 +28,13 @@ MAX_SKIN_NODES = 1 << 17
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TableLayout:
-    """Sizes and scales of the streams. Lengths in metres.
+    """Sizes and scales of the streams, as in the tables they are of. Lengths in metres.
 
     Attributes:
-        surfels: Number of surfels.
-        surfel_low, surfel_extent_m, surfel_spacing_m: As in `SurfelTable`.
         bricks: Number of bricks without the empty one.
         brick_counts: Blocks of the grid along x, y, z.
-        brick_low, voxel_m: As in `BrickTable`.
         skin_nodes: Number of stored nodes of the skinning grid.
         skin_counts: Nodes of that grid along x, y, z.
-        skin_low, skin_step_m: As in `SkinningGrid`.
-        pelvis, reach_m: As in `PlayerTables`.
     """
 
     surfels: int
@@ -212,12 +207,7 @@ def _decode_bricks(
 def add_border_voxels(
     index: Int32[np.ndarray, "bx by bz"], own_voxels: UInt8[np.ndarray, "bricks 8 8 8 4"]
 ) -> UInt8[np.ndarray, "bricks 9 9 9 4"]:
-    """Append to each brick's own voxels the first layers of its next neighbors.
-
-    Args:
-        index: Number of the brick that covers each block; 0 is the empty one.
-        own_voxels: Own voxels of each brick, the empty one first.
-    """
+    """Append to bricks' own voxels the first layers of their next neighbors; brick 0 is empty."""
     whole = np.zeros((len(own_voxels), BRICK_NODES, BRICK_NODES, BRICK_NODES, 4), dtype=np.uint8)
     padded = np.pad(index, [(0, 1)] * 3)
     place = np.argwhere(index > 0)
