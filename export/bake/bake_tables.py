@@ -213,7 +213,7 @@ def _surface_within_surfel_limit(grid: FieldGrid, config: BakeConfig) -> ProxySu
 
 
 def _max_reach_m(rig: Rig) -> float:
-    """Bound the reach in any pose, metres: the longest chain of bones, 0.35 m for what is beyond."""
+    """Bound poses' reach, metres: the longest chain of bones, 0.35 m for head, hands, clothes."""
     along = np.zeros(len(rig.parents))
     for joint, parent in enumerate(rig.parents):
         if parent >= 0:
