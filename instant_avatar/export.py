@@ -209,6 +209,7 @@ def synthetic_views(rig: "Rig") -> list[tuple[BodyPose, Camera]]:
     motion = demo_motion(frames=CHECK_VIEWS)
     low, high = rig.seeds.min(axis=0).astype(float), rig.seeds.max(axis=0).astype(float)
     distance = DISTANCE_HEIGHTS * (high[1] - low[1])
+    # person_px / focal = height / distance, of which the height cancels
     focal = PERSON_HEIGHT_SHARE * VIEW_PX * DISTANCE_HEIGHTS
     axes = np.diag([1.0, -1.0, -1.0])
     camera_from_world = np.eye(4)

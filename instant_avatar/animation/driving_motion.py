@@ -211,6 +211,7 @@ class FollowingCamera:
         )
         if not len(rows):  # nothing visible: keep the guess
             rows = np.array([0, MEASURING_PX - 1])
+        # the guess shows 2.2 m at `PERSON_HEIGHT_SHARE` of the image: meters per pixel
         metres = 2.2 / PERSON_HEIGHT_SHARE / MEASURING_PX
         return replace(
             guess,
@@ -228,10 +229,12 @@ class FollowingCamera:
         away = DISTANCE_HEIGHTS * self.height_m
         person_px = PERSON_HEIGHT_SHARE * min(height, MAX_HEIGHT_OVER_WIDTH * width)
         zoom = 1.0 if self.viewpoint.joint is None else CLOSE_UP_ZOOM
+        # similar triangles: person_px / focal = height_m / away
         focal = person_px * away / self.height_m * zoom
         axes = self.viewpoint.rotation_at(seconds) @ self.level_axes
         camera_from_world = np.eye(4)
         camera_from_world[:3, :3] = axes
+        # x_camera = R (x - target) + (0, 0, away)
         camera_from_world[:3, 3] = -axes @ self._look_at_point(pose)
         camera_from_world[2, 3] += away
         return Camera(

@@ -155,6 +155,7 @@ def _hexagonal_grid(size_cm: Float[np.ndarray, "2"]) -> Float[np.ndarray, "grid 
     """Return the points of a hexagonal grid that covers a rectangle from its top left."""
     x, y = np.meshgrid(
         np.arange(-DOT_SPACING_CM, size_cm[0] + DOT_SPACING_CM, DOT_SPACING_CM),
+        # rows of equilateral triangles: sqrt(3) / 2 apart, every second one shifted by a half
         np.arange(-DOT_SPACING_CM, size_cm[1] + DOT_SPACING_CM, 0.866 * DOT_SPACING_CM),
     )
     x[1::2] += 0.5 * DOT_SPACING_CM

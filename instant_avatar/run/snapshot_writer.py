@@ -89,6 +89,7 @@ class CheckpointWriter:
     def _take_result(self) -> None:
         assert self._pending is not None
         done, self._pending = self._pending, None
+        # cost / interval = share
         self._cpu_interval_s = (self._copy_cost_s + done.result()) / CHECKPOINT_COST_SHARE
 
     def _write(self, state: dict[str, Any]) -> float:

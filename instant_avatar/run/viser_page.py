@@ -91,6 +91,7 @@ def _row_at(motion: Motion, seconds: float) -> int:
     times = motion.times_s
     if times is None or len(times) < 2 or not np.isfinite(times).all() or times[-1] <= times[0]:
         return int(seconds * DEFAULT_FPS) % len(motion)
+    # n poses span n - 1 intervals; the loop lasts n, so that the last pose is shown, too
     length = (times[-1] - times[0]) * len(times) / (len(times) - 1)
     return int(np.searchsorted(times - times[0], seconds % length, side="right")) - 1
 
