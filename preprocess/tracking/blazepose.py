@@ -1,12 +1,11 @@
 """BlazePose in use: one person followed through a video, and masks where poses are given.
 
-The detector finds persons in a frame. From then on the square for the next frame comes from the
-key points of this one, and the detector is needed only when the person is lost. Where the places of
-two persons do not tell them apart, the colors of their clothes do.
+The detector finds persons in a frame. From then on the square for the next frame comes from the key
+points of this one, and the detector is needed only when the person is lost. Where the places of two
+persons do not tell them apart, the colors of their clothes do.
 
-Given poses say which person it is, and where the network has to look. What is
-far from the posed body is background, whatever the network says; the rest is as for tracked masks
-(`MaskRefiner`).
+Given poses say which person it is, and where to look: all that is far from the posed body is
+background. The rest is as for tracked masks (`MaskRefiner`).
 """
 
 from dataclasses import dataclass, replace
@@ -38,18 +37,18 @@ SHOULDERS, HIPS, KNEES = (11, 12), (23, 24), (25, 26)
 """Numbers of key points, left and right."""
 ACROSS = np.linspace(0.2, 0.8, 8)
 ALONG = np.linspace(0.1, 0.9, 12)
-"""Where colors are taken: shares of the way from left to right, and downwards."""
+"""Places where colors are taken: shares of the way from left to right, and downwards."""
 QUANTILES = (0.15, 0.5, 0.85)
 """Quantiles of the colors that are compared: stripes differ from one color of the same mean."""
 LEARNING_RATE = 0.15
-"""Share of a new picture in what is remembered."""
+"""Share of a new image in what is remembered."""
 HIP_JOINTS, NECK_JOINT = (1, 2), 12
 """SMPL's hips and neck."""
 MAX_CLOTHING_M = 0.2
 """Distance from the posed body beyond which all is background, metres: hair, wide clothes and
 errors of poses are within."""
 BODY_REACH_PX = 2.0
-"""Distance from a point of the skin within which a pixel of the network's picture is body."""
+"""Distance from a point of the skin within which a pixel of the network's image is body."""
 MIN_BODY_IOU = 0.4
 """Least IoU of mask and posed body; masks below it are rejected."""
 
@@ -64,15 +63,15 @@ class PersonLooks:
 
     @property
     def is_known(self) -> bool:
-        """Whether there is anything to compare with."""
+        """True if there is anything to compare with."""
         return self._pictures > 0
 
     def distance(self, colors: Float[np.ndarray, "numbers"]) -> float:
-        """How unlike the person's the colors are: the mean difference, in units of CIELAB."""
+        """Mean difference between colors and the person's, in units of CIELAB."""
         return float(np.abs(colors - self._colors).mean())
 
     def learn(self, colors: Float[np.ndarray, "numbers"]) -> None:
-        """Remember the colors of a picture that shows the person."""
+        """Remember the colors of an image that shows the person."""
         self._pictures += 1
         self._colors += max(LEARNING_RATE, 1 / self._pictures) * (colors - self._colors)
 
@@ -101,9 +100,9 @@ MIN_PRESENCE = 0.5
 MAX_STEP = 0.2
 """Farthest that a person moves in one frame, in sides of the square; farther is someone else."""
 MAX_GROWTH = 1.4
-"""Most that a person grows or shrinks in the picture in one frame."""
+"""Most that a person grows or shrinks in the image in one frame."""
 MAX_STEP_AFTER_LOSS = 0.1
-"""How much farther than `MAX_STEP` a lost person may be, for each frame since."""
+"""Distance beyond `MAX_STEP` that a lost person may have moved, for each frame since."""
 SEARCH_SIDE = 1.5
 """Side of the area around the last place that is searched, in sides of the person's square."""
 WATCH_INTERVAL = 5
@@ -123,18 +122,13 @@ CROWD_MEMORY = 20
 
 @dataclass(frozen=True, kw_only=True)
 class LastPlace:
-    """Where the person was when it was seen last.
-
-    Attributes:
-        square: The person's square.
-        frames_ago: Frames since then.
-    """
+    """The person's square when it was seen last, and the number of frames since then."""
 
     square: PersonSquare
     frames_ago: int = 1
 
     def strangeness(self, square: PersonSquare) -> float:
-        """How unlikely it is that a square shows the same person; above 1 it does not."""
+        """Improbability that a square shows the same person; above 1 it does not."""
         reach = MAX_STEP + MAX_STEP_AFTER_LOSS * (self.frames_ago - 1)
         step = distance_in_sides(self.square, square)
         growth = abs(np.log(square.side / self.square.side)) / np.log(MAX_GROWTH)
@@ -147,9 +141,8 @@ class BlazePoseTracker:
     def __init__(self, person: int | None = None) -> None:
         """Loads the networks.
 
-        Args:
-            person: Whom to follow, counted from left to right from 1, in the first frame with
-                that many persons; the largest one if it is not given.
+        `person` is counted from left to right from 1, in the first frame with that many persons;
+        None follows the largest one.
 
         Raises:
             InputError: If that number is below 1.
@@ -185,7 +178,7 @@ class BlazePoseTracker:
         return None if found is None or self._is_a_thing(rgb, found) else found
 
     def _is_a_thing(self, rgb: UInt8[np.ndarray, "height width 3"], found: FoundLandmarks) -> bool:
-        """Whether what was found has strange colors, and is no person to the detector."""
+        """True if the colors are strange, and the detector finds no person there."""
         distance = self._looks.distance(colors_of(rgb, found.keypoints))
         return distance > MAX_UNSEEN_COLOR_DISTANCE and not any(
             distance_in_sides(found.square, each.square) < NEAR for each in self._detect(rgb)
@@ -194,7 +187,7 @@ class BlazePoseTracker:
     def _accept(
         self, rgb: UInt8[np.ndarray, "height width 3"], found: FoundLandmarks
     ) -> FoundLandmarks | None:
-        """What was found, if it is a person, and the same one as before."""
+        """The landmarks, if they are of a person, and of the same one as before."""
         if found.keypoints.presence < MIN_PRESENCE:
             return None
         if self._last is None:
@@ -271,7 +264,7 @@ class BlazePoseTracker:
         person: PersonSquare,
         other: PersonSquare,
     ) -> bool:
-        """Whether a detection near the person is the person; another one's looks are remembered.
+        """Check whether a detection near the person is the person; remember another one's looks.
 
         The detector's squares around small persons lie beside them; their key points do not.
         """
@@ -286,7 +279,7 @@ class BlazePoseTracker:
         return False
 
     def _looks_right(self, colors: Float[np.ndarray, "numbers"]) -> bool:
-        """Whether colors are rather the person's than those of another one."""
+        """True if colors are rather the person's than those of another one."""
         distance = self._looks.distance(colors)
         if self._company.is_known:
             return distance < self._company.distance(colors)
@@ -302,10 +295,7 @@ def distance_in_sides(a: PersonSquare, b: PersonSquare) -> float:
 class BlazePoseSegmenter:
     """Segments one person, frame by frame.
 
-    Attributes:
-        name: Its name in the report.
-        mask_count: Number of masks made.
-        agreement: Mean IoU of these masks with the posed body; 0 of none.
+    `agreement` is the mean IoU of the `mask_count` masks made with the posed body; 0 of none.
     """
 
     name = "BlazePose"
@@ -348,12 +338,7 @@ class BlazePoseSegmenter:
 def _square_around(
     pixels: Float[np.ndarray, "points 2"], joints: Float[np.ndarray, "24 2"]
 ) -> PersonSquare:
-    """The square in which BlazePose expects a posed body.
-
-    Args:
-        pixels: The skin in the frame.
-        joints: The joints there.
-    """
+    """The square in which BlazePose expects a posed body, by its skin and joints in the frame."""
     hips = joints[list(HIP_JOINTS)].mean(axis=0)
     up = joints[NECK_JOINT] - hips
     radius = np.linalg.norm(pixels - hips, axis=1).max()
@@ -363,16 +348,7 @@ def _square_around(
 def _limit_to_body(
     mask: CroppedMask, pixels: Float[np.ndarray, "points 2"], px_per_m: float
 ) -> tuple[CroppedMask, float]:
-    """Clear a mask far from the posed body.
-
-    Args:
-        mask: The network's.
-        pixels: The skin in the frame.
-        px_per_m: Pixels of the frame per metre at the body.
-
-    Returns:
-        The mask, and its IoU with the body.
-    """
+    """Clear a mask far from the skin's pixels; also its IoU with the posed body."""
     turn, offset = mask.image_from_crop[:, :2], mask.image_from_crop[:, 2]
     at = ((pixels - offset) @ np.linalg.inv(turn).T).astype(int)
     height, width = mask.values.shape

@@ -1,10 +1,10 @@
 """BlazePose's networks: one finds the persons in a frame, one a person's key points and mask.
 
-Both (Bazarevsky et al. 2020, arXiv:2006.10204) take a square around a person, turned so that the
-person stands upright in it. Where a person is, is described by a circle: its middle is that of the
-hips, and it encloses the whole body. The square stands around that circle, a quarter wider. The
-detector is a single-shot one (Liu et al. 2016): for each of 2,254 anchors, evenly spread over the
-picture, it says how sure it is of a person there, and where that person's middle and size are.
+Both (Bazarevsky et al. 2020, arXiv:2006.10204) describe where a person is by a circle that has its
+middle between the hips and encloses the whole body. Key points are found in a square around that
+circle, a quarter wider, turned so that the person stands upright in it. The detector is a
+single-shot one (Liu et al. 2016): for each of 2,254 anchors, evenly spread over the image, it gives
+the probability of a person, and that person's middle and size.
 """
 
 from dataclasses import dataclass, replace
@@ -31,7 +31,7 @@ SAME_PERSON_DISTANCE = 0.12
 """Two detections whose middles are nearer than this share of their squares' side are one person."""
 SMALL_PERSON = 0.6
 """A person whose square is smaller than this share of the searched one is searched again, larger:
-the network was made for persons who fill the picture."""
+the network was made for persons who fill the image."""
 HEATMAP_REACH = 3
 """Cells of a heat map on each side of a key point that make it more exact."""
 MIN_HEAT = 0.5
@@ -39,14 +39,10 @@ MIN_HEAT = 0.5
 
 
 class OnnxNetwork:
-    """A network that takes one picture.
-
-    Attributes:
-        picture_size: Width and height of the picture, pixels.
-    """
+    """A network that takes one square image, `picture_size` pixels wide and high."""
 
     def __init__(self, path: Path) -> None:
-        """Loads the network; it computes on one thread, which costs least per picture."""
+        """Loads the network; it computes on one thread, which costs least per image."""
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1
         options.inter_op_num_threads = 1
@@ -62,11 +58,7 @@ class OnnxNetwork:
     def run(
         self, picture: UInt8[np.ndarray, "size size 3"], low: float, high: float
     ) -> dict[str, Float32[np.ndarray, "..."]]:
-        """Run the network on one picture, whose values are spread from `low` to `high`.
-
-        Returns:
-            The outputs by their names, without the dimension of pictures.
-        """
+        """Run the network on an image scaled to [`low`, `high`]; its outputs by their names."""
         values = picture.astype(np.float32)
         values *= np.float32((high - low) / 255)
         if low:
@@ -84,12 +76,10 @@ def sigmoid(values: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
 
 @dataclass(frozen=True, kw_only=True)
 class PersonSquare:
-    """A turned square in a frame; the first pixel's middle is at (0.5, 0.5).
+    """A turned square in a frame: its middle (`x`, `y`) and `side` in pixels, and its `angle`.
 
-    Attributes:
-        x, y: Its middle, pixels.
-        side: Length of its sides, pixels.
-        angle: Turn from upright, radians, clockwise as seen in the picture.
+    The first pixel's middle is at (0.5, 0.5). The angle is the turn from upright, radians,
+    clockwise as seen in the image.
     """
 
     x: float
@@ -101,12 +91,7 @@ class PersonSquare:
     def around(
         cls, hips: Float[np.ndarray, "2"], above_head: Float[np.ndarray, "2"]
     ) -> "PersonSquare":
-        """The square of a person.
-
-        Args:
-            hips: Middle of the hips, pixels.
-            above_head: The point of the circle around the person that lies above the head.
-        """
+        """The square of a person, by the middle of the hips and the point above the head."""
         x, y = (above_head - hips).tolist()
         return cls(
             x=float(hips[0]),
@@ -159,12 +144,9 @@ class PersonSquare:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PersonDetection:
-    """One person that the detector found.
+    """A person that the detector found: its square, and the probability (`score`) that it is one.
 
-    Attributes:
-        square: Where the whole person is.
-        box: Left, upper, right and lower border of the head and shoulders, pixels.
-        score: Probability that it is a person.
+    `box` is the left, upper, right and lower border of head and shoulders, pixels.
     """
 
     square: PersonSquare
@@ -183,12 +165,7 @@ class BlazePoseDetector:
     def __call__(
         self, rgb: UInt8[np.ndarray, "height width 3"], area: PersonSquare | None = None
     ) -> list[PersonDetection]:
-        """Find the persons, the most certain first.
-
-        Args:
-            rgb: The frame.
-            area: Upright square in which to look; the whole frame if it is not given.
-        """
+        """Find the persons in an upright area (None: the whole frame), the most certain first."""
         area = area or PersonSquare.of_frame(rgb)
         size = self._network.picture_size
         output = self._network.run(area.crop(rgb, size), -1.0, 1.0)
@@ -219,10 +196,8 @@ class BlazePoseDetector:
     ) -> list[PersonDetection]:
         """Find the persons in a frame, small ones as well.
 
-        Args:
-            rgb: The frame.
-            in_parts: Whether to look into each part of the frame even if a person was found: of
-                two the network often sees only one.
+        With `in_parts`, each part of the frame is searched even if a person was found: of two the
+        network often sees only one.
         """
         whole = PersonSquare.of_frame(rgb)
         found = self(rgb, whole)
@@ -261,7 +236,7 @@ def parts_of_frame(rgb: UInt8[np.ndarray, "height width 3"]) -> list[PersonSquar
 
 
 def anchors(picture_size: int) -> Float[np.ndarray, "anchors 2"]:
-    """Places of the anchors, as shares of the picture's width and height."""
+    """Places of the anchors, as shares of the image's width and height."""
     grids = []
     for distance, count in ANCHOR_GRIDS:
         cells = picture_size // distance
@@ -271,7 +246,7 @@ def anchors(picture_size: int) -> Float[np.ndarray, "anchors 2"]:
 
 
 def is_same_person(a: PersonDetection, b: PersonDetection) -> bool:
-    """Whether two detections are of one person."""
+    """Check whether two detections are of one person: they are near, or their boxes overlap."""
     apart = np.hypot(a.square.x - b.square.x, a.square.y - b.square.y)
     if apart < SAME_PERSON_DISTANCE * min(a.square.side, b.square.side):
         return True
@@ -288,12 +263,7 @@ def overlap(a: Float[np.ndarray, "4"], b: Float[np.ndarray, "4"]) -> float:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FoundLandmarks:
-    """What the landmark network finds in one square.
-
-    Attributes:
-        keypoints: The person.
-        square: Where the person is, as the key points say: the square for the next frame.
-    """
+    """The person found in a square, and the square that its key points give for the next frame."""
 
     keypoints: PersonKeypoints
     square: PersonSquare
@@ -312,7 +282,7 @@ class BlazePoseLandmarks:
         """Find the person in a square of a frame."""
         size = self._network.picture_size
         output = self._network.run(square.crop(rgb, size), 0.0, 1.0)
-        # Of each point x, y, depth, and logits of being visible and of being in the picture. After
+        # Of each point x, y, depth, and logits of being visible and of being in the image. After
         # the 33 key points come the two that give the next square.
         points = output["landmarks"].reshape(-1, 5).astype(np.float64)
         crop_px = refine(points[:, :2], output["heatmaps"], size)
@@ -337,13 +307,7 @@ def refine(
     heatmaps: Float32[np.ndarray, "points rows columns"],
     size: int,
 ) -> Float[np.ndarray, "points 2"]:
-    """Move points to the centroid of their heat maps nearby.
-
-    Args:
-        crop_px: Points in the crop, pixels.
-        heatmaps: Logits of where each point is.
-        size: Width and height of the crop, pixels.
-    """
+    """Move points, pixels of the crop, to the centroid of their heat maps (logits) nearby."""
     cells = heatmaps.shape[1]
     cell_px = size / cells
     refined = crop_px.copy()

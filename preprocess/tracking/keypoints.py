@@ -28,12 +28,10 @@ OPTIONAL_KEYS = ("keypoint_times", "keypoint_problems")
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CroppedMask:
-    """How far each pixel of a small square around the person is person.
+    """The mask of a small square around the person: 255 is certainly person, 0 certainly not.
 
-    Attributes:
-        values: 255 where a pixel is certainly person, 0 where it certainly is not.
-        image_from_crop: Affine map from pixels of the square to pixels of the frame; in both, the
-            first pixel's middle is at (0.5, 0.5).
+    `image_from_crop` is the affine map from its pixels to those of the frame; in both, the first
+    pixel's middle is at (0.5, 0.5).
     """
 
     values: UInt8[np.ndarray, "rows columns"]
@@ -42,12 +40,7 @@ class CroppedMask:
     def resample(
         self, frame_px: tuple[int, int], size_px: tuple[int, int]
     ) -> Float32[np.ndarray, "height width"]:
-        """The mask of a whole frame, in [0, 1]; 0 outside the square.
-
-        Args:
-            frame_px: Width and height of the frame.
-            size_px: Width and height of the mask to make.
-        """
+        """The mask of a whole frame, in [0, 1], at `size_px` (width, height); 0 off the square."""
         import cv2  # heavy, and players, which read poses, do without
 
         scale = np.array(size_px) / np.array(frame_px)
@@ -60,7 +53,7 @@ class CroppedMask:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PersonKeypoints:
-    """What a tracker finds of one person in one frame.
+    """The key points and the mask of one person in one frame.
 
     Attributes:
         image_px: Key points in the frame, pixels; the first pixel's middle is at (0.5, 0.5). Some
@@ -69,7 +62,6 @@ class PersonKeypoints:
             middle of the hips. Their size and their depth are guesses.
         visibility: Probability that a key point is in the frame and not hidden.
         presence: Probability that a person is there at all.
-        mask: How far each pixel is person.
         crowded: Whether another person is so near that the two may be mixed up.
     """
 
@@ -85,12 +77,12 @@ class PersonKeypoints:
 class KeypointTrack:
     """Key points of one person over time, one row a frame in which the person was found.
 
+    The arrays of key points are as in `PersonKeypoints`.
+
     Attributes:
         frames: Number of each row's frame, counted from 0.
-        image_px, world_m, visibility, presence: As in `PersonKeypoints`.
-        size_px: Width and height of the frames.
         times_s: Time of each row's frame, seconds, if known.
-        problems: What makes each row doubtful, as the sum of `PROBLEM_BITS`, if known.
+        problems: Problems of each row, as the sum of `PROBLEM_BITS`, if known.
     """
 
     frames: Int[np.ndarray, "rows"]
@@ -148,7 +140,7 @@ class KeypointTrack:
     def from_arrays(
         cls, arrays: dict[str, Shaped[np.ndarray, "..."]], path: Path
     ) -> "KeypointTrack | None":
-        """What `as_arrays` returned; None if a file's arrays do not hold it.
+        """Restore what `as_arrays` returned; None if a file's arrays do not hold it.
 
         Raises:
             InputError: If they hold something else under its keys; `path` is for the message.

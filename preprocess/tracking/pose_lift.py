@@ -2,7 +2,7 @@
 
 The root follows from the trunk's four key points, limbs from the directions between theirs. How far
 an upper arm or a thigh twists about itself follows from where the elbow or the knee bends to. The
-distance is the one at which the body covers its key points in the picture.
+distance is the one at which the body covers its key points in the image.
 
 Short stretches in which a tracker took the person's left for the right are repaired first: only
 frames close in time are compared, and only a stretch that both its neighbors contradict is changed.
@@ -47,17 +47,13 @@ joint bends about at rest."""
 STRAIGHT = 0.35
 """Sine of a limb's bend at which its key points and its rest pose tell its twist alike."""
 PLACED_JOINTS = (1, 2, 4, 5, 7, 8, 16, 17, 18, 19, 20, 21)
-"""Joints that are placed at their key points in the picture."""
+"""Joints that are placed at their key points in the image."""
 PLACED_POINTS = (23, 24, 25, 26, 27, 28, 11, 12, 13, 14, 15, 16)
 """Their key points."""
 
 
 def repair_swaps(track: KeypointTrack) -> tuple[KeypointTrack, Bool[np.ndarray, "rows"]]:
-    """Exchange left and right where a short stretch contradicts the frames on both its sides.
-
-    Returns:
-        The track, and the rows that were changed.
-    """
+    """Exchange left and right in short stretches that both sides contradict; and those rows."""
     swapped = find_swaps(track)
     mirrored = np.arange(33)
     mirrored[list(LEFT_POINTS)], mirrored[list(RIGHT_POINTS)] = RIGHT_POINTS, LEFT_POINTS
@@ -97,16 +93,10 @@ def _cosines(rows: Float[np.ndarray, "rows n"]) -> Float[np.ndarray, "gaps"]:
 
 
 def lift_keypoints(track: KeypointTrack, shaped: ShapedBody, camera: Camera) -> Motion:
-    """Poses of the body's mean shape, a first guess; short gaps are bridged.
+    """First guess of the poses of the body's mean shape; short gaps are bridged.
 
-    Args:
-        track: Key points of one person.
-        shaped: The body, of its model's mean shape.
-        camera: The camera of all frames, of the frames' size, at the world's origin.
-
-    Returns:
-        One row for each frame with a person, and for the frames of short gaps between them; with
-        the key points, and the camera's K.
+    The camera is that of all frames, of their size, at the world's origin. The motion has a row for
+    each frame with a person or in a short gap, and holds the key points and the camera's K.
     """
     track, _ = repair_swaps(track)
     poses = [
@@ -133,7 +123,6 @@ def _lift(
     shaped: ShapedBody,
     camera: Camera,
 ) -> BodyPose:
-    """The pose of one frame."""
     rest, local = shaped.joints, np.tile(np.eye(3), (24, 1, 1))
     local[0] = _trunk_turn(rest[list(TRUNK_JOINTS)], world_m[list(TRUNK_POINTS)])
     for upper, middle, lower, *points, hinge in LIMBS:
@@ -170,11 +159,9 @@ def _limb_turn(
 ) -> Float[np.ndarray, "3 3"]:
     """World rotation of a limb's first bone, so that its hinge bends it where it is bent to.
 
-    Args:
-        rest: First bone at rest.
-        hinge: Axis of the hinge at its end, at rest.
-        parent: World rotation of what it hangs on.
-        first, second: The limb's bones as they were found.
+    `rest` and `hinge` are the bone and the axis of the hinge at its end, at rest; `parent` is the
+    world rotation of what it hangs on; `first` and `second` are the limb's bones as they were
+    found.
     """
     along, further = _unit(first), _unit(second)
     unbent = parent @ _swing(rest, parent.T @ first)

@@ -45,9 +45,9 @@ DIRECTIONS = 12
 """Directions, 30 degrees each, from which the camera may see the person."""
 BREADTHS = (0.78, 1.17)
 """Least and largest breadth of shoulders and hips to the height, relative to the mean body's: in 40
-films 0.82 to 1.10, in films stretched by a third 1.3."""
+videos 0.82 to 1.10, in videos stretched by a third 1.3."""
 JUMP_HEIGHTS = 0.1
-"""Way of the hips from one frame to the next that may be a cut of the film, body heights."""
+"""Way of the hips from one frame to the next that may be a cut of the video, body heights."""
 JUMP_STEPS = 8.0
 """The same, in medians of that way."""
 JUMPED = "the person jumps to another place; was the film cut here?"
@@ -62,13 +62,7 @@ ENDS = {"left wrist": 15, "right wrist": 16, "left ankle": 27, "right ankle": 28
 
 @dataclass(frozen=True, kw_only=True)
 class DoubtfulStretch:
-    """Frames in a row whose poses are doubtful.
-
-    Attributes:
-        start_s, end_s: From the first frame to the last, seconds.
-        frames: Number of frames.
-        reason: Why, in a few words.
-    """
+    """Frames in a row, from `start_s` to `end_s`, whose poses are doubtful for one reason."""
 
     start_s: float
     end_s: float
@@ -85,9 +79,7 @@ class TrackingGrade:
     """Grades of tracked poses.
 
     Attributes:
-        frames: Number of frames that were looked at.
-        found_share: Share of them in which the person was found.
-        doubtful_share: Share of them that are doubtful for another reason than a limb that is
+        doubtful_share: Share of frames that are doubtful for another reason than a limb that is
             hidden or fast; those without the person included.
         iou_mean, iou_worst: IoU of posed body and mask; NaN where no mask could be compared.
         jitter_mm: Median second difference of joints relative to the root, mm per frame squared.
@@ -95,8 +87,7 @@ class TrackingGrade:
         directions_seen: Share of the horizontal directions from which the person was seen.
         breadth: Breadth of shoulders and hips to the height, relative to the mean body's.
         left_out: Numbers of the frames that had better not be learnt from.
-        stretches: Doubtful stretches, in order.
-        doubts: Why frames are doubtful, by their numbers.
+        doubts: Reasons why frames are doubtful, by their numbers.
     """
 
     frames: int
@@ -114,7 +105,7 @@ class TrackingGrade:
 
     @property
     def objections(self) -> tuple[str, ...]:
-        """Why the poses are not good enough for an avatar; empty if they are."""
+        """Reasons why the poses are not good enough for an avatar; empty if they are."""
         found = []
         if self.found_share < MIN_FOUND_SHARE:
             found.append(f"the person was found in only {self.found_share:.0%} of the frames")
@@ -141,7 +132,7 @@ class TrackingGrade:
 
     @property
     def is_good_enough(self) -> bool:
-        """Whether the poses are good enough for an avatar."""
+        """True if the poses are good enough for an avatar."""
         return not self.objections
 
     def describe(self) -> str:
@@ -194,14 +185,11 @@ def grade_tracking(
     frame_times_s: Mapping[int, float],
     iou_of_frame: Mapping[int, float],
 ) -> TrackingGrade:
-    """Grade tracked poses.
+    """Grade poses that were made of key points.
 
     Args:
-        motion: Poses, with the numbers of their frames.
-        keypoints: What they were made of.
-        shaped: The person.
-        camera: Camera of the poses.
-        frame_times_s: Time of each frame that was looked at, by its number.
+        frame_times_s: Time of each frame that was looked at, with a person or without, by its
+            number.
         iou_of_frame: IoU of posed body and mask of some frames, by their numbers.
     """
     numbers = np.array(sorted(frame_times_s))
@@ -234,7 +222,7 @@ def _reasons_by_frame(
     frame_times_s: Mapping[int, float],
     iou_of_frame: Mapping[int, float],
 ) -> dict[int, list[str]]:
-    """Why frames are doubtful, by their numbers."""
+    """Reasons why frames are doubtful, by their numbers."""
     reasons: dict[int, list[str]] = {}
 
     def note(rows: Bool[np.ndarray, "rows"], reason: str) -> None:
@@ -308,7 +296,7 @@ def _speed(
 
 
 def _jitter_mm(motion: Motion, shaped: ShapedBody) -> float:
-    """Median second difference of joints relative to the root, of three frames in a row."""
+    """Median second difference of joints relative to the root, of three frames in a row, mm."""
     joints = np.stack(
         [shaped.with_pose(motion[row]).joints() for row in range(len(motion))]
         or [np.zeros((24, 3))]

@@ -1,7 +1,7 @@
-"""Tracks the person of a recording: key points in memory, masks as pictures in a folder.
+"""Tracks the person of a recording: key points in memory, masks as images in a folder.
 
 Networks run on one thread; masks are refined and written on another, so two cores are busy. Frames
-in which borders of the picture or other persons make the track doubtful are marked.
+in which borders of the image or other persons make the track doubtful are marked.
 """
 
 import threading
@@ -67,12 +67,7 @@ class ProblemFinder:
     def problems(
         self, found: PersonKeypoints | None, size_px: tuple[int, int]
     ) -> frozenset[TrackingProblem]:
-        """The problems of the next frame.
-
-        Args:
-            found: The person in it; None if there was none.
-            size_px: Width and height of the frame.
-        """
+        """Find the problems of the next frame; a frame without the person has none."""
         if found is None:
             self._is_absent = True
             return frozenset()
@@ -120,7 +115,7 @@ def touched_borders(found: PersonKeypoints, size_px: tuple[int, int]) -> set[Tra
 
 
 def has_moved(before: PersonKeypoints, after: PersonKeypoints) -> bool:
-    """Whether two squares around a person are far from each other."""
+    """Check whether the squares around a person in two frames are far from each other."""
     middles = []
     for found in (before, after):
         rows, columns = found.mask.values.shape
@@ -145,12 +140,9 @@ class MaskRefinement(Protocol):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TrackedVideo:
-    """What tracking found in a recording.
+    """Key points of a recording, and the times of all frames that were looked at, by their numbers.
 
-    Attributes:
-        keypoints: Key points of the frames in which the person was found.
-        frame_times_s: Time of each frame that was looked at, by its number, seconds.
-        interrupted: Whether tracking was stopped before the last frame.
+    `interrupted` tells that tracking was stopped before the last frame.
     """
 
     keypoints: KeypointTrack
@@ -171,18 +163,14 @@ def track_video(
     """Find the person in each wanted frame of a recording.
 
     Args:
-        source: The recording.
-        tracker: Follows the person.
-        refine: Makes masks of the frames' size from the tracker's.
-        mask_folder: Existing folder; a mask is written for every frame, an empty one where the
-            person was not found. None writes none.
+        mask_folder: Existing folder for a mask of every frame, an empty one where the person was
+            not found; None writes none.
         advance: Called with the number of frames done.
         stop: Ends tracking early once it is set; what was found until then is returned.
-        before: What was found in the frames before those of `source`; it is returned with the rest.
+        before: Result for the frames before those of `source`; it is returned with the rest.
 
     Raises:
         InputError: If the person is found in too few frames.
-        OSError: If a mask cannot be written.
     """
     frames, problems = list[int](), list[int]()
     found: list[PersonKeypoints] = []
