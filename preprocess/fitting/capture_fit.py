@@ -1,4 +1,4 @@
-"""What the alignment of a capture changes: it is saved with a run, and described for people."""
+"""The changes that the alignment of a capture makes: saved with a run, and described for people."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -39,11 +39,10 @@ def correct_pose(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CaptureFit:
-    """What the alignment of a capture changes.
+    """The changes that the alignment of a capture makes.
 
     Attributes:
         coefficients: Proportions, in prior standard deviations.
-        focal_factor: Factor of the focal lengths.
         corrections: Correction of each row of the motion: root and joint rotations, root position.
         error_before_cm: Root mean square distance between outlines of body and masks, cm; of poses
             that were made of key points: after a fit to these alone.
@@ -95,7 +94,7 @@ class CaptureFit:
         )
 
     def advice(self) -> str | None:
-        """Say that the given poses were far from the film; None if they were not."""
+        """Say that the given poses were far from the video; None if they were not."""
         turn_deg = self._mean_turns_deg()[1:].mean()
         if turn_deg <= MAX_USUAL_TURN_DEG:
             return None
@@ -121,12 +120,7 @@ class CaptureFit:
         }
 
     def save(self, path: Path, video: str) -> None:
-        """Write the changes, for a run that is resumed.
-
-        Args:
-            path: File, .npz.
-            video: What identifies the capture's video.
-        """
+        """Write the changes, for a run that is resumed; `video` identifies the capture's video."""
         with atomic_file(path) as unfinished:
             np.savez(unfinished, **vars(self), video=video)
 

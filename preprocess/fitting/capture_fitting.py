@@ -72,13 +72,8 @@ MIN_FRAMES = 4
 def apply_fit(capture: Capture, fit: CaptureFit, *, height_m: float | None = None) -> Capture:
     """The capture with the changes of a fit, and a note about them.
 
-    A static camera shows only the ratio of size and distance: the person keeps its size. The
-    person of a finished avatar does not change at all.
-
-    Args:
-        capture: The capture that was fitted.
-        fit: Its fit.
-        height_m: The person's stated height, which stays; metres.
+    A static camera shows only the ratio of size and distance: the person keeps its size. A stated
+    height stays, and the person of a finished avatar does not change at all.
     """
     if not fit.share:
         return replace(capture, fit=fit)
@@ -98,7 +93,7 @@ def apply_fit(capture: Capture, fit: CaptureFit, *, height_m: float | None = Non
 
 
 def _size_ratio(one: ShapedBody, other: ShapedBody) -> float:
-    """How many times as large one person is as another, by least squares over their joints."""
+    """Size of one person relative to another, by least squares over their joints."""
     a, b = one.joints - one.joints[0], other.joints - other.joints[0]
     return float((a * b).sum() / (b * b).sum())
 
@@ -106,14 +101,11 @@ def _size_ratio(one: ShapedBody, other: ShapedBody) -> float:
 def fit_capture(capture: Capture, *, fit_body: bool = True) -> CaptureFit | None:
     """Fit a capture to the masks of a few frames, and to its key points if its poses have some.
 
-    Args:
-        capture: A recording with masks. If its motion holds key points, its poses are a first
-            guess made of these alone, and are always changed.
-        fit_body: Whether proportions may change; not where an avatar's person is given.
+    Poses with key points are a first guess made of these alone, and are always changed. Without
+    `fit_body` proportions stay, as those of an avatar's person.
 
-    Returns:
-        The changes; None if there are no masks that could be fitted, or if the poses' file holds
-        proportions: then they were fitted before.
+    Returns None if there are no masks that could be fitted, or if the poses' file holds
+    proportions: then they were fitted before.
     """
     tracked = capture.motion.keypoints is not None
     if fit_body and capture.motion.proportions is not None:
@@ -144,9 +136,8 @@ def fit_capture(capture: Capture, *, fit_body: bool = True) -> CaptureFit | None
 def share_beyond_noise(corrections: Float[np.ndarray, "frames 75"], error_cm: float) -> float:
     """Share of corrections of poses that is more than the fit's noise: 1 - noise² / change².
 
-    Args:
-        corrections: Root and joint rotations, radians, and root positions.
-        error_cm: Distance of outlines of body and masks that the fit leaves, cm.
+    Corrections are root and joint rotations, radians, and root positions; `error_cm` is the
+    distance of outlines of body and masks that the fit leaves.
     """
     squares = (corrections[:, :72].reshape(-1, 24, 3) ** 2).sum(axis=2).mean(axis=0)
     change_deg = float(np.degrees(np.sqrt(squares[0] + squares[1:].mean())))  # a root moves all
@@ -156,8 +147,7 @@ def share_beyond_noise(corrections: Float[np.ndarray, "frames 75"], error_cm: fl
 def _fit_tracked(fitter: ClipFitter, everything: FitParameters) -> list[float]:
     """Fits to key points, then with outlines, then poses alone to outlines that count more.
 
-    Returns:
-        The error before each iteration with outlines.
+    Returns the error before each iteration with outlines.
     """
     for _ in range(KEYPOINT_ITERATIONS):
         fitter.iterate(everything._replace(outlines=False))
@@ -168,11 +158,7 @@ def _fit_tracked(fitter: ClipFitter, everything: FitParameters) -> list[float]:
 
 
 def _iterate_until_settled(fitter: ClipFitter, fitted: FitParameters) -> list[float]:
-    """Iterates until the error hardly decreases.
-
-    Returns:
-        The error before each iteration.
-    """
+    """Iterates until the error hardly decreases; returns it before each iteration."""
     errors: list[float] = []
     while len(errors) < MAX_ITERATIONS:
         errors.append(fitter.iterate(fitted))
@@ -183,11 +169,7 @@ def _iterate_until_settled(fitter: ClipFitter, fitted: FitParameters) -> list[fl
 
 
 def make_fitter(capture: Capture) -> ClipFitter | None:
-    """The problem of a capture's evenly spread masks, and of its key points.
-
-    Returns:
-        The problem, at its start; None without enough masks or key points.
-    """
+    """The problem of a capture's spread masks and key points; None without enough of them."""
     track, has_masks = capture.motion.keypoints, capture.masks is not None
     has_masks |= capture.source.has_alpha or capture.segment is not None
     if capture.live is not None or not (has_masks or track):
@@ -239,11 +221,9 @@ def _reduced_size_px(capture: Capture) -> tuple[int, int]:
 
 
 def fitted_motion(capture: Capture, fit: CaptureFit) -> Motion:
-    """What a pose file should hold of tracked poses after their fit: proportions, and a static K.
+    """Tracked poses after their fit, as a pose file holds them: with proportions, and a static K.
 
-    Args:
-        capture: What was fitted: poses made of key points, for the mean body.
-        fit: Its fit.
+    The fit is of poses made of key points, for the mean body.
     """
     moved = fit.correct_motion(capture.geometry())
     betas = SIGMA_BETA * fit.coefficients[: capture.shaped.body.shape_directions.shape[-1]]
@@ -275,10 +255,8 @@ def _read_outlines(
 def _observe_silhouettes(capture: Capture, count: int) -> SilhouetteObjective | None:
     """Estimated or refined masks of evenly spread frames, which are decoded.
 
-    What refines masks then knows the background from the film's first frame on.
-
-    Returns:
-        None if there is no such mask: given ones that stay as they are can be read without frames.
+    What refines masks then knows the background from the video's first frame on. None if there is
+    no such mask: given ones that stay as they are can be read without frames.
     """
     estimated, tracked = capture.segment is not None, capture.motion.keypoints is not None
     refine = None if estimated or tracked else capture.mask_refiner

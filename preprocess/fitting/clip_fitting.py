@@ -38,17 +38,17 @@ MAX_PLACE_STEP_M = 0.5
 MAX_LOG_FOCAL_STEP = 0.1
 """Largest change of the logarithm of the focal length in one iteration."""
 USUAL_FPS = 30.0
-"""Frames per second of a film that does not say."""
+"""Frames per second of a video that does not say."""
 HELD_PRECISION = 1e9
 """Precision that holds a parameter that is not fitted."""
 
 
 class EvidenceWeights(NamedTuple):
-    """What a clip's evidence counts against its priors.
+    """Weights of a clip's evidence against its priors.
 
     Attributes:
         outline_rows: Independent distances along one outline; neighbors on it err alike.
-        keypoints: Factor of the key points' precision in the picture, where an outline tells the
+        keypoints: Factor of the key points' precision in the image, where an outline tells the
             pose, too.
     """
 
@@ -58,13 +58,9 @@ class EvidenceWeights(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ClipFrame:
-    """A frame whose pose is fitted.
+    """A frame whose pose is fitted: its row of the motion, and its number.
 
-    Attributes:
-        row: Row of the motion.
-        number: Frame number.
-        camera: Its camera, of the reduced masks' size.
-        mask: Outline of its mask; None if it is not compared.
+    The camera is of the reduced masks' size; without a mask the frame is not compared with one.
     """
 
     row: int
@@ -74,7 +70,7 @@ class ClipFrame:
 
 
 class FitParameters(NamedTuple):
-    """Which parameters and which evidence an iteration takes."""
+    """The parameters and the evidence that an iteration takes."""
 
     poses: bool = True
     proportions: bool = True
@@ -83,7 +79,7 @@ class FitParameters(NamedTuple):
 
 
 USUAL_WEIGHTS = EvidenceWeights()
-"""Where proportions are fitted to few frames, or poses are given."""
+"""Weights where proportions are fitted to few frames, or poses are given."""
 TRACKED_WEIGHTS = EvidenceWeights(outline_rows=120.0, keypoints=0.3)
 """Outlines tell where limbs are better than key points, which are off by 2 cm for many frames."""
 ALL_PARAMETERS = FitParameters()
@@ -96,11 +92,9 @@ class ClipFitter:
 
     Attributes:
         frames: The frames that are fitted, in time order.
-        model: The person.
         coefficients: Proportions, in prior standard deviations.
         log_focal: Logarithm of the focal length's factor.
-        poses: Present poses of the frames.
-        weights: What outlines and key points count; may be changed between iterations.
+        weights: May be changed between iterations.
     """
 
     def __init__(
@@ -119,15 +113,12 @@ class ClipFitter:
         """Starts with the poses, the proportions and the focal length as they are.
 
         Args:
-            motion: The poses to start from.
-            space: Proportions around the present person.
             frames: The frames to fit, in time order.
             track: Key points, as further evidence. With them the poses are merely human; without,
                 they are near the motion's.
             settled: Whether these poses were fitted to key points before.
-            sigma_log_focal: How uncertain the focal length is.
+            sigma_log_focal: Prior standard deviation of the focal length's logarithm.
             frames_per_prior: Frames that count as one for the proportions.
-            weights: What outlines and key points count.
             model: The person at the space's origin, where several clips share it.
         """
         self.frames = tuple(frames)
@@ -166,13 +157,9 @@ class ClipFitter:
         return self.poses[index]
 
     def iterate(self, fitted: FitParameters = ALL_PARAMETERS) -> float:
-        """Makes one Gauss-Newton step.
+        """Makes one Gauss-Newton step; returns the outlines' robust error before it.
 
-        Args:
-            fitted: Which parameters may change.
-
-        Returns:
-            Root mean square distance of the outlines before the step, px; robustly weighted.
+        The error is a root mean square distance, px of the reduced masks.
         """
         equations, error = self._linearise(fitted)
         steps = self._add_priors(equations, fitted)
@@ -221,7 +208,6 @@ class ClipFitter:
         return equations, float(np.sqrt(squares / max(total, 1e-9)))
 
     def _add_keypoints(self, equations: ChainEquations, outlines: bool) -> None:
-        """Adds the key points of all frames."""
         if self._keypoints is None:
             return
         outlined = [outlines and frame.mask is not None for frame in self.frames]
@@ -246,8 +232,7 @@ class ClipFitter:
     ) -> Float[np.ndarray, "frames 75 75"]:
         """Adds the priors of all parameters, and holds those that are not fitted.
 
-        Returns:
-            The poses' steps by the parameters that the equations then have.
+        Returns the poses' steps by the parameters that the equations then have.
         """
         steps = self._prior.add_to(equations, self.poses)
         precision = np.full(len(self.coefficients) + 1, self._priors)

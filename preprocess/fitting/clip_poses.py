@@ -1,4 +1,4 @@
-"""The poses of a clip as rotation matrices, and what is known of them before any picture.
+"""The poses of a clip as rotation matrices, and what is known of them before any image.
 
 All frames are computed at once. Poses are near those given, or merely human.
 """
@@ -52,12 +52,7 @@ which the prior counts a quarter, radians: what trackers err by, or else how thi
 
 
 class PosedJoints(NamedTuple):
-    """Where the joints of a clip's frames are.
-
-    Attributes:
-        turns: World rotation of each joint.
-        places: World position of each joint, metres.
-    """
+    """World rotation and position (metres) of each joint in a clip's frames."""
 
     turns: Float[np.ndarray, "frames 24 3 3"]
     places: Float[np.ndarray, "frames 24 3"]
@@ -75,9 +70,8 @@ class PosedJoints(NamedTuple):
 class ClipPoses:
     """Poses of a clip's frames.
 
-    Attributes:
-        rotations: Of the root and of each joint relative to its parent.
-        translations: As in `BodyPose`, metres.
+    `rotations` are those of the root and of each joint relative to its parent; `translations` are
+    as in `BodyPose`, metres.
     """
 
     rotations: Float[np.ndarray, "frames 24 3 3"]
@@ -109,9 +103,8 @@ class ClipPoses:
     ) -> "ClipPoses":
         """The poses after a step.
 
-        Args:
-            steps: Rotations in the joints' axes, radians; translation in the camera's, metres.
-            camera_rotations: Camera from world.
+        Steps hold rotations in the joints' axes, radians, and the translation in the camera's,
+        metres; `camera_rotations` are camera from world.
         """
         turned = rotation_matrices(steps[:, :72].reshape(-1, 24, 3))
         shifted = (steps[:, None, 72:] @ camera_rotations)[:, 0]
@@ -130,7 +123,7 @@ class ClipPoses:
     def joints(
         self, rest_joints: Float[np.ndarray, "24 3"], parents: Int[np.ndarray, "24"]
     ) -> PosedJoints:
-        """Where the joints are, for a person's rest joints."""
+        """World rotations and positions of the joints, for a person's rest joints."""
         turns, places = np.empty_like(self.rotations), np.empty((len(self.rotations), 24, 3))
         for joint, parent in enumerate(parents):
             if parent < 0:
@@ -189,7 +182,7 @@ CHANGES_PER_SECOND = (
 CHANGE_M = (0.013, 0.013, 0.013)
 """Standard deviation of how far the root strays from a steady motion in a second, metres."""
 CUT_TURN_RAD = 0.25
-"""Rotation of the root from frame to frame that photographs show, but no film; at it neighbors
+"""Rotation of the root from frame to frame that photographs show, but no video; at it neighbors
 tell a quarter about each other."""
 FAST_CHANGE = 2.0
 """Standard deviations of a change between frames at which it counts a quarter (Geman-McClure):
@@ -225,9 +218,8 @@ class GivenPosePrior:
     ) -> Float[np.ndarray, "frames 75 75"]:
         """Adds it to the equations of a step from the present poses, in units of `POSE_SIGMA`.
 
-        Returns:
-            The poses' steps by the parameters that the equations then have: rotations relative to
-            the root, in units of `POSE_SIGMA`.
+        Returns the poses' steps by the parameters that the equations then have: rotations relative
+        to the root, in units of `POSE_SIGMA`.
         """
         _add_human(equations, poses, self._sigma)
         steps = _steps_by_turns(poses) * POSE_SIGMA
@@ -252,12 +244,9 @@ class HumanPosePrior:
         *,
         settled: bool = False,
     ) -> None:
-        """Takes what the poses are compared by.
+        """Takes camera-from-world rotations and times of the frames.
 
-        Args:
-            camera_rotations: Camera from world of each frame.
-            times_s: Times of the frames.
-            settled: Whether the poses were fitted before: no frame is far off its neighbors.
+        `settled` tells that the poses were fitted before: no frame is far off its neighbors.
         """
         self._cameras = camera_rotations
         change = np.zeros((25, 3))
@@ -272,11 +261,7 @@ class HumanPosePrior:
     def add_to(
         self, equations: ChainEquations, poses: ClipPoses
     ) -> Float[np.ndarray, "frames 75 75"]:
-        """Adds it to the equations of a step from the present poses, in units of `POSE_SIGMA`.
-
-        Returns:
-            The poses' steps by the equations' parameters.
-        """
+        """Adds it to the equations of a step; returns the poses' steps by their parameters."""
         _add_human(equations, poses, _SIGMA)
         each = np.arange(72, 75)
         equations.blocks[:, each, each] += (POSE_SIGMA[72:] / SIGMA_FREE) ** 2
@@ -291,6 +276,7 @@ class HumanPosePrior:
         turned = np.linalg.norm(apart[:, :3], axis=1)
         apart -= gaussian_filter1d(apart, self._steady_frames, axis=0, mode="nearest")
         size = ((apart / self._change) ** 2).reshape(-1, 25, 3).mean(axis=2)
+        # Geman-McClure's weight 1 / (1 + e²/k²)², for fast motions and for cuts
         usual = np.repeat(1.0 / (1.0 + size / self._fast_change**2) ** 2, 3, axis=1)
         usual *= 1.0 / (1.0 + (turned / CUT_TURN_RAD) ** 2)[:, None] ** 2
         equations.add_links(apart / POSE_SIGMA, usual * (POSE_SIGMA / self._change) ** 2)
@@ -300,6 +286,7 @@ def _add_human(
     equations: ChainEquations, poses: ClipPoses, sigma: Float[np.ndarray, "24 3"]
 ) -> None:
     """Adds priors of the joints' axis-angles around their means."""
+    # The residual v - mean has the Jacobian J = J_r⁻¹(v): JᵀΣ⁻¹J step = -JᵀΣ⁻¹(v - mean).
     vectors = rotation_vectors(poses.rotations)
     by_step = _inverse_right_jacobian(vectors)
     heavy = by_step / sigma[..., None] ** 2
@@ -345,6 +332,7 @@ def _turns_from_root(poses: ClipPoses) -> Float[np.ndarray, "frames 24 3 3"]:
 
 def _steps_by_turns(poses: ClipPoses) -> Float[np.ndarray, "frames 75 75"]:
     """Derivative of a step of poses by a step of the rotations relative to the root."""
+    # R_j = T_parentᵀ T_j, so that a joint's step is its turn's minus R_jᵀ times its parent's
     steps = np.tile(np.eye(75), (len(poses.rotations), 1, 1))
     for joint, parent in enumerate(PARENTS):
         if parent > 0:
@@ -370,6 +358,7 @@ def _inverse_right_jacobian(
     vectors: Float[np.ndarray, "*batch 3"],
 ) -> Float[np.ndarray, "*batch 3 3"]:
     """Derivative of the axis-angle of R(v) R(step) by the step, at 0."""
+    # I + ½ [v]ₓ + (1/θ² - (1 + cos θ) / (2 θ sin θ)) [v]ₓ²
     angle = np.linalg.norm(vectors, axis=-1)
     safe = np.clip(angle, 1e-3, 3.0)
     factor = 1.0 / safe**2 - (1.0 + np.cos(safe)) / (2.0 * safe * np.sin(safe))

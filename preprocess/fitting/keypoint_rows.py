@@ -1,7 +1,7 @@
 """Key point residuals: how far a posed person's key points lie from those found, and the Jacobian.
 
-Each key point is fixed in the frame of one joint. Its place in the picture is compared in pixels;
-how much farther away one of two key points is, weakly, in metres: this tells what pictures leave
+Each key point is fixed in the frame of one joint. Its place in the image is compared in pixels;
+how much farther away one of two key points is, weakly, in metres: this tells what images leave
 open. All frames of a clip are linearised at once.
 """
 
@@ -37,9 +37,9 @@ RIGHT_OF = {1: 4, 2: 5, 3: 6, **{left: left + 1 for left in range(7, 33, 2)}}
 """The right key point of each left one."""
 PIXEL_WEIGHTS = np.array([0.4] + [0.15] * 6 + [0.4] * 2 + [0.15] * 2 + [1.0] * 6 + [0.3] * 6
                          + [1.0] * 6 + [0.6] * 4)  # fmt: skip
-"""What each key point counts in the picture; those of the face and of a hand err alike."""
+"""Weight of each key point in the image; those of the face and of a hand err alike."""
 SIGMA_KEYPOINT_PX = 1.0
-"""Standard deviation of a key point in the picture, px of the reduced masks (1.4 cm)."""
+"""Standard deviation of a key point in the image, px of the reduced masks (1.4 cm)."""
 ROBUST_KEYPOINT_PX = 6.0
 """Distance at which a key point counts a quarter (Geman-McClure), px of the reduced masks."""
 DEPTH_PAIRS = (
@@ -50,7 +50,7 @@ DEPTH_PAIRS = (
 """Key points whose difference in depth is compared, and its standard deviation, metres."""
 NEARER_M = ((11, 12, 0.06), (13, 14, 0.10), *((hand, hand + 1, 0.135) for hand in (15, 17, 19, 21)))
 """Left and right key points that BlazePose finds too near to the camera, relative to the hips, and
-by how much, metres: shoulders, elbows, wrists and hands. Means of five films, all of one sign."""
+by how much, metres: shoulders, elbows, wrists, hands. Means of five videos, all of one sign."""
 ROBUST_DEPTH = 3.0
 """Standard deviations at which a difference in depth counts a quarter."""
 MIN_PRESENCE = 0.5
@@ -75,13 +75,7 @@ KEYPOINT_OFFSETS_M = _offsets_m()
 
 
 class ClipCameras(NamedTuple):
-    """The cameras of a clip's frames, for the reduced masks.
-
-    Attributes:
-        rotations, translations: Camera from world.
-        focal_px: Focal lengths.
-        center_px: Principal points.
-    """
+    """The cameras of a clip's frames, camera from world, in pixels of the reduced masks."""
 
     rotations: Float[np.ndarray, "frames 3 3"]
     translations: Float[np.ndarray, "frames 3"]
@@ -101,12 +95,11 @@ class ClipCameras(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ClipKeypoints:
-    """Key points of a clip's frames.
+    """Key points of a clip's frames, in pixels of the reduced masks.
 
     Attributes:
-        pixels: In pixels of the reduced masks.
         depths_m: Depth of each key point, from any origin, corrected by `NEARER_M`.
-        confidence: What each key point counts, in [0, 1]; 0 in frames without key points.
+        confidence: Weight of each key point, in [0, 1]; 0 in frames without key points.
     """
 
     pixels: Float[np.ndarray, "frames 33 2"]
@@ -121,13 +114,9 @@ class ClipKeypoints:
         cameras: Sequence[Camera],
         rest_joints: Float[np.ndarray, "24 3"],
     ) -> "ClipKeypoints":
-        """A track's key points in some frames.
+        """Select a track's key points in some frames, seen by cameras of the reduced masks' size.
 
-        Args:
-            track: Key points.
-            numbers: Numbers of the frames.
-            cameras: Their cameras, of the reduced masks' size.
-            rest_joints: The person's, which tell the scale of depths.
+        The person's rest joints tell the scale of depths.
         """
         row_of = {int(number): row for row, number in enumerate(track.frames)}
         rows = [row_of.get(int(number), -1) for number in numbers]
@@ -151,7 +140,7 @@ class ClipKeypoints:
 
 
 def _world_scale(track: KeypointTrack, rest_joints: Float[np.ndarray, "24 3"]) -> float:
-    """How large a track's points in space are, compared with the person."""
+    """Size of a track's points in space, relative to the person."""
     ratios = [
         np.linalg.norm(track.world_m[:, end] - track.world_m[:, start], axis=1)
         / np.linalg.norm(rest_joints[joint] - rest_joints[parent])
@@ -161,12 +150,9 @@ def _world_scale(track: KeypointTrack, rest_joints: Float[np.ndarray, "24 3"]) -
 
 
 class KeypointRows(NamedTuple):
-    """Residuals of all frames and their derivatives.
+    """Residuals of all frames, px of the reduced masks or standard deviations, and derivatives.
 
-    Attributes:
-        residuals: Distances, px of the reduced masks or standard deviations.
-        weights: Precision of each residual; robust.
-        pose_jacobian, shape_jacobian, focal_jacobian: As in `OutlineRows`.
+    `weights` are robust precisions; the Jacobians are as in `OutlineRows`.
     """
 
     residuals: Float[np.ndarray, "frames rows"]
@@ -198,12 +184,7 @@ class KeypointModel:
     ) -> KeypointRows:
         """Residuals of poses, for the rest joints of the present proportions.
 
-        Args:
-            poses: The poses.
-            rest_joints: The person's.
-            cameras: Of the frames.
-            found: Key points of the frames.
-            factors: Factor of their precision in the picture, for each frame.
+        `factors` multiply the precision of each frame's key points in the image.
         """
         joints = poses.joints(rest_joints, self._parents)
         rotation = cameras.rotations[:, None]
@@ -219,6 +200,7 @@ class KeypointModel:
         scale = cameras.focal_px[:, None] / depth
         pixels = cameras.focal_px[:, None] * plane + cameras.center_px[:, None]
         off = pixels - found.pixels
+        # derivative of (f x/z, f y/z) by the point: rows (f/z, 0, -f x/z²) and (0, f/z, -f y/z²)
         view = np.zeros((*points.shape[:2], 2, 3))
         view[..., 0, 0], view[..., 1, 1] = scale[..., 0], scale[..., 1]
         view[..., 2] = -scale * plane
@@ -231,6 +213,7 @@ class KeypointModel:
         )
         sure = np.minimum(found.confidence[:, one], found.confidence[:, other])
         frames = len(points)
+        # by the logarithm of the focal length: pixels move from the center by their distance to it
         return KeypointRows(
             residuals=np.concatenate([off.reshape(frames, -1), farther / _PAIR_SIGMAS], axis=1),
             weights=np.concatenate(
@@ -295,7 +278,7 @@ def _apply(
 def _stack_rows(
     view: Float[np.ndarray, "frames 33 2 3"], by: Float[np.ndarray, "frames 33 3 n"]
 ) -> Float[np.ndarray, "frames rows n"]:
-    """Rows of the picture, then rows of the differences in depth."""
+    """Rows of the image, then rows of the differences in depth."""
     seen = (view @ by).reshape(len(by), 66, -1)
     deep = (by[:, _PAIRS[:, 1], 2] - by[:, _PAIRS[:, 0], 2]) / _PAIR_SIGMAS[:, None]
     return np.concatenate([seen, deep], axis=1)

@@ -52,6 +52,7 @@ class ChainEquations:
         weights: Float[np.ndarray, "rows"],
     ) -> None:
         """Adds weighted residuals of one frame, with their Jacobians."""
+        # Gauss-Newton: JᵀWJ step = -JᵀWr, with J = [own, shared]
         heavy, heavy_shared = weights[:, None] * own, weights[:, None] * shared
         self.blocks[frame] += own.T @ heavy
         self.borders[frame] += own.T @ heavy_shared
@@ -77,7 +78,7 @@ class ChainEquations:
 
     def change_parameters(self, by: Float[np.ndarray, "frames n n"]) -> None:
         """Replaces each frame's parameters x by y, where x = `by` y; before there are links."""
-        back = by.swapaxes(-1, -2)
+        back = by.swapaxes(-1, -2)  # A x = b becomes (byᵀ A by) y = byᵀ b
         self.blocks[:] = back @ self.blocks @ by
         self.borders[:] = back @ self.borders
         self.right[:] = (back @ self.right[..., None])[..., 0]
@@ -90,10 +91,8 @@ class ChainEquations:
     ) -> None:
         """Adds priors around 0 for each frame, and priors of equality between neighbors.
 
-        Args:
-            state: Present parameters.
-            precision: Of each parameter in one frame.
-            links: Precision of the difference between neighbors.
+        `state` holds the present parameters, `precision` is that of each of them in one frame, and
+        `links` that of the difference between neighbors.
         """
         each = np.arange(state.shape[1])
         self.blocks[:, each, each] += precision
@@ -105,6 +104,7 @@ class ChainEquations:
     ) -> None:
         """Adds priors of equality between neighbors, `apart` from each other at present."""
         each = np.arange(links.shape[1])
+        # ½ l (apart + x_next - x)²: l on both diagonals, -l between them, ±l apart on the right
         self.links[:] += links
         self.blocks[:-1, each, each] += links
         self.blocks[1:, each, each] += links
@@ -127,6 +127,9 @@ class ChainEquations:
         count = len(self.right_shared)
         corner = np.column_stack([self.shared, self.right_shared])
         links = np.concatenate([self.links, np.zeros((1, self.right.shape[1]))])
+        # Forward, with frames f in turn, links L, borders B and right sides r:
+        # K_f = blocks_f - L K_(f-1)⁻¹ L, and [B, r]_f += L K_(f-1)⁻¹ [B, r]_(f-1);
+        # the shared parameters s keep their Schur complement, shared - Σ BᵀK⁻¹B.
         reduced, passed_on = [], []  # K⁻¹ of a frame's right sides and of its links
         block, carried = np.zeros_like(self.blocks[0]), 0.0
         for frame, link in enumerate(links):
@@ -138,6 +141,7 @@ class ChainEquations:
             corner = corner - side[:, :count].T @ reduced[-1]
             carried, block = link[:, None] * reduced[-1], link[:, None] * passed_on[-1]
         shared = np.linalg.solve(corner[:, :count], corner[:, count])
+        # Backward: x_f = K_f⁻¹ (r - B s + L x_(f+1))
         found, after = np.zeros_like(self.right), np.zeros(self.right.shape[1])
         for frame in range(len(links) - 1, -1, -1):
             local = reduced[frame][:, count] - reduced[frame][:, :count] @ shared

@@ -28,7 +28,7 @@ OUTLINE_PERSON_PX = 128
 OUTLINE_SKIN_POINTS = 7000
 """Points on the skin: about one per pixel of a person `OUTLINE_PERSON_PX` high."""
 SPLAT_GROWTH_PX = 0.5
-"""How far a splatted silhouette reaches beyond the outline: it has every pixel that is touched."""
+"""Reach of a splatted silhouette beyond the outline: it has every pixel that is touched."""
 MASK_BORDER_POINTS = 160
 """Points of a mask's border that are compared."""
 SKIN_BORDER_POINTS = 160
@@ -47,13 +47,11 @@ IMAGE_BORDER_PX = 2.0
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class OutlineDistances:
-    """The outline of one mask, reduced.
+    """The outline of one reduced mask, seen by `camera`.
 
     Attributes:
-        camera: Camera of the reduced mask.
         distance: Signed distance from the outline, negative inside, px.
-        border: Points of the outline, px.
-        normals: Outward unit normals of the outline at these points.
+        border, normals: Points of the outline, px, and its outward unit normals there.
     """
 
     camera: Camera
@@ -127,10 +125,8 @@ class OutlineModel:
     ) -> OutlineRows | None:
         """Residuals of a pose before a mask; None where the silhouette cannot be compared.
 
-        Args:
-            transforms: World from rest of each joint, for the present proportions.
-            mask: Outline of the mask.
-            proportions: Whether these may change; else the derivatives by them are left at 0.
+        `transforms` are world from rest of each joint, for the present proportions; the derivatives
+        by these are left at 0 if `proportions` is false.
         """
         points, normals = self._posed(transforms)
         chosen, matched = self._match(points, normals, mask)
@@ -206,6 +202,7 @@ class OutlineModel:
         depth = inside[:, 2]
         focal = matched.normals * np.array(camera.focal_px)
         plane = inside[:, :2] / depth[:, None]
+        # n · derivative of a pixel by its point: (n_x f/z, n_y f/z, -(n_x f x + n_y f y)/z²)
         in_camera = np.column_stack([focal, -(focal * plane).sum(axis=1)]) / depth[:, None]
         in_world = in_camera @ rotation
         weights = self._weights[rows].T.astype(np.float64)

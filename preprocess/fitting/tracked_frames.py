@@ -51,13 +51,9 @@ REVISION_ITERATIONS = 2
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SeenPerson:
-    """What was found of the person in one frame of a stream.
+    """The person as found in one frame of a stream.
 
-    Attributes:
-        number: The frame's.
-        time_s: When it was filmed, seconds.
-        keypoints: Key points, in pixels of the frame.
-        mask: How far each pixel of the reduced frame is person, in [0, 1].
+    Key points are in pixels of the frame; `mask` is that of the reduced frame, in [0, 1].
     """
 
     number: int
@@ -83,14 +79,9 @@ def fit_first_frames(
     """Fit proportions, focal length and poses to the first frames of a stream.
 
     Args:
-        seen: The frames.
-        shaped: The body's mean shape, or the person.
+        shaped: The body's mean shape, or (`fixed`) the person, whose proportions stay.
         camera: Camera of the frames, whose focal length is not exact.
-        fixed: Whether the body is the person's, and its proportions stay.
-        sigma_log_focal: How uncertain the focal length is.
-
-    Returns:
-        Poses of the frames, the person, and the camera.
+        sigma_log_focal: Prior standard deviation of the focal length's logarithm.
     """
     space = ProportionSpace.around(shaped)
     fitter = _fitter(
@@ -113,12 +104,7 @@ class FramePoseFitter:
     """Fits the poses of a stream's last frames, for a known person and camera."""
 
     def __init__(self, shaped: ShapedBody, camera: Camera) -> None:
-        """Start without frames.
-
-        Args:
-            shaped: The person.
-            camera: Camera of the frames.
-        """
+        """Start without frames."""
         self._model, self._camera = OutlineModel(ProportionSpace.around(shaped)), camera
         self._seen: deque[SeenPerson] = deque(maxlen=WINDOW_FRAMES)
         self._poses: deque[BodyPose] = deque(maxlen=WINDOW_FRAMES)
@@ -126,9 +112,7 @@ class FramePoseFitter:
     def add(self, seen: SeenPerson, start: BodyPose | None = None) -> None:
         """Fit the poses of the window that ends with the next frame.
 
-        Args:
-            seen: What was found in it.
-            start: Its pose, if it is known nearly; None lifts it from the key points.
+        `start` is its pose, if it is known nearly; None lifts it from the key points.
         """
         self._seen.append(seen)
         shaped = self._model.space.shaped
@@ -162,12 +146,7 @@ class EarlierPoses:
     """
 
     def __init__(self, shaped: ShapedBody, camera: Camera) -> None:
-        """Start without frames.
-
-        Args:
-            shaped: The person.
-            camera: Camera of the frames.
-        """
+        """Start without frames."""
         self._model, self._camera = OutlineModel(ProportionSpace.around(shaped)), camera
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="earlier poses")
         self._fit: Future[None] | None = None
@@ -218,7 +197,6 @@ def _at_distance_of(pose: BodyPose, other: BodyPose, pelvis: Float[np.ndarray, "
 
 
 def _lift(seen: Sequence[SeenPerson], shaped: ShapedBody, camera: Camera) -> Motion:
-    """First guess of the frames' poses."""
     return lift_keypoints(_track(seen, camera), shaped, camera)
 
 
