@@ -45,14 +45,9 @@ def estimate_focal_length(
 ) -> CameraTrack:
     """Fit the focal length of an assumed camera so that the body covers the masks.
 
-    It changes only if that fits clearly better, and not for poses of another body model: their size
-    and the focal length are ambiguous.
-
-    Args:
-        evidence: With one camera, whose focal length was assumed (`assume_static_camera`); without
-            mask files the camera stays.
-        motion: Poses in the camera's world.
-        shaped: The person.
+    The evidence holds that one camera (`assume_static_camera`). Its focal length changes only if
+    another fits clearly better; without mask files it stays, and for poses of another body model:
+    their size and the focal length are ambiguous.
     """
     cameras, geometry = evidence.cameras, evidence.geometry(motion)
     if evidence.masks is None or motion.body_model != shaped.body.family:
@@ -98,9 +93,7 @@ class BodyAlignment:
     """A person and poses that belong together.
 
     Attributes:
-        shaped: The person's body.
-        motion: The poses for this body.
-        description: What was done, for people; empty if nothing was.
+        description: Changes that were made, for people; empty if none were.
         placement: The fitted placement; None if none was attempted.
     """
 
@@ -111,20 +104,16 @@ class BodyAlignment:
 
 
 def needs_placement(motion: Motion, shaped: ShapedBody) -> bool:
-    """Whether poses were made for a body model whose size is unknown here."""
+    """Check whether poses were made for a body model whose size is unknown here."""
     return shaped.body.family not in ("smpl", motion.body_model)
 
 
 def align_body(motion: Motion, shaped: ShapedBody, evidence: CaptureEvidence) -> BodyAlignment:
     """Align body and motion to the masks, if the poses are of another body model.
 
-    The body's own mean proportions are tried beside SMPL's and taken if they fit better by
-    `MIN_OWN_SHAPE_GAIN`: files state SMPL for poses that were fitted to another body.
-
-    Args:
-        motion: Poses in the cameras' world.
-        shaped: The body that is used, with SMPL's mean joints (`shape_for_motion`).
-        evidence: Frames, masks and cameras.
+    `shaped` is the body that is used, with SMPL's mean joints (`shape_for_motion`). Its own mean
+    proportions are tried beside these and taken if they fit better by `MIN_OWN_SHAPE_GAIN`: files
+    state SMPL for poses that were fitted to another body.
     """
     if not needs_placement(motion, shaped):
         return BodyAlignment(shaped=shaped, motion=motion)
@@ -144,14 +133,7 @@ def align_body(motion: Motion, shaped: ShapedBody, evidence: CaptureEvidence) ->
 def align_to_person(
     motion: Motion, shaped: ShapedBody, person: ShapedBody, evidence: CaptureEvidence
 ) -> BodyAlignment:
-    """Align a motion to an avatar's person, whose body stays.
-
-    Args:
-        motion: Poses in the cameras' world, for the body `shaped`.
-        shaped: The person that the poses were made for.
-        person: The avatar's person.
-        evidence: Frames, masks and cameras.
-    """
+    """Align a motion, made for `shaped`, to an avatar's person, whose body stays."""
     foreign, same = needs_placement(motion, shaped), is_same_person(person, shaped)
     if same and not foreign:
         return BodyAlignment(shaped=person, motion=motion)
@@ -169,7 +151,7 @@ def align_to_person(
 
 
 def is_same_person(a: ShapedBody, b: ShapedBody) -> bool:
-    """Whether two shapes of one body model are the same person."""
+    """Check whether two shapes of one body model are the same person."""
     same = a.vertices.shape == b.vertices.shape
     return same and all(
         bool(np.abs(one - other).max() < SAME_SHAPE_M)
@@ -224,11 +206,7 @@ def place_motion(
     names it. Betas of one body model are meaningless for another. So a motion whose file does not
     state the body model is labeled as SMPL's if SMPL's body fits better.
 
-    Args:
-        motion_read: The motion that `read_poses` returns.
-        body: The body model that is used.
-        evidence: Frames, masks and cameras.
-        cameras_given: Whether a file states the cameras; see `place_in_camera_world`.
+    `cameras_given` tells that a file states the cameras (`place_in_camera_world`).
     """
 
     def placed(motion: Motion) -> tuple[Motion, ShapedBody]:
@@ -257,7 +235,7 @@ PosedPerson = tuple[CaptureGeometry, ShapedBody]
 
 
 def _smpl_fits_masks(own: PosedPerson, smpl: PosedPerson, evidence: CaptureEvidence) -> str | None:
-    """How much better SMPL's body fits the masks than the file's; None if it does not."""
+    """Words on how much better SMPL's body fits the masks than the file's; None if it does not."""
     objective = evidence.silhouettes(SkinPoints.of(own[1]), own[0], ALIGNMENT_SAMPLES)
     if objective is None or mean_score(objective.frame_scores(own[0])) >= GOOD_IOU:
         return None
@@ -276,13 +254,11 @@ def fit_person(
     avatar_body: Path | None,
     height_m: float | None,
 ) -> BodyAlignment:
-    """The body, and the poses for it.
+    """Fit body and poses to the masks, to a finished avatar's person, or to a stated height.
 
     Args:
         motion: In the cameras' world, for the body `shaped`.
-        shaped: As the poses' tracker had it in mind.
-        evidence: Frames, masks and cameras.
-        avatar_body: File of a finished avatar's person, if these poses are added to one.
+        avatar_body: File of the avatar's person, if these poses are added to one.
         height_m: Stated height of the person, metres.
 
     Raises:

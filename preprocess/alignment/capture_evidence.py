@@ -1,4 +1,4 @@
-"""What shows where the person of a capture is: given masks, or a few images without masks.
+"""Evidence of where the person of a capture is: given masks, or a few images without masks.
 
 Without any, masks are estimated in reduced images.
 """
@@ -43,13 +43,7 @@ ALIGNMENT_FRAMES = 240
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ImageSample:
-    """One frame's image, reduced.
-
-    Attributes:
-        index: Frame number.
-        camera_row: Index of the frame's camera.
-        rgb: The image.
-    """
+    """One frame's reduced image, and the row of the frame's camera."""
 
     index: int
     camera_row: int
@@ -65,15 +59,10 @@ class ImageSample:
 def sample_video(
     geometry: CaptureGeometry, skin: SkinPoints, cameras: CameraTrack, source: FrameSource
 ) -> list[ImageSample]:
-    """Decode images of frames that have a pose, spread over the beginning of a video.
+    """Decode images of frames that have a pose, spread over the beginning of a recording.
 
-    Where frames without a pose are among these, later ones take their place.
-
-    Args:
-        geometry: Poses and cameras.
-        skin: The body; its height in the images determines their size.
-        cameras: The cameras of the geometry.
-        source: The frames; not a live source.
+    Where frames without a pose are among these, later ones take their place. The body's height in
+    the images determines their size.
 
     Raises:
         InputError: If cameras and frames do not belong together, or no image can be used.
@@ -105,10 +94,7 @@ def sample_video(
 def thumbnail_size_px(skin: SkinPoints, pose: BodyPose, camera: Camera) -> tuple[int, int]:
     """Width and height of images in which the body is about `IMAGE_PERSON_PX` high; never larger.
 
-    Args:
-        skin: The body.
-        pose: One of its poses.
-        camera: Camera of the original image's size.
+    The camera is of the original image's size.
     """
     width, height = camera.size_px
     points = skin.posed(pose).astype(np.float64)
@@ -126,10 +112,7 @@ def estimate_silhouettes(
 ) -> SilhouetteObjective | None:
     """The objective of masks that are estimated in a few images; None if no person is found.
 
-    Args:
-        geometry: Poses and cameras; the body may be off by a fifth of its size.
-        skin: The body.
-        samples: Images of one size; see `sample_video`.
+    The images are of one size (`sample_video`); the body may be off by a fifth of its size.
     """
     segment, masks = make_segmenter(DEFAULT_SEGMENTER, skin.shaped), list[MaskSample]()
     for sample in samples:
@@ -151,7 +134,7 @@ def estimate_silhouettes(
 
 
 class CaptureEvidence(NamedTuple):
-    """What shows where the person of a capture is.
+    """Evidence of where the person of a capture is.
 
     Attributes:
         source: The frames; few are decoded, and none if there are mask files.
@@ -165,7 +148,7 @@ class CaptureEvidence(NamedTuple):
 
     @property
     def has_masks(self) -> bool:
-        """Whether there are mask files, or alpha channels in their place."""
+        """True if there are mask files, or alpha channels in their place."""
         return self.masks is not None or self.source.has_alpha
 
     def geometry(self, motion: Motion) -> CaptureGeometry:
@@ -181,11 +164,8 @@ class CaptureEvidence(NamedTuple):
     ) -> SilhouetteObjective | None:
         """The objective of a few masks; None where parts do not fit (reported elsewhere).
 
-        Args:
-            skin: The person.
-            geometry: Poses and cameras: where masks are estimated if there are none.
-            count: Number of frames.
-            person_px: Height of the person in the reduced masks, px.
+        The geometry tells where masks are estimated if there are none; `person_px` is the height of
+        the person in the reduced masks.
         """
         try:
             if not self.has_masks:

@@ -55,7 +55,7 @@ class VideoTransform:
 
     @property
     def reorients(self) -> bool:
-        """Whether images must be rotated or mirrored."""
+        """True if images must be rotated or mirrored."""
         return self.mirrored or self.quarter_turns % 4 != 0
 
     def reorient(self, image: np.ndarray) -> np.ndarray:
@@ -79,13 +79,12 @@ class CaptureGeometry:
     Attributes:
         motion: The poses; only `row_frames` assigns them to frames.
         row_frames: Frame number of each row of the motion; need not be whole.
-        intrinsics: K in pixels, one for all frames or one per frame.
-        extrinsics: Camera-from-world, one for all frames or one per frame.
+        intrinsics, extrinsics: K in pixels and camera-from-world, one for all frames or one per
+            frame.
         size_px: Width and height that K belongs to.
         distortion: OpenCV's coefficients of all cameras.
-        masks_inverted: Whether masks are to be inverted before use.
         keeps_person_only: Whether only those components of a mask count that the body touches.
-        video_transform: How images are to be changed before masks and poses belong to them.
+        video_transform: Change of images before masks and poses belong to them.
     """
 
     motion: Motion
@@ -136,11 +135,7 @@ class CaptureGeometry:
         return rows, np.take_along_axis(away, rows[:, None], axis=1)[:, 0] <= reach
 
     def in_video_frames(self, frames: int) -> "CaptureGeometry":
-        """The same for the video's own frame numbers and the part of the image that it shows.
-
-        Args:
-            frames: Number of frames of the video.
-        """
+        """The same for a video's own frame numbers and the part of the image that it shows."""
         video = self.video_transform
         low, high = np.array(video.window[:2]), np.array(video.window[2:])
         intrinsics, extrinsics = self.intrinsics.copy(), self.extrinsics
@@ -207,12 +202,7 @@ def relative_change(before: CaptureGeometry, after: CaptureGeometry) -> float:
 
 
 def sanity_warnings(geometry: CaptureGeometry, frames: list[int]) -> Iterator[str]:
-    """Describe what is implausible in poses and cameras, for people: gaps, jumps, ranges, views.
-
-    Args:
-        geometry: Poses and cameras.
-        frames: Numbers of the selected frames.
-    """
+    """Describe implausible poses and cameras of the selected frames: gaps, jumps, ranges, views."""
     yield from _missing_pose_warnings(geometry, frames)
     yield from _timestamp_warnings(geometry, frames)
     yield from _range_warnings(geometry)
@@ -243,7 +233,6 @@ def _missing_pose_warnings(geometry: CaptureGeometry, frames: list[int]) -> Iter
 
 
 def _timestamp_warnings(geometry: CaptureGeometry, frames: list[int]) -> Iterator[str]:
-    """Times of poses that are not the video's."""
     times = geometry.motion.times_s
     known = np.isfinite(geometry.row_frames)
     if times is None or geometry.motion.frames is not None or not known.any():
@@ -287,7 +276,6 @@ def find_jumps(geometry: CaptureGeometry) -> tuple[list[int], float]:
 
 
 def _jump_warnings(geometry: CaptureGeometry) -> Iterator[str]:
-    """Jumps and repeated poses."""
     after, still = find_jumps(geometry)
     if after:
         times = "once" if len(after) == 1 else f"{len(after)} times"

@@ -38,7 +38,7 @@ KNOWN_TURNS = {
     ("x", 90): " (z up, not y)",
     ("x", 270): " (y up, not z)",
 }
-"""What is known for an axis and an angle in degrees by which poses are turned."""
+"""Explanations of an axis and an angle in degrees by which poses are turned."""
 MIRROR_X = np.diag([-1.0, 1.0, 1.0])
 """Reflection that exchanges left and right."""
 MIRRORED_JOINTS = [
@@ -59,10 +59,7 @@ def body_corrections(
 ) -> Iterator[Correction]:
     """Every discrete mistake between body and masks; focal lengths and sizes are fitted instead.
 
-    Args:
-        geometry: The capture as its files state it.
-        pelvis: Rest position of the pelvis, J0, about which the root rotates.
-        frames: Number of frames.
+    `pelvis` is its rest position, J0, about which the root rotates.
     """
     for entries in (
         _mask_entries(),
@@ -81,12 +78,7 @@ def body_corrections(
 
 
 def video_corrections(frames: int, mask_count: int) -> Iterator[Correction]:
-    """Every discrete mistake of a video whose masks and poses agree; crops are fitted instead.
-
-    Args:
-        frames: Number of frames in the video.
-        mask_count: Number of masks.
-    """
+    """Every discrete mistake of a video whose masks and poses agree; crops are fitted instead."""
     yield from (undo_video_rotation(turns) for turns in (1, 2, 3))
     yield from (undo_video_rotation(turns, mirrored=True) for turns in range(4))
     yield from map(undo_video_offset, _offsets(frames))
@@ -225,12 +217,10 @@ def _change_cameras(
 
 
 def _cameras_at_origin(geometry: CaptureGeometry) -> bool:
-    """Whether world and camera space are the same."""
     return np.allclose(geometry.extrinsics, np.eye(4), atol=1e-6)
 
 
 def _degrees_to_radians(motion: Motion, root: bool, joints: bool) -> Motion:
-    """The motion with the root's angles, the joints', or both converted from degrees."""
     return replace(
         motion,
         root_rotations=np.deg2rad(motion.root_rotations) if root else motion.root_rotations,

@@ -62,9 +62,7 @@ CAMERA_SEARCH_MIN_GAIN = 0.05
 class CaptureObjective:
     """Scores a geometry by masks and key points of a few frames.
 
-    Attributes:
-        masks: Masks of some frames; None without masks.
-        keypoints: Key points of some images; None if no person was found in them.
+    `masks` is None without masks; `keypoints` is None if no person was found in the images.
     """
 
     masks: SilhouetteObjective | None
@@ -95,12 +93,11 @@ class CorrectionCandidate:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CorrectionResult:
-    """The mistakes found in a capture.
+    """The mistakes found in a capture, and the geometry without them.
 
     Attributes:
         corrections: The corrections, the one with the largest gain first.
         candidates: The best candidate of each cause in the first round, best first.
-        corrected: The geometry with all corrections.
     """
 
     corrections: tuple[Correction, ...]
@@ -122,9 +119,7 @@ def find_corrections(
 
     Args:
         geometry: The capture as its files state it.
-        objective: Masks and key points of a few frames.
         pelvis: Rest position of the pelvis.
-        frames: Number of frames in the capture.
         mask_count: Number of masks; 0 if images and masks cannot disagree.
     """
     search = _CorrectionSearch(
@@ -151,7 +146,7 @@ def find_corrections(
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _CorrectionSearch:
-    """What is tried, and how it is scored; see `find_corrections`."""
+    """The corrections that are tried, and their scores; see `find_corrections`."""
 
     objective: CaptureObjective
     pelvis: Float[np.ndarray, "3"]
@@ -242,7 +237,7 @@ def is_significant(
     geometry: CaptureGeometry,
     scores: Float[np.ndarray, "samples"],
 ) -> bool:
-    """Whether a candidate gains enough, frame by frame, over the current scores."""
+    """Check whether a candidate gains enough, frame by frame, over the current scores."""
     gains = candidate.frame_scores - np.nan_to_num(scores)
     had, has = np.isfinite(scores), np.isfinite(candidate.frame_scores)
     if had.sum() - has.sum() > MAX_LOST_FRACTION * had.sum():

@@ -40,7 +40,7 @@ class Correction:
 
     Attributes:
         cause: The mistake, one of `CAUSES`.
-        description: What was wrong, for people: ends the sentence "It looks as if …".
+        description: The mistake for people: ends the sentence "It looks as if …".
         apply: From the geometry as stated to the geometry as it should have been.
         factor: The number that was fitted; None of a discrete mistake.
         frame_shift: Number of frames of an offset; None of any other mistake.
@@ -54,7 +54,7 @@ class Correction:
 
     @property
     def is_of_video(self) -> bool:
-        """Whether the mistake is one of the video alone."""
+        """True if the mistake is one of the video alone."""
         return self.cause.startswith("video_")
 
 
@@ -70,12 +70,7 @@ def undo_pose_delay(frames: int) -> Correction:
 
 
 def undo_video_rotation(quarter_turns: int, *, mirrored: bool = False) -> Correction:
-    """A video rotated counter-clockwise and perhaps mirrored, unlike its masks and poses.
-
-    Args:
-        quarter_turns: Number of quarter turns counter-clockwise.
-        mirrored: Whether left and right were exchanged as well.
-    """
+    """A video rotated by counter-clockwise quarter turns, perhaps mirrored, unlike its masks."""
 
     def apply(geometry: CaptureGeometry) -> CaptureGeometry:
         video = geometry.video_transform
@@ -111,8 +106,7 @@ def undo_video_offset(frames: int) -> Correction:
 def undo_video_crop(window: tuple[float, float, float, float]) -> Correction:
     """A video that shows only a part of the masks' image, or has borders added around it.
 
-    Args:
-        window: Left, top, right and bottom of the video's image in the mask's, as fractions.
+    `window` is left, top, right and bottom of the video's image in the mask's, as fractions.
     """
     left, top, right, bottom = window
     inside = right - left < 1.0 and bottom - top < 1.0
@@ -195,7 +189,6 @@ def _frame_count(frames: int) -> str:
 
 
 def _with_video(geometry: CaptureGeometry, **changes: Any) -> CaptureGeometry:
-    """The geometry with fields of its video transform replaced."""
     return replace(geometry, video_transform=replace(geometry.video_transform, **changes))
 
 
@@ -217,10 +210,7 @@ def fit_factor(
 ) -> Correction:
     """Fit the one factor of a correction to masks: a coarse grid, then a bounded scalar search.
 
-    Args:
-        make: Makes the correction of a factor (`scale_focal_length`, `divide_distances`).
-        geometry: The capture that the correction is applied to.
-        objective: Masks of a few frames.
+    `make` gives the correction of a factor (`scale_focal_length`, `divide_distances`).
     """
     from scipy.optimize import minimize_scalar  # 0.1 s that a capture in order does not need
 
@@ -269,10 +259,7 @@ def fit_to_keypoints(
 def fit_principal_point(
     geometry: CaptureGeometry, objective: KeypointObjective
 ) -> Correction | None:
-    """Fit the principal point that puts the bodies where the key points are.
-
-    None if the shift is too large to be a crop.
-    """
+    """Fit the principal point that puts bodies on their key points; None if too far for a crop."""
     bodies, found = objective.bodies(geometry), objective.found_px(geometry)
     if found is None:
         return None

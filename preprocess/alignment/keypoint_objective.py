@@ -55,13 +55,8 @@ ROBUST_STEPS = 8
 class TrackedImage:
     """One image, and the person that was tracked in it.
 
-    Attributes:
-        index: Frame number.
-        thumbnail: The image, reduced.
-        alpha: Its alpha channel, reduced; None without one.
-        size_px: Width and height of the image.
-        image_px: Key points, pixels of the image; 0 if no person was found.
-        confidence: What each key point counts; 0 if no person was found.
+    The thumbnail and the alpha channel (None without one) are reduced. Key points are in pixels of
+    the image, and 0 with their confidence if no person was found.
     """
 
     index: int
@@ -94,7 +89,6 @@ class _PersonFinder:
         self._square: PersonSquare | None = None
 
     def track(self, frame: Frame) -> TrackedImage:
-        """The person in the next image."""
         rgb = self._brighten(frame.rgb)
         found = None if self._square is None else self._look(rgb, self._square)
         if found is None:
@@ -131,12 +125,7 @@ class _PersonFinder:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class KeypointObjective:
-    """Scores a geometry by the key points of a few images.
-
-    Attributes:
-        images: Images in which the person was found.
-        shaped: The person whose poses are compared with them.
-    """
+    """Scores the geometry of a person by the key points of images in which it was found."""
 
     images: tuple[TrackedImage, ...]
     shaped: ShapedBody
@@ -154,7 +143,7 @@ class KeypointObjective:
 
     @cached_property
     def confidence(self) -> Float[np.ndarray, "images 33"]:
-        """What each key point counts."""
+        """Weight of each key point."""
         return np.stack([each.confidence for each in self.images])
 
     def frame_scores(self, geometry: CaptureGeometry) -> Float[np.ndarray, "images"]:
@@ -234,13 +223,9 @@ class KeypointObjective:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PosedKeypoints:
-    """Key points of a posed body in some images.
+    """Key points and pelvis of a posed body in some images, in the world.
 
-    Attributes:
-        world_m: Key points in the world, metres.
-        pelvis_m: The pelvis there.
-        cameras: Camera of each image.
-        known: Whether there is a pose.
+    `known` tells in which images there is a pose.
     """
 
     world_m: Float[np.ndarray, "images 33 3"]

@@ -40,12 +40,7 @@ def scale_to_height(shaped: ShapedBody, height_m: float) -> ShapedBody:
 def rescale_motion(geometry: CaptureGeometry, shaped: ShapedBody, resized: ShapedBody) -> Motion:
     """Move a motion so that a resized body looks the same from its cameras.
 
-    Distances from the camera grow with the body.
-
-    Args:
-        geometry: Poses and cameras.
-        shaped: The person that the poses were made for.
-        resized: The same person in another size.
+    The poses were made for `shaped`; distances from the camera grow with the body.
     """
     factor = body_height_m(resized) / body_height_m(shaped)
     eyes = geometry.camera_centers()[geometry.camera_rows()]
@@ -73,14 +68,10 @@ MIN_ALIGNMENT_GAIN = 0.01
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BodyPlacement:
-    """The result of aligning a body's poses.
+    """The poses of a body aligned to masks, with the mean IoU before and after.
 
-    Attributes:
-        motion: Poses for the body that is used.
-        iou_before: Mean IoU of body and masks as the poses were.
-        iou_after: Mean IoU of body and masks with `motion`.
-        distance_divisor: Factor by which distances from the camera were divided.
-        pelvis_shift_m: Shift of the pelvis in the root's own axes, metres.
+    `distance_divisor` divided the distances from the camera; `pelvis_shift_m` moved the pelvis in
+    the root's own axes.
     """
 
     motion: Motion
@@ -91,12 +82,12 @@ class BodyPlacement:
 
     @property
     def is_improvement(self) -> bool:
-        """Whether the poses fit better by enough to be taken."""
+        """True if the poses fit better by enough to be taken."""
         return self.is_reliable and self.iou_after > self.iou_before + MIN_ALIGNMENT_GAIN
 
     @property
     def is_reliable(self) -> bool:
-        """Whether body and masks agree better than by chance."""
+        """True if body and masks agree better than by chance."""
         return self.iou_after >= MIN_ALIGNED_IOU
 
     def describe(self) -> str:
@@ -127,12 +118,7 @@ class BodyPlacement:
 
 
 def place_body_on_masks(geometry: CaptureGeometry, objective: SilhouetteObjective) -> BodyPlacement:
-    """Align SMPL's poses, on another body, to the masks of a few frames.
-
-    Args:
-        geometry: Poses of SMPL's family, and cameras.
-        objective: Masks, and the body.
-    """
+    """Align SMPL's poses, on another body, to the masks of a few frames."""
     from scipy.optimize import minimize  # 0.1 s that a capture in order does not need
 
     shaped, some = objective.skin.shaped, objective.subset(ALIGNMENT_SAMPLES)
@@ -175,7 +161,6 @@ class _PosedSample:
     size_px: tuple[int, int]
 
     def iou(self, distance_divisor: float, shift: Float[np.ndarray, "3"]) -> float:
-        """IoU after dividing the distance and shifting the pelvis."""
         camera = self.geometry.camera_at(self.sample.camera_row, self.size_px)
         there = move_pelvis(
             self.pelvis, camera.center_world, self.root_rotation, distance_divisor, shift

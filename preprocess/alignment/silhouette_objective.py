@@ -41,13 +41,7 @@ MAX_CACHED_POSES = 256
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MaskSample:
-    """One frame's mask.
-
-    Attributes:
-        index: Frame number.
-        camera_row: Index of the frame's camera.
-        alpha: The mask, reduced, in [0, 1].
-    """
+    """One frame's reduced mask, in [0, 1], and the row of the frame's camera."""
 
     index: int
     camera_row: int
@@ -58,10 +52,8 @@ class MaskSample:
 class SilhouetteObjective:
     """Scores a geometry by the IoU of the posed body with the masks of a few frames.
 
-    Attributes:
-        samples: Masks in the frames' order, all of one size.
-        skin: The person whose silhouette is compared with them.
-        rejections: Why sampled masks cannot be used.
+    `samples` are in the frames' order and of one size; `rejections` say why other masks cannot be
+    used.
     """
 
     samples: tuple[MaskSample, ...]
@@ -79,7 +71,7 @@ class SilhouetteObjective:
 
     @property
     def are_boxes(self) -> bool:
-        """Whether the masks are boxes, which do not determine the person's size."""
+        """True if the masks are boxes, which do not determine the person's size."""
         return float(np.median([_box_fill(w.alpha > 0.5) for w in self.samples])) > MIN_BOX_FILL
 
     def subset(self, count: int) -> "SilhouetteObjective":
@@ -199,14 +191,9 @@ def sample_masks(
     """Read a few masks; images are decoded only where their alpha channel is the mask.
 
     Args:
-        source: The frames.
         masks: The masks; None if the images have an alpha channel.
-        mask_row: From a frame number to its mask.
-        camera_row: From a frame number to its camera.
-        skin: The person.
-        count: Number of frames to sample.
+        mask_row, camera_row: From a frame number to its mask, and to its camera.
         person_px: Height of the person in the reduced masks, px.
-        excluded_frames: Frames that cannot be used.
 
     Raises:
         InputError: If no mask shows a person.
@@ -235,12 +222,9 @@ def sample_masks(
 def reduce_masks(
     samples: Sequence[MaskSample], full_px: tuple[int, int], person_px: int
 ) -> tuple[MaskSample, ...]:
-    """Bring masks of one size to one in which the person has a height.
+    """Bring masks of one size to one in which the person is about `person_px` high.
 
-    Args:
-        samples: The masks; each shows a person.
-        full_px: Width and height of the frames.
-        person_px: Height of the person in the result, px.
+    Each mask shows a person; `full_px` is the width and height of the frames.
     """
     tall = float(np.median([_mask_height(each.alpha) for each in samples]))
     longer = max(samples[0].alpha.shape) * person_px / max(tall, 1.0)
@@ -297,19 +281,13 @@ def _resize_alpha(
 
 
 def mask_warnings(objective: SilhouetteObjective | None, height_px: int) -> Iterator[str]:
-    """Describe what is implausible in some frames' masks, for people; nothing without masks.
-
-    Args:
-        objective: The masks, if there are any.
-        height_px: Height of the images.
-    """
+    """Describe what is implausible in masks, for people; `height_px` is that of the images."""
     if objective is not None:
         yield from _unusable_mask_warnings(objective)
         yield from _framing_warnings(objective, height_px)
 
 
 def _unusable_mask_warnings(objective: SilhouetteObjective) -> Iterator[str]:
-    """Masks that cannot be used, or are boxes."""
     looked = len(objective.rejections) + len(objective.samples)
     if objective.rejections:
         first = objective.rejections[0].rstrip(".")
@@ -325,7 +303,6 @@ def _unusable_mask_warnings(objective: SilhouetteObjective) -> Iterator[str]:
 
 
 def _framing_warnings(objective: SilhouetteObjective, height_px: int) -> Iterator[str]:
-    """Persons who are cut off by the image's border, or small."""
     alphas = [sample.alpha > 0.5 for sample in objective.samples]
     touching = sum(a[0].any() or a[:, 0].any() or a[:, -1].any() or a[-1].any() for a in alphas)
     if touching > 0.2 * len(alphas):
