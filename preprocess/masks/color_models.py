@@ -67,12 +67,9 @@ def color_density(
 
 
 class PlateColors(NamedTuple):
-    """The background in a part of a frame.
+    """The background in a part of a frame, at the frame's exposure.
 
-    Attributes:
-        known: Which pixels are known.
-        mean: Their colors at the frame's exposure, in levels.
-        variance: Variance of a channel.
+    `mean` holds the colors of the `known` pixels, in levels; `variance` is that of one channel.
     """
 
     known: PixelMask
@@ -80,7 +77,7 @@ class PlateColors(NamedTuple):
     variance: Float32[np.ndarray, "height width"]
 
     def in_sight(self, image: Float32[np.ndarray, "3 height width"]) -> PixelMask:
-        """Where the same part of the frame shows the background's texture: no person is before it.
+        """Pixels that show the background's texture: no person is before them.
 
         A flat background of a sleeve's color says little, leaves and books say nearly everything.
         """
@@ -111,6 +108,7 @@ def plate_density(
     A shadow has the background's color, only darker (Horprasert et al. 1999, a statistical approach
     for background subtraction and shadow detection).
     """
+    # least squares: gain = color · mean / |mean|²
     dot = colors[0] * mean[0] + colors[1] * mean[1] + colors[2] * mean[2]
     length = np.maximum(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2, np.float32(1.0))
     gain = np.clip(dot / length, np.float32(SHADOW_GAIN[0]), np.float32(SHADOW_GAIN[1]))
@@ -140,11 +138,9 @@ class BackgroundPlate:
         image: Float32[np.ndarray, "3 height width"],
         background: Bool[np.ndarray, "height width"],
     ) -> None:
-        """Estimate the frame's gains; forget everything if the camera has moved.
+        """Estimate gains from a frame's sure background; forget everything if the camera has moved.
 
-        Args:
-            image: The frame's channels, in levels; another size than before rescales the plate.
-            background: Pixels that are surely background.
+        The image's channels are in levels; another size than before rescales the plate.
         """
         self._gain = np.ones(3, np.float32)
         self._rescale(background.shape)
@@ -210,7 +206,7 @@ class DarkFilmBrightener:
     """Brightens the frames of a dark film, and leaves those of others as they are."""
 
     def __init__(self) -> None:
-        """No frame was seen."""
+        """Starts before the first frame."""
         self._brightest = 1.0
 
     def __call__(

@@ -67,12 +67,8 @@ def open_rle_masks(
 
     Accepts a list with one mask per frame (TRAM's masks.npy; an empty entry is an empty mask), a
     dictionary by file name, a COCO file with `images` and `annotations`, or PHALP's tracks. Several
-    masks of a frame are united, except PHALP's, of which one person is selected.
-
-    Args:
-        content: Content of the file.
-        path: File that messages name.
-        person: Track identity; None for the person with the most frames.
+    masks of a frame are united, except PHALP's: of these `person` selects a track, None the
+    longest.
     """
     frames = _track_rle(content, person) if is_phalp_tracks(content) else _frame_rle(content)
     if not frames or not any(frames):
@@ -90,7 +86,7 @@ def open_rle_masks(
 
 
 def is_phalp_tracks(content: Any) -> bool:
-    """Whether content is PHALP's tracks with masks: {image: {tid, mask, …}} of parallel lists."""
+    """Recognize PHALP's tracks with masks: {image: {tid, mask, …}} of parallel lists."""
     if not isinstance(content, dict) or not content:
         return False
     return all(isinstance(one, dict) and {"tid", "mask"} <= one.keys() for one in content.values())

@@ -1,7 +1,7 @@
 """Masks from files: how far each pixel is person, in [0, 1], never thresholded.
 
 Which side of the masks is the person, and whether they hold brightness or object numbers, is
-detected from a few samples.
+detected from a few samples. Files that hold no readable masks raise `InputError`.
 """
 
 from collections.abc import Callable
@@ -36,7 +36,7 @@ SOFT_MIN, SOFT_MAX = 0.1, 0.9
 
 
 def shows_background(samples: list[Float32[np.ndarray, "_ _"]], path: Path) -> bool:
-    """Whether masks are 1 on the background: on most of the image and of its rim."""
+    """Check whether masks are 1 on the background: on most of the image and of its rim."""
     shares = np.array([_coverage(mask) for mask in samples])
     usable = shares[(shares[:, 0] > 0.0) & (shares[:, 0] < 1.0)]
     if not len(usable):
@@ -65,7 +65,7 @@ def check_are_masks(samples: list[Float32[np.ndarray, "_ _"]], path: Path) -> No
 
 
 def are_object_ids(samples: list[Float32[np.ndarray, "_ _"]]) -> bool:
-    """Whether masks hold object numbers 1, 2, … of 255 rather than brightness."""
+    """Check whether masks hold object numbers 1, 2, … of 255 rather than brightness."""
     if max(float(mask.max()) for mask in samples) > MAX_OBJECTS / 255.0:
         return False
     found = np.unique(np.concatenate([np.unique(mask) for mask in samples]))
@@ -98,8 +98,6 @@ class Masks:
     """One mask per frame, in order.
 
     Attributes:
-        path: Folder or file of the masks.
-        count: Number of masks.
         size_px: Width and height of the first mask.
         inverted: Whether the files hold the background and are inverted on reading.
         names: Stems of a folder's files; None where there is only an order.
@@ -137,8 +135,7 @@ class Masks:
         """The mask of one row, scaled to an image's size.
 
         Raises:
-            InputError: If it cannot be read, has another aspect ratio than the image, or (where the
-                polarity was detected) is inverted unlike the others.
+            InputError: If its aspect ratio is not the image's, or it is inverted unlike the others.
         """
         stored = self._binarize_ids(self._read(row))
         height, width = stored.shape
@@ -165,14 +162,8 @@ class Masks:
 def open_masks(path: Path, *, invert: bool | None = None, person: str | None = None) -> Masks:
     """Open a folder of images or .npy files, a video, arrays (N, H, W), or run-length codes.
 
-    Args:
-        path: The folder or file.
-        invert: Whether the person is dark; None detects it from a few masks.
-        person: Identity in a file of several people's tracks; None for the longest track.
-
-    Raises:
-        InputError: If there are none, if they are all empty, or if it is unclear which side is the
-            person.
+    With `invert` the person is dark; None detects it from a few masks. `person` selects one of
+    several people's tracks in a file, None the longest.
     """
     if not path.exists():
         raise InputError(f"There are no masks {path}; expected a folder of images, or an .npz.")
@@ -198,13 +189,7 @@ def _open_folder(path: Path, invert: bool | None) -> Masks:
 def open_tracker_masks(
     path: Path, source: FrameSource, *, person: str | None = None
 ) -> Masks | None:
-    """The masks in a tracker's pose file (PHALP), if they match the video; else None.
-
-    Args:
-        path: The pose file.
-        source: The video.
-        person: Identity of the track; None for the longest track.
-    """
+    """Masks of a track (None: the longest) in a PHALP file, if they match the video; else None."""
     if path.suffix.lower() not in (".pkl", ".pickle"):
         return None
     if not is_phalp_tracks(content := read_untrusted_file(path)):
@@ -223,7 +208,6 @@ def open_tracker_masks(
 
 
 def _open_rle(path: Path, person: str | None) -> tuple[int, MaskReader] | None:
-    """Open run-length encoded masks; None if a file holds none."""
     try:
         return open_rle_masks(read_untrusted_file(path), path, person)
     except MALFORMED_TRACK_ERRORS as cause:
@@ -265,11 +249,7 @@ def _load_npy(path: Path) -> Shaped[np.ndarray, "..."] | None:
 
 
 def read_mask(path: Path) -> Float32[np.ndarray, "height width"]:
-    """Read one mask as stored, in [0, 1].
-
-    Raises:
-        InputError: If it cannot be decoded, or is not complete.
-    """
+    """Read one mask as stored, in [0, 1]."""
     if path.suffix.lower() == ".npy":
         stored = _load_npy(path)
         if stored is None:

@@ -1,4 +1,4 @@
-"""Sharp masks: a tracker's soft ones, and given ones whose borders miss the edges in the picture.
+"""Sharp masks: a tracker's soft ones, and given ones whose borders miss the edges in the image.
 
 The network's mask is coarse: a pixel of its square is several of the frame, fingers and the gap
 between arm and trunk are lost. It is right at large, though, so only a band around its border is
@@ -8,9 +8,9 @@ it, under the background itself (`BackgroundPlate`). Where its texture is in pla
 no person. A guided filter makes neighbors of like color agree and carries the result to full size;
 before a known background, the border is then moved to where the colors change (`refine_border`).
 
-Given masks are right where the picture changes along their border: color is a mixture of person and
-background by alpha, so that the picture's gradient follows that of alpha. They are refined in the
-same way and the two borders compared; only if the picture changes clearly more along the refined
+Given masks are right where the image changes along their border: color is a mixture of person and
+background by alpha, so that the image's gradient follows that of alpha. They are refined in the
+same way and the two borders compared; only if the image changes clearly more along the refined
 one is it used. Exact masks stay as they are.
 """
 
@@ -39,7 +39,7 @@ WORKING_SCALE = 2.0
 """Pixels of the working image for each pixel of the network's square, about; the working image is
 the frame, or smaller by a whole number."""
 RESCALE_MARGIN = 0.4
-"""How far that number must be from the best before it changes."""
+"""Distance of that number from the best before it changes."""
 
 OUTER_BAND, INNER_BAND = 6.0, 6.0
 """Reach of the band outside and inside the mask's border, in the network's pixels."""
@@ -77,7 +77,7 @@ COMPARED_FRAMES = 10
 """Frames whose borders are compared; what they say holds for all others."""
 MIN_EDGE_RATIO = 1.15
 """Ratio of the edge strengths along refined and given borders from which masks are refined; noise
-in the pictures alone makes it up to 1.12."""
+in the images alone makes it up to 1.12."""
 SQUARE_PX = 256
 """Width and height of the square that holds the person, as in a tracker's masks."""
 SQUARE_MARGIN = 1.25
@@ -85,7 +85,7 @@ SQUARE_MARGIN = 1.25
 
 
 class _Band(NamedTuple):
-    """The part of a working image around the person, and what the network says of it.
+    """The part of a working image around the person, and the network's mask of it.
 
     Attributes:
         image: The three channels, in levels.
@@ -93,8 +93,7 @@ class _Band(NamedTuple):
         prior: The network's probability of person.
         inside: Pixels that are more likely person.
         person, background: Pixels that are surely so, for learning colors.
-        rows, columns: The pixels of the band.
-        colors: Their colors, in levels.
+        rows, columns, colors: The pixels of the band, and their colors in levels.
     """
 
     image: Channels
@@ -113,11 +112,7 @@ class MaskRefiner:
     """Refines the masks of one person in the frames of one camera, in their order."""
 
     def __init__(self, frame_px: tuple[int, int]) -> None:
-        """Start without knowledge of background and person.
-
-        Args:
-            frame_px: Width and height of the frames.
-        """
+        """Start without knowledge of background and person, for frames of one width and height."""
         self._frame_px = frame_px
         self._brighten, self._plate = DarkFilmBrightener(), BackgroundPlate()
         self._reduction = 0
@@ -129,16 +124,7 @@ class MaskRefiner:
         mask: CroppedMask,
         size_px: tuple[int, int] | None = None,
     ) -> Plane:
-        """Refine the mask of the next frame.
-
-        Args:
-            rgb: The frame.
-            mask: The tracker's mask.
-            size_px: Width and height of the result; None for the frame's.
-
-        Returns:
-            How far each pixel is person, in [0, 1].
-        """
+        """Refine the next frame's mask, in [0, 1], at `size_px` (width, height) or the frame's."""
         alpha = self._refine(self._brighten(rgb), mask)
         if size_px is None or size_px == self._frame_px:
             return alpha
@@ -199,7 +185,7 @@ class MaskRefiner:
         return _without_islands(alpha, band.inside)
 
     def _color_frequencies(self, band: _Band) -> tuple[Pixels, Pixels]:
-        """How frequent the band's colors are on the person, and around them."""
+        """Frequencies of the band's colors on the person, and around them."""
         some = np.s_[::2, ::2]
         bins = _color_bins(band.image[:, ::2, ::2])
         now = np.stack(
@@ -219,10 +205,7 @@ class MaskRefiner:
 def _find_band(image: Channels, soft: Plane, unit_px: float) -> tuple[_Band | None, PixelMask]:
     """The band around a soft mask's border, and the pixels beyond it.
 
-    Args:
-        image: The working image's channels.
-        soft: The network's mask of it.
-        unit_px: Edge of the network's pixel in it, px.
+    `unit_px` is the edge of one of the network's pixels in the working image, px.
     """
     far = np.ones(soft.shape, dtype=bool)
     left, top, width, height = cv2.boundingRect((soft > 0.5).astype(np.uint8))
@@ -277,19 +260,19 @@ class GivenMaskRefiner:
     """Refines the masks of a recording or a stream, frame by frame in order, if that is needed."""
 
     def __init__(self) -> None:
-        """Nothing is known yet."""
+        """Start before the first frame."""
         self._refiner: MaskRefiner | None = None
         self._size_px = (0, 0)
         self._ratios: list[float] = []
 
     @property
     def is_needed(self) -> bool:
-        """Whether masks are refined, by the frames that were seen; at first they are not."""
+        """True if masks are refined, by the frames that were seen; at first they are not."""
         return bool(self._ratios) and float(np.mean(self._ratios)) >= MIN_EDGE_RATIO
 
     @property
     def note(self) -> str | None:
-        """What a user should know of it; None if the masks stay as they are."""
+        """Note for the user; None if the masks stay as they are."""
         if not self.is_needed:
             return None
         return (
@@ -300,7 +283,7 @@ class GivenMaskRefiner:
 
     @property
     def keeps_given_masks(self) -> bool:
-        """Whether enough frames have shown that the given masks need no refinement."""
+        """True once enough frames have shown that the given masks need no refinement."""
         return len(self._ratios) >= COMPARED_FRAMES and not self.is_needed
 
     def __call__(
@@ -309,16 +292,7 @@ class GivenMaskRefiner:
         alpha: Float32[np.ndarray, "rows columns"],
         size_px: tuple[int, int],
     ) -> Float32[np.ndarray, "height width"]:
-        """Refine the mask of the next frame.
-
-        Args:
-            rgb: The frame.
-            alpha: Its given mask, of the same size.
-            size_px: Width and height of the result.
-
-        Returns:
-            The refined mask, or the given one if that is as good.
-        """
+        """Refine the next frame's mask, unless the given one is as good; scaled to `size_px`."""
         found = alpha
         if not self.keeps_given_masks and (alpha > 0.5).any():
             refined = self._refine(rgb, alpha)
@@ -342,11 +316,9 @@ class GivenMaskRefiner:
 def edge_strength(
     rgb: UInt8[np.ndarray, "height width 3"], alpha: Float32[np.ndarray, "height width"]
 ) -> float:
-    """How much a picture changes along a mask's border.
+    """Change of color across a mask's border, levels per pixel.
 
-    Returns:
-        Change of color across the border per pixel, levels; mean over the border, weighted by
-        the gradient of alpha.
+    It is the mean over the border, weighted by the gradient of alpha.
     """
     border, slopes = _gradient(alpha), [_gradient(channel) for channel in cv2.split(rgb)]
     steepness = np.hypot(*border)

@@ -57,10 +57,8 @@ def refine_border(
 
     Args:
         rgb: The image, in levels of any type.
-        alpha: The mask.
         background: Expected background color of each pixel and its standard deviation, in levels.
-        foreground: Expected color of the person and its standard deviation, in levels. Where
-            either deviation is infinite the mask stays.
+        foreground: The same of the person. Where either deviation is infinite the mask stays.
     """
     outside = border_distance_px(alpha)
     spread = background[1] + foreground[1]
@@ -69,6 +67,7 @@ def refine_border(
     tried = np.clip(0.5 - (away[:, None] + BORDER_SHIFTS_PX), 0.0, 1.0).astype(np.float32)
     off = (rgb[at].astype(np.float32) - background[0][at]) @ COLOR_AXES
     apart = (foreground[0][at] - background[0][at]) @ COLOR_AXES
+    # |I - (a F + (1 - a) B)|² = |off - a apart|², for each displacement's a
     squared = (off**2).sum(axis=1)[:, None] - 2.0 * tried * (off * apart).sum(axis=1)[:, None]
     squared += tried**2 * (apart**2).sum(axis=1)[:, None]
     noise = (background[1][at] ** 2)[:, None] * (1.0 - tried) ** 2 + 1.0
@@ -117,19 +116,15 @@ def guided_coefficients(
     radius_px: int,
     tolerance: float,
 ) -> Float32[np.ndarray, "4 height width"]:
-    """Fit alpha = a · color + b in the window around each pixel, and average a and b over windows.
+    """Fit alpha = a · color + b in the window around each pixel, and average (a, b) over windows.
 
     The averages may be enlarged and applied to a larger image: that is the fast guided filter (He
     and Sun 2015, arXiv:1505.00996).
 
     Args:
         guide: The image's three channels, in levels.
-        alpha: What to fit.
         radius_px: Half the window's edge, px; the edge is `2 * radius_px + 1`.
         tolerance: Standard deviation of colors, in levels, below which a window counts as one.
-
-    Returns:
-        a of the three channels, and b.
     """
     height, width = alpha.shape
     rows, halo = max(STRIP_PX // width, 4 * radius_px), 2 * radius_px
@@ -156,6 +151,7 @@ def _fit_windows(
         product -= cv2.multiply(mean[i], mean[j])
         return product
 
+    # a = (Σ + tolerance² 1)⁻¹ cov(color, alpha), and b = mean(alpha) - a · mean(color)
     rr, gg, bb = (covariance(i, i) + np.float32(tolerance**2) for i in range(3))
     rg, rb, gb = covariance(0, 1), covariance(0, 2), covariance(1, 2)
     red, green, blue = (covariance(i, 3) for i in range(3))  # become the slopes a
@@ -202,7 +198,7 @@ def steepen(alpha: Plane) -> Plane:
 def move_border(
     image: Float32[np.ndarray, "3 height width"], alpha: Plane, plate: PlateColors
 ) -> Plane:
-    """How much more person a pixel is, by its color between the person's and the background's."""
+    """Change of alpha near a mask's border, by colors between the person's and the background's."""
     sure = cv2.erode((alpha > SURE_ALPHA).astype(np.uint8), np.ones((3, 3), np.uint8))
     size_px, window = alpha.shape[::-1], (NEARBY_PX, NEARBY_PX)
     half_px = (size_px[0] + 1) // 2, (size_px[1] + 1) // 2
