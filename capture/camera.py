@@ -11,13 +11,13 @@ from jaxtyping import Float
 class Camera:
     """A pinhole camera with OpenCV axes (x right, y down, z forward) and OpenCV distortion.
 
-    A pixel is a point (x, y) of the picture plane in pixels; the pixel in row i and column j
+    A pixel is a point (x, y) of the image plane in pixels; the pixel in row i and column j
     covers [j, j+1) x [i, i+1) and has its centre at (j + 0.5, i + 0.5).
 
     Attributes:
         focal_px: Focal lengths along x and y.
         center_px: Principal point.
-        size_px: Width and height of the picture.
+        size_px: Width and height of the image.
         camera_from_world: Rigid 4x4 transform, metres.
         distortion: OpenCV coefficients k1 k2 p1 p2 [k3 …]; empty for none.
     """
@@ -58,7 +58,7 @@ class Camera:
         return -rotation.T @ translation
 
     def resize(self, size_px: tuple[int, int]) -> "Camera":
-        """The same camera for a picture scaled to another size (the same field of view)."""
+        """The same camera for an image scaled to another size (the same field of view)."""
         sx, sy = size_px[0] / self.size_px[0], size_px[1] / self.size_px[1]
         return replace(
             self,
@@ -68,7 +68,7 @@ class Camera:
         )
 
     def crop(self, corner_px: tuple[int, int], size_px: tuple[int, int]) -> "Camera":
-        """The camera of a part of the picture: its upper left corner (x, y), width and height."""
+        """The camera of a part of the image: its upper left corner (x, y), width and height."""
         (cx, cy), (left, top) = self.center_px, corner_px
         return replace(self, center_px=(cx - left, cy - top), size_px=size_px)
 
@@ -83,9 +83,9 @@ class Camera:
         return self.resize((width, height))
 
     def rotate_quarter_turns(self, quarter_turns: int) -> "Camera":
-        """The camera of the same pictures, rotated counter-clockwise by this many quarter turns.
+        """The camera of the same images, rotated counter-clockwise by this many quarter turns.
 
-        Its axes turn with the picture; where it stands and what it sees stay. Distortion can only
+        Its axes turn with the image; its position and its view stay. Distortion can only
         follow where it is radial, or by half a turn of its tangential part's signs.
         """
         camera = self

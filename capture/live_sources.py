@@ -67,7 +67,6 @@ class CameraDevice:
 
         Args:
             address: The part of the argument behind `camera:`.
-            selection: The frames that are wanted.
             pace: The clock of those who wait for poses or masks of its images; closing ends it.
 
         Raises:
@@ -243,7 +242,7 @@ class WatchedImageFolder:
 
         Args:
             path: The folder, which may be empty.
-            selection: The images that are wanted, counted in natural order.
+            selection: Counted in natural order.
             pace: Its clock; stopping it ends the watch.
             idle_s: The source ends when no new image has come for this time, seconds.
 

@@ -269,9 +269,9 @@ class PacingClock:
 class RealtimePlayback(_WrappedSource):
     """A source whose frames are handed over no earlier than their timestamps say.
 
-    The first frame is at 0; what lies between two frames is what the container says, whatever its
-    rate. Nothing is lost: where frames are not taken in time, the playback falls behind and
-    catches up as soon as it can.
+    The first frame is at 0; the intervals between frames are the container's, whatever its rate.
+    Nothing is lost: where frames are not taken in time, the playback falls behind and catches up as
+    soon as it can.
 
     Attributes:
         catch_up: Whether frames come as fast as they are taken, as those do that an interrupted run

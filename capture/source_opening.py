@@ -54,7 +54,6 @@ def _list_videos(folder: Path) -> list[Path]:
 
 
 def _ambiguous_folder_error(path: Path, videos: list[Path]) -> InputError:
-    """Explain why a folder is neither a folder of images nor one with a single video."""
     if videos:
         found, advice = ", ".join(file.name for file in videos), "Name the video itself."
     else:
@@ -76,8 +75,6 @@ def open_live_source(
     Args:
         path: The folder; a capture folder's images lie in its `images/`.
         camera: Number or address of a camera instead.
-        frames: The frames that are wanted. All if None.
-        pace: The clock of a folder.
         idle_s: Time without a new image after which a folder ends, seconds.
     """
     selection = FrameSelection.of(frames)

@@ -200,7 +200,6 @@ def _quarter_turns(frame: Any) -> int:
 
 
 def _has_transparency(frame: Any) -> bool:
-    """Return whether a frame has an alpha channel that is not opaque."""
     if not any(component.is_alpha for component in frame.format.components):
         return False
     return has_cutout_alpha(frame.to_ndarray(format="rgba")[..., 3])

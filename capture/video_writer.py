@@ -63,8 +63,6 @@ def write_video(path: Path, images: Iterable[Pixels], fps: float, codec: VideoCo
     Args:
         path: File to write; its suffix selects the container.
         images: RGB, or RGBA with straight alpha.
-        fps: Images per second.
-        codec: The encoder and its options.
 
     Raises:
         OSError: If the disk is full.

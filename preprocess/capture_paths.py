@@ -59,8 +59,7 @@ def find_capture_paths(
 
     Args:
         video: Video file, folder of images, or native capture folder.
-        poses: Pose file; needed unless `video` is a folder that holds one of `POSES`.
-        masks: Folder or file of masks.
+        poses: Pose file; needed unless `video` is a folder that holds one of `POSE_FILE_NAMES`.
         cameras: Camera file; "static" for a static camera without a description; "solve" for a
             moving one, for which no file is looked for either.
 

@@ -48,7 +48,6 @@ def associate_by_order(rows: int, source: FrameSource, things: str) -> Callable[
 
 
 def _mismatch_hint(rows: int, count: int) -> str:
-    """Suggest a cause of the mismatch, and a remedy."""
     if rows > count:
         return " Was the video cut, or re-encoded with fewer frames per second?"
     step = round(count / rows)

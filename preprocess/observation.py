@@ -22,7 +22,7 @@ from preprocess.plugins import Segmenter
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Observation:
-    """One example of the trainer.
+    """One training example.
 
     Attributes:
         alpha: Degree to which each pixel is person, in [0, 1], never thresholded.
@@ -64,7 +64,6 @@ def observation_builder(
     """Check that the parts fit together, and return a function from a frame to its observation.
 
     Args:
-        source: Where the frames come from.
         motion: Poses; matched by their frame numbers, by their times, or by order.
         masks: One mask a frame; None if `segment` finds it, or else the alpha channel is the mask.
         cameras: Cameras of the frames' size.

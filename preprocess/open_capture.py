@@ -100,7 +100,6 @@ def open_capture(
     """Open a recording: its frames, poses, masks and cameras, aligned with each other.
 
     Args:
-        inputs: The inputs of the user.
         size_px: Longer side of the training images.
         skip_checks: Opens the parts even if they do not fit together, to find out why.
         avatar_body: File of a finished avatar's person, to whom the poses belong.

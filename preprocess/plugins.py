@@ -21,7 +21,7 @@ from preprocess.tracking.keypoints import PersonKeypoints
 DEFAULT_TRACKER = "blazepose"
 """Name of this project's own tracker."""
 SEGMENTER_PREFIX = "segmenter:"
-"""What precedes a segmenter's name in --masks."""
+"""Prefix of a segmenter's name in --masks."""
 DEFAULT_SEGMENTER = "blazepose"
 """Name of this project's own segmenter."""
 
@@ -95,7 +95,6 @@ def _make_registered(kind: str, name: str, *arguments: object, own: str, option:
 
     Args:
         kind: "segmenter" or "tracker".
-        name: The name that it is registered by.
         arguments: Those of `make`.
         own: Name of this project's own part of that kind.
         option: The user's option, for messages.

@@ -99,7 +99,6 @@ def _as_bytes(raw: Any) -> Any:
 
 
 def _fill_array(array: Shaped[np.ndarray, "..."], state: Any) -> None:
-    """Give an array of `_reconstruct` its type, shape and contents."""
     _, shape, kind, by_columns, raw = state
     if min(shape, default=0) < 0 or (kind.dtype.hasobject and math.prod(shape) != len(raw)):
         raise ValueError(f"an array of {shape}")  # which numpy would not check
@@ -226,7 +225,7 @@ def load_torch(data: bytes) -> Any:
 
 
 def load_safe_pickle(data: bytes) -> Any:
-    """Return what a pickle or PyTorch file holds: containers, arrays, tensors and stand-ins.
+    """Return the content of a pickle or PyTorch file: containers, arrays, tensors and stand-ins.
 
     Raises:
         UnsafePickleError: If it names anything that is not in `ALLOWED`.

@@ -227,12 +227,8 @@ class LiveTracking:
     ) -> Callable[[Frame], Observation | DroppedFrame]:
         """Make the function from a frame, tracked when it was taken, to its observation.
 
-        Args:
-            source: The frames.
-            cameras: The camera.
-            size_px: Longer side of the observations.
-            segment: Estimates masks, where the user named a segmenter.
-            refine: Refines given masks; the tracker's are refined already.
+        `size_px` is the observations' longer side. `segment` estimates masks where the user named a
+        segmenter, `refine` refines given masks; the tracker's are refined already.
         """
         target_px = shrink_to_longer_side(source.size_px, size_px)
         found = deque[SeenPerson](maxlen=1)  # in the frame whose pose was asked for

@@ -42,7 +42,7 @@ PoseSpace = Literal["camera", "world"]
 
 @dataclass(frozen=True, kw_only=True)
 class RelativeFocalLength:
-    """A focal length that is known only as a share of the picture, looking at its middle.
+    """A focal length that is known only as a fraction of the image's size, looking at its middle.
 
     Attributes:
         ratio: Focal length as a fraction of `reference`.
@@ -53,7 +53,7 @@ class RelativeFocalLength:
     reference: Literal["longer side", "diagonal"] = "longer side"
 
     def intrinsic_matrix(self, size_px: tuple[int, int]) -> Float[np.ndarray, "3 3"]:
-        """The camera matrix K for pictures of a size (width, height)."""
+        """The camera matrix K for images of a size (width, height)."""
         width, height = size_px
         unit = max(size_px) if self.reference == "longer side" else float(np.hypot(width, height))
         focal = self.ratio * unit

@@ -88,7 +88,6 @@ class SkinPoints:
     """Points spread evenly over one person's skin, dense enough to draw a silhouette.
 
     Attributes:
-        rest: Rest positions, metres.
         corners: The three vertices that each point lies between.
         shares: Barycentric coordinates of each point between them.
     """

@@ -163,5 +163,5 @@ def slerp(
     """Rotations on the shortest way from one to the other (slerp; Shoemake 1985)."""
     start = rotation_matrices(before)
     way = axis_angles_from_matrices(np.swapaxes(start, -1, -2) @ rotation_matrices(after))
-    turned = start @ rotation_matrices(fractions[:, None, None] * way)
+    turned = start @ rotation_matrices(fractions[:, None, None] * way)  # R_a exp(t log(R_aᵀ R_b))
     return axis_angles_from_matrices(turned)

@@ -142,7 +142,7 @@ Arrays = dict[str, Shaped[np.ndarray, "..."]]
 
 
 def load_body_model(path: Path | None = None) -> BodyModel:
-    """Reads a 24-joint body, SMPL's or ours; the embedded body if no path is given.
+    """Read a 24-joint body, SMPL's or ours; the embedded body if no path is given.
 
     Keys: v_template (V, 3), shapedirs (V, 3, B), weights (V, 24), kintree_table (2, 24), f (F, 3),
     and either J_regressor (24, V), which makes it SMPL's, or J (24, 3) and J_shapedirs (24, 3, B);

@@ -18,7 +18,7 @@ from preprocess.file_content import read_npz
 from preprocess.frame_association import cameras_by_frame, interpolate_missing_cameras
 
 DEFAULT_FOCAL_RATIO = 0.85
-"""Focal length of a phone's main camera in video, in units of the picture's longer side."""
+"""Focal length of a phone's main camera in video, in units of the image's longer side."""
 ASSUMED_CAMERA_SOURCE = f"{DEFAULT_FOCAL_RATIO} x longer side"
 """Origin of a camera, for the report, if neither a file nor the poses state one."""
 
@@ -71,7 +71,6 @@ def read_cameras(
     the same shape are scaled to `size_px`.
 
     Args:
-        path: File or folder.
         size_px: Width and height of the frames; None for those of the file's own images.
         source: The frames, whose names or number tell which camera is whose. Without it cameras
             of other programs are taken in order.
@@ -214,9 +213,9 @@ def assume_static_camera(motion: Motion, size_px: tuple[int, int]) -> CameraTrac
 def tracker_intrinsic_matrix(
     motion: Motion, size_px: tuple[int, int]
 ) -> Float[np.ndarray, "3 3"] | None:
-    """The tracker's K for pictures of a size; None if it is not known.
+    """The tracker's K for images of a size; None if it is not known.
 
-    A K whose principal point is the middle of a larger or smaller picture belongs to such a one.
+    A K whose principal point is the middle of a larger or smaller image belongs to such a one.
     """
     if motion.assumed_focal is not None:
         return motion.assumed_focal.intrinsic_matrix(size_px)

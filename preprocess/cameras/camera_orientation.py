@@ -56,7 +56,6 @@ def _rotate(stored: CameraTrack, path: Path, source: FrameSource) -> CameraTrack
 
 
 def _principal_point_offset_px(track: CameraTrack) -> float:
-    """Distance of the first camera's principal point from the middle of its image, pixels."""
     camera = track.cameras[0]
     return float(np.abs(np.array(camera.center_px) - np.array(camera.size_px) / 2.0).sum())
 

@@ -22,7 +22,7 @@ from preprocess.cameras.named_camera import (
 )
 
 MODEL_SUBFOLDERS = (".", "sparse/0", "0", "sparse", "colmap/sparse/0", "dense/sparse")
-"""Where models lie in a folder, as COLMAP, nerfstudio and others leave them."""
+"""Places of models in a folder, as COLMAP, nerfstudio and others leave them."""
 
 CAMERA_MODELS = {
     "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8,

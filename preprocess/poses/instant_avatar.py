@@ -175,7 +175,6 @@ def parse_per_frame(content: Any, path: Path, default_model: str) -> MotionByPer
 
 
 def _parse_row(item: Any) -> dict[str, Any] | None:
-    """One row by our keys; None if it is none."""
     if not isinstance(item, dict):
         return None
     named = normalize_keys(item)

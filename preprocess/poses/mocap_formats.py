@@ -78,7 +78,6 @@ def _aist_motion(content: dict[str, Any]) -> Motion:
 
 
 def _rate(content: dict[str, Any]) -> float | None:
-    """Poses per second, if the file states them."""
     keys = ("mocap_framerate", "mocap_frame_rate", "frame_rate", "fps")
     found = next((content[key] for key in keys if key in content), None)
     rate = None if found is None else float(np.asarray(found).reshape(-1)[0])

@@ -47,7 +47,6 @@ def build_motion(
         translations: Places of the root, one row a pose, metres.
         betas: One row, or one row a pose: then their median.
         frames: The frames' numbers; of a number that comes twice the first row counts.
-        times_s: Times in seconds.
         lost: Rows that the tracker itself calls lost.
         body_model, space, anchor: See `Motion`.
         lens: The camera matrix K, or one per pose; or the focal length that the tracker assumed.
@@ -276,7 +275,7 @@ def place_by_pixels(
     rows[:, :, 2] = -away
     right = away * shape[:, 2:] - focal * shape[:, :2]
     solved, *_ = np.linalg.lstsq(rows.reshape(-1, 3), right.reshape(-1), rcond=None)
-    return solved - middle
+    return solved - middle  # the rows are about the joints' middle
 
 
 def _refocus_motion(motion: Motion, shaped: ShapedBody, camera: Camera) -> Motion:

@@ -141,7 +141,6 @@ def _read_numbers(arrays: Arrays, key: str, path: Path) -> Float[np.ndarray, "..
 
 
 def _rows(arrays: Arrays, key: str, path: Path) -> Float[np.ndarray, "poses *numbers"]:
-    """An array of one row a pose."""
     rows = _read_numbers(arrays, key, path)
     if rows.ndim < 2 or not rows.size:
         raise InputError(f"`{key}` in {path} has the shape {rows.shape}; expected one row a pose.")
@@ -228,7 +227,6 @@ def _intrinsic(arrays: Arrays, path: Path) -> Float[np.ndarray, "3 3"] | None:
 
 
 def _space(arrays: Arrays, path: Path) -> PoseSpace:
-    """The space of the poses."""
     said = str(arrays["space"]) if "space" in arrays else "world"
     if said == "world" or said == "camera":
         return said

@@ -116,7 +116,6 @@ def _recognize(
 
 
 def _describe_content(content: Any) -> str:
-    """Describe the content of a file that holds no poses."""
     if isinstance(content, np.ndarray):
         return f"it is an array of the shape {content.shape}"
     if isinstance(content, dict):

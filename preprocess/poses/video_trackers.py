@@ -44,7 +44,6 @@ MAX_LINK_STEP_M = 1.0
 
 
 def _hold_keys(people: Any, keys: set[str]) -> bool:
-    """Return whether a content is people by their names, each with all of the keys."""
     return (
         isinstance(people, dict)
         and len(people) > 0
@@ -53,7 +52,6 @@ def _hold_keys(people: Any, keys: set[str]) -> bool:
 
 
 def _choose_view(rows: dict[str, Any], views: tuple[str, str], prefer_world: bool) -> str:
-    """The key of the poses in the camera or in the world, by preference and existence."""
     return next(key for key in (views[::-1] if prefer_world else views) if key in rows)
 
 
@@ -61,7 +59,7 @@ def parse_wham(content: Any, prefer_world: bool = False) -> MotionByPerson | Non
     """WHAM: axis-angles in the camera and in a world with y up, by person.
 
     Layout: joblib `wham_output.pkl` {person: {pose (N, 72), trans (N, 3), pose_world, trans_world,
-    betas (N, 10), verts, frame_ids (N,)}}. Its focal length, if none was given, is the picture's
+    betas (N, 10), verts, frame_ids (N,)}}. Its focal length, if none was given, is the image's
     diagonal, and is not stored. (github.com/yohanshin/WHAM, demo.py.)
     """
     if not _hold_keys(content, {"pose", "trans", "frame_ids"}):
@@ -82,7 +80,7 @@ def parse_wham(content: Any, prefer_world: bool = False) -> MotionByPerson | Non
 
 
 def parse_vibe(content: Any, prefer_world: bool = False) -> MotionByPerson | None:
-    """VIBE: axis-angles and a weak-perspective camera of the whole picture, by person.
+    """VIBE: axis-angles and a weak-perspective camera of the whole image, by person.
 
     Layout: joblib `vibe_output.pkl` {person: {pose (N, 72), betas (N, 10), orig_cam (N, 4) = (sx,
     sy, tx, ty), pred_cam, bboxes (N, 4), verts, frame_ids (N,)}}: a point (X, Y) of the body is
@@ -135,7 +133,7 @@ def parse_prompthmr(content: Any, prefer_world: bool = False) -> MotionByPerson 
 
     Layout: `results.pkl` {people: {person: {frames (N,), smplx_cam, smplx_world: {rotmat (N, 55, 3,
     3) or pose (N, 165), shape (N, 10), trans (N, 3)}}}, camera: {img_focal, img_center, …}}.
-    Pictures were shrunk to a height of 896 px at most: K belongs to these.
+    Images were shrunk to a height of 896 px at most: K belongs to these.
     (github.com/yufu-wang/PromptHMR.)
     """
     tracks: Any = content.get("people") if isinstance(content, dict) else None
@@ -205,7 +203,7 @@ def _tram_intrinsic(held: Any) -> Float[np.ndarray, "3 3"] | None:
 def parse_phalp(content: Any, prefer_world: bool = False) -> MotionByPerson | None:
     """4D-Humans and PHALP: rotation matrices of everybody in each frame, in a camera of 5,000 px.
 
-    Layout: a joblib file {picture: {time, tid, tracked_ids, tracked_time, size, camera, smpl, …}};
+    Layout: a joblib file {image: {time, tid, tracked_ids, tracked_time, size, camera, smpl, …}};
     the lists run in parallel, `smpl[k]` = {global_orient (1, 3, 3), body_pose (23, 3, 3), betas
     (10,)}, `camera[k]` = (3,), metres for a focal length of 5,000 px on a padded square of 256 px.
     A track that was not detected in a frame is in its lists as a guess: `tracked_time[k]` > 0.
@@ -241,7 +239,7 @@ def _phalp_person(rows: list[tuple[int, Any, Any]]) -> Motion:
 def parse_romp(content: Any, prefer_world: bool = False) -> MotionByPerson | None:
     """ROMP and BEV (simple-romp): all people of each frame, with or without tracks.
 
-    Layout: `video_results.npz` with `results` {picture: {smpl_thetas (P, 72), smpl_betas (P, 10 or
+    Layout: `video_results.npz` with `results` {image: {smpl_thetas (P, 72), smpl_betas (P, 10 or
     11), cam (P, 3), cam_trans (P, 3), pj2d, pj2d_org, …}} and, tracked with -t, `sequence_results`
     {track: {frame_id: […], smpl_thetas: […], …}}; or a folder of one .npz a frame, each with its
     `results`. (github.com/Arthur151/ROMP, simple_romp: romp/main.py, bev/main.py, romp/utils.py.)

@@ -169,7 +169,7 @@ JUMP_DEG = 1.0
 
 
 def find_outlier_cameras(model: SparseModel) -> Bool[np.ndarray, "cameras"]:
-    """Cameras that see too few points, or turn unlike their neighbours; better placed otherwise."""
+    """Cameras that see too few points, or turn unlike their neighbors; better placed otherwise."""
     counts = np.bincount(model.observation_camera, minlength=len(model.frames))
     few = counts < MIN_OBSERVATION_RATIO * np.median(counts)
     return few | _rotation_jumps(model)

@@ -72,9 +72,7 @@ class SolverSettings:
 
     Attributes:
         focal_ratio: Known focal length as a fraction of the image's longer side, if any.
-        seed: Seed of everything random.
         threads: Threads for features; the result does not depend on it.
-        max_keyframes: Largest number of key frames.
     """
 
     focal_ratio: float | None = None
@@ -91,11 +89,8 @@ def solve_cameras(
 ) -> CameraSolution:
     """Solve the cameras of all selected frames; takes minutes.
 
-    Args:
-        source: The frames.
-        person_mask: Finds the person, who moves and is ignored.
-        settings: Seed, threads and the known focal length.
-        report_progress: Called with the fraction of the work that is done.
+    `person_mask` finds the person, who moves and is ignored; progress is the fraction of the work
+    that is done.
 
     Raises:
         InputError: If pycolmap is missing, or no solution passes all gates.
@@ -159,7 +154,6 @@ def _solve(
 
 
 def _report_stage(report_progress: Callable[[float], None], name: str, share: float) -> None:
-    """Report the fraction of the whole work from that of one stage."""
     names = list(STAGE_SHARES)
     before = sum(STAGE_SHARES[each] for each in names[: names.index(name)])
     report_progress(before + share * STAGE_SHARES[name])
@@ -202,7 +196,6 @@ def _map(
 
 
 def _unsolved_error(failed: list[QualityGate]) -> InputError:
-    """Explain the failure and its remedies."""
     reasons = "; ".join(gate.failure_reason for gate in failed[:3]) or "no two images fit together"
     return InputError(
         f"The cameras could not be solved with certainty: {reasons}. Film with the surroundings in "

@@ -57,7 +57,7 @@ class FloorPlane:
 
 
 def mean_camera_up(model: SparseModel) -> Float[np.ndarray, "3"]:
-    """Up as the cameras hold their pictures: minus the mean of their y axes."""
+    """Up as the cameras hold their images: minus the mean of their y axes."""
     up = -model.camera_from_world[:, 1, :3].mean(axis=0)
     return up / np.linalg.norm(up)
 
@@ -97,7 +97,6 @@ def fit_floor_plane(model: SparseModel, up: Float[np.ndarray, "3"]) -> FloorPlan
 def _plane_through(
     three: Float[np.ndarray, "3 3"], up: Float[np.ndarray, "3"]
 ) -> tuple[Float[np.ndarray, "3"], float] | None:
-    """The plane through three points, if it is nearly level."""
     normal = np.cross(three[1] - three[0], three[2] - three[0])
     length = float(np.linalg.norm(normal))
     if length < 1e-12:
@@ -260,7 +259,7 @@ def _scale_from_static_person(
     square = float((moves**2).sum())
     if len(moves) < 3 * MIN_FRAMES or square <= 0.0:
         return None, float("inf")
-    scale = float((moves * stays).sum()) / square
+    scale = float((moves * stays).sum()) / square  # least squares: s = Σ a b / Σ a²
     if scale <= 0.0 or scale * np.sqrt(3.0 * square / len(moves)) < MIN_CAMERA_PATH_M:
         return None, float("inf")
     return scale, float(np.sqrt(3.0 * ((moves * scale - stays) ** 2).mean()))

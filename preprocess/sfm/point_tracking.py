@@ -1,7 +1,7 @@
 """Points tracked from image to image: they tell a static camera, and place the frames in between.
 
 The tracker is that of Lucas & Kanade 1981, in pyramids (Bouguet 2000). Points that a key frame sees
-are followed into its neighbours, always from the key frame's own picture, so that errors do not add
+are followed into its neighbors, always from the key frame's own image, so that errors do not add
 up. Each frame is placed by RANSAC on three points (Ke & Roumeliotis 2017, AP3P) and refined by
 least squares. Where the next key frame is reached, its own camera is known: that tests the solution
 by something else than the matches it was made from.
@@ -290,7 +290,7 @@ class _PointTracks:
 def _frames_between_keyframes(
     source: FrameSource, anchors: list[_KeyframePoints], size_px: tuple[int, int]
 ) -> Iterator[tuple[_KeyframePoints | None, _KeyframePoints | None, list[tuple[int, GrayImage]]]]:
-    """The frames between two neighbouring key frames, and before the first and after the last."""
+    """The frames between two neighboring key frames, and before the first and after the last."""
     waiting, stretch = list(anchors), []
     before: _KeyframePoints | None = None
     for frame in source.frames():
