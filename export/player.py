@@ -38,7 +38,7 @@ MIN_CLOSE_FRACTION = 0.999
 
 @dataclass(frozen=True, kw_only=True)
 class PictureDifference:
-    """How far two premultiplied pictures differ.
+    """Difference of two premultiplied pictures.
 
     Attributes:
         largest_difference: Over all pixels and channels, in 1/255.
@@ -61,7 +61,7 @@ class PictureDifference:
 
     @property
     def matches(self) -> bool:
-        """Whether they count as the same picture."""
+        """Tell whether they count as the same picture."""
         return self.close_fraction >= MIN_CLOSE_FRACTION
 
 

@@ -41,7 +41,7 @@ def visible_depth_steps(
             j = I32(np.rint((positions[p, 1] - normals[p, 1] * depth - low[1]) / voxel_m))
             k = I32(np.rint((positions[p, 2] - normals[p, 2] * depth - low[2]) / voxel_m))
             i, j, k = min(max(i, 0), last_i), min(max(j, 0), last_j), min(max(k, 0), last_k)
-            total += density[i, j, k] * step
+            total += density[i, j, k] * step  # the optical depth, Σ σ Δ
             along[n] = total
         enough = min(F32(opaque), F32(fraction) * total)
         seen = 0

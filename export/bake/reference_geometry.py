@@ -61,6 +61,7 @@ def newton_correction(
     inverse, sound = invert_jacobians(settings, jacobian)
     turned = np.einsum("nij,nj->ni", inverse, rays.direction_camera)
     inverse = inverse[sound]
+    # x += J⁻¹ (t d - skinned(x)), at most `max_correction_m` long
     off = rays.begin[sound, None] * rays.direction_camera[sound] - camera[sound]
     shift = np.einsum("nij,nj->ni", inverse, off)
     length = np.linalg.norm(shift, axis=1, keepdims=True)

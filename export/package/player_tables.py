@@ -25,7 +25,7 @@ MAX_MEDIAN_DIFFERENCE = 0.15
 
 @dataclass(frozen=True, kw_only=True)
 class RenderSettings:
-    """How one tier draws the tables. The names are keys of manifest.json."""
+    """Settings of one tier, by which it draws the tables. The names are keys of manifest.json."""
 
     layers: int = 2
     """Depth layers of surfels, at least 1."""
@@ -82,8 +82,8 @@ class RenderSettings:
 
     # Folded skin
     max_volume_ratio: float = 10.0
-    """Where the Jacobian's determinant is outside (1 / ratio, ratio), do not invert it: look along
-    the surfel's normal, and leave the path uncorrected."""
+    """If the Jacobian's determinant is outside (1 / ratio, ratio), do not invert it: look along the
+    surfel's normal, and leave the path uncorrected."""
 
     # Layers after the first
     layer_gap_m: float = 0.01

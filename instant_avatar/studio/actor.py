@@ -45,12 +45,10 @@ class ClothingLayer:
     """One surface of the dressed person.
 
     Attributes:
-        material: Material of the layer (`outfit.SKIN` …).
         rest_vertices: Vertices on the template, metres.
         template_points: Position of each vertex on the undressed template, of which colors and
             borders are functions, so that they stick to the body.
         body_vertices: The body vertex of each vertex, from which it takes weights and shape.
-        faces: Triangles.
     """
 
     material: int
@@ -91,7 +89,6 @@ def _skin_and_eyes(body: BodyModel) -> list[ClothingLayer]:
 
 
 def _submesh(body: BodyModel, kind: int, chosen: Bool[np.ndarray, "vertices"]) -> ClothingLayer:
-    """The part of the body whose vertices are chosen."""
     faces = body.faces[chosen[body.faces].all(axis=1)]
     source, flat = np.unique(faces, return_inverse=True)
     place = body.template[source].astype(np.float64)
@@ -105,7 +102,7 @@ def _submesh(body: BodyModel, kind: int, chosen: Bool[np.ndarray, "vertices"]) -
 
 
 def _subdivide(layer: ClothingLayer) -> ClothingLayer:
-    """The same surface with every triangle split in four (new vertices hang from an old one)."""
+    """Split every triangle in four; new vertices hang from an old one."""
     edges = np.sort(layer.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     unique, which = np.unique(edges, axis=0, return_inverse=True)
     middle = len(layer.rest_vertices) + which.reshape(-1, 3)
@@ -128,7 +125,7 @@ def _subdivide(layer: ClothingLayer) -> ClothingLayer:
 def _drape(
     layer: ClothingLayer, thickness: ThicknessFunction, *, smoothing: int, smooth_place: bool = True
 ) -> ClothingLayer:
-    """A layer smoothed like cloth over the body and lifted off it along its normals."""
+    """Smooth a layer like cloth over the body and lift it off along its normals."""
     rest = layer.rest_vertices
     average, inner = _neighbor_mean_operator(layer)
     for _ in range(smoothing):
@@ -154,7 +151,7 @@ def _drape(
 def _neighbor_mean_operator(
     layer: ClothingLayer,
 ) -> tuple[csr_matrix, Bool[np.ndarray, "vertices"]]:
-    """The mean over neighbours as a matrix, and which vertices are no border."""
+    """Return the mean over neighbors as a matrix, and the vertices that are no border."""
     edges = np.sort(layer.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     unique, used = np.unique(edges, axis=0, return_counts=True)
     count = len(layer.rest_vertices)
@@ -221,7 +218,7 @@ def _attach_to_body(
     refined: int,
     among: Int[np.ndarray, "chosen"],
 ) -> ClothingLayer:
-    """A surface of its own, each vertex hung from the nearest of the body vertices `among`."""
+    """Make a surface whose vertices hang from the nearest of the body vertices `among`."""
     layer = ClothingLayer(
         material=kind,
         rest_vertices=points,
@@ -256,15 +253,11 @@ class Actor:
     """A dressed person who can be drawn in any pose.
 
     Attributes:
-        betas: Its shape coefficients.
         shaped: The body underneath; `poses.npz` is about this one.
-        outfit: What it wears.
         rest_vertices: Vertices of all layers at rest, metres.
-        template_points: Where each vertex lies on the undressed template.
+        template_points: Position of each vertex on the undressed template.
         body_vertices: The body vertex that each vertex hangs from.
-        faces: Triangles.
-        materials: Material of each triangle.
-        baked_light: Painted light on each vertex.
+        baked_light: Light on each vertex, as a factor of its color.
         palette: The outfit's colors, tinted by the seed.
     """
 
@@ -283,12 +276,10 @@ class Actor:
     def of(
         cls, subject: int = 1, seed: int = 0, proportions: BodyProportions | None = None
     ) -> "Actor":
-        """One of the subjects of `OUTFITS`.
+        """Dress one of the subjects of `OUTFITS`.
 
-        Args:
-            subject: Which one.
-            seed: Varies shape and colors a little (0: as designed).
-            proportions: What is different from the body model beyond betas; None: nothing.
+        The `seed` varies shape and colors a little (0: as designed); `proportions` are what betas
+        do not describe.
         """
         body, outfit = load_body_model(), OUTFITS[subject]
         if proportions is not None:
@@ -338,7 +329,7 @@ class Actor:
 
     @cached_property
     def sole_vertices(self) -> Int[np.ndarray, "chosen"]:
-        """The vertices of the shoes."""
+        """Numbers of the vertices of the shoes."""
         return np.unique(self.faces[self.materials == SHOE])
 
     def vertices(
@@ -359,7 +350,7 @@ class Actor:
     def render_rgb_alpha(
         self, pose: BodyPose, camera: Camera, supersampling: int = 4
     ) -> tuple[Float32[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]:
-        """Color of the covered part of each pixel, and how much of it is covered, in [0, 1]."""
+        """Return the color of each pixel's covered part, and the covered fraction, in [0, 1]."""
         cut = self.outfit.measures
         seen = rasterize(
             self.vertices(pose),
@@ -387,16 +378,12 @@ class Actor:
         camera: Camera,
         background: UInt8[np.ndarray, "height width 3"] | None = None,
     ) -> tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"]]:
-        """The person in front of a background (white if None), and the soft mask."""
+        """Return the person in front of a background (white if None), and the soft mask."""
         rgb, alpha = self.render_rgb_alpha(pose, camera)
         return composite_over(rgb, alpha, background), (alpha * 255.0 + 0.5).astype(np.uint8)
 
     def with_baked_light(self, lamp_strength: float = LAMP_STRENGTH) -> "Actor":
-        """The same actor with the light of the A-pose painted on.
-
-        Args:
-            lamp_strength: Of the lamp, as a factor of color; without it the sky's light remains.
-        """
+        """Paint on the light of the A-pose; without the lamp the sky's light remains."""
         pose = replace(BodyPose.rest(), joint_rotations=A_POSE.reshape(23, 3))
         points = self.vertices(pose)
         light = bake_light(

@@ -1,4 +1,4 @@
-"""The room around the actor: its furniture, what covers it, and what a camera in it sees."""
+"""The room around the actor: its furniture, its surfaces, and the images of a camera in it."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -25,7 +25,7 @@ RoomStyle = Literal["room", "tiles"]
 ROOM_LOW_M, ROOM_HIGH_M = (-3.7, 0.0, -3.1), (3.7, 2.7, 3.5)
 """Corners of the room; the actor stands near the origin, on the floor y = 0."""
 FACE_LIGHT = np.array([0.84, 0.92, 0.90, 1.02, 0.97, 0.88], dtype=np.float32)
-"""How bright faces are: low x, high x, low y, …"""
+"""Brightness of faces: low x, high x, low y, …"""
 FLOOR_FACE = 2
 """Number of the floor among all faces: low y of solid 0."""
 SENSOR_NOISE = 1.5
@@ -38,8 +38,7 @@ class FurnitureBox:
 
     Attributes:
         center_xz_m: Its middle on the floor (x, z), metres.
-        size_m: Along x, y, z before it is turned.
-        texture: What covers it.
+        size_m: Size along x, y, z before it is turned.
         base_height_m: Height of its lower face.
         yaw_deg: Turn about the vertical.
     """
@@ -92,7 +91,6 @@ class FurnishedRoom:
 
     Attributes:
         style: "room": nothing repeats; "tiles": on walls, floor and furniture everything does.
-        solids: Its faces and what covers them.
         seed: Of the furniture's places, the patterns and the sensor's noise.
     """
 
@@ -148,13 +146,7 @@ class FurnishedRoom:
     def render(
         self, camera: Camera, feet_world: Float[np.ndarray, "feet 3"], number: int
     ) -> UInt8[np.ndarray, "height width 3"]:
-        """The room with soft shadows on the floor around the feet, and the sensor's noise.
-
-        Args:
-            camera: Somewhere in the room.
-            feet_world: Points of the feet, metres.
-            number: Of the picture; each has its own noise.
-        """
+        """Render the room with soft shadows around the feet, and noise by the image's `number`."""
         seen = self.view_from(camera)
         rgb = seen.rgb * _foot_shadows(seen, camera, feet_world)[..., None]
         generator = np.random.default_rng([self.seed, 6, number])
@@ -165,7 +157,7 @@ class FurnishedRoom:
 def _foot_shadows(
     seen: RoomView, camera: Camera, feet_world: Float[np.ndarray, "feet 3"]
 ) -> Float32[np.ndarray, "height width"]:
-    """The light that the feet leave on the floor, as a factor."""
+    """Return the factor of the floor's light about the feet."""
     light = np.ones(seen.depth.shape, dtype=np.float32)
     floor = seen.face == FLOOR_FACE
     height, width = floor.shape

@@ -1,4 +1,4 @@
-"""Words for poses: a gesture names what the limbs do, and becomes 23 joint rotations.
+"""Words for poses: a gesture names the limbs' positions, and becomes 23 joint rotations.
 
 Angles are in degrees, because they are for people to read. Left and right mirror each other: a
 positive number does to the right arm what it does to the left.
@@ -22,14 +22,13 @@ COLLARS, SHOULDERS, ELBOWS, WRISTS = (12, 13), (15, 16), (17, 18), (19, 20)
 
 @dataclass(frozen=True, kw_only=True)
 class Arm:
-    """Degrees.
+    """Angles of an arm, degrees.
 
     Attributes:
         lift: Upper arm above the horizontal (-90 hangs, 90 points up).
         forward: Upper arm swung to the front.
         twist: Upper arm turned about itself; positive: the bent forearm rises.
-        elbow: How far the elbow is bent.
-        wrist: How far the hand is bent down.
+        wrist: Hand bent down.
     """
 
     lift: Degrees = -50.0
@@ -41,12 +40,11 @@ class Arm:
 
 @dataclass(frozen=True, kw_only=True)
 class Leg:
-    """Degrees.
+    """Angles of a leg, degrees.
 
     Attributes:
         forward: Thigh raised to the front.
         out: Thigh spread to its side.
-        knee: How far the knee is bent.
         turn: Toes turned out.
         heel: Heel lifted; else the sole stays level.
     """
@@ -60,16 +58,14 @@ class Leg:
 
 @dataclass(frozen=True, kw_only=True)
 class Gesture:
-    """What the whole body does; angles in degrees, shift in metres.
+    """Position of the whole body; angles in degrees, lengths in metres.
 
     Attributes:
-        left, right: Arms.
-        left_leg, right_leg: Legs.
         bow, lean, turn: The back: to the front, to the left side, twisted to the left.
         nod, tilt, look: The head: down, to its left, turned left.
         yaw: The whole body turned left.
-        shift: Where the body stands: to its left and to the front, metres.
-        hop: Height above the floor, metres.
+        shift: Position on the floor: to the body's left and to the front.
+        hop: Height above the floor.
     """
 
     left: Arm = field(default_factory=Arm)

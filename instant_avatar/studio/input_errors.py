@@ -22,7 +22,7 @@ from preprocess.body.parametric_body import ShapedBody
 from preprocess.poses.motion_builder import place_by_pixels, transform_motion
 
 BORDER_NOISE_SCALE_PX = 6.0
-"""How smooth the wandering is along the border."""
+"""Standard deviation of the blur that makes the wandering smooth along the border."""
 
 
 def add_mask_noise(
@@ -33,14 +33,10 @@ def add_mask_noise(
     grown_px: float = 0.0,
     soft_px: float = 1.0,
 ) -> Float32[np.ndarray, "height width"]:
-    """The mask with its border moved in and out by smooth noise.
+    """Move the border of the exact mask in and out by smooth noise of this standard deviation.
 
-    Args:
-        alpha: The exact mask; returned as it is if there is no noise.
-        noise_px: Standard deviation of the border.
-        generator: Where the noise comes from.
-        grown_px: How far the whole border is moved outwards.
-        soft_px: Width of the border's ramp from 0 to 1.
+    The whole border is moved outwards by `grown_px`; its ramp from 0 to 1 is `soft_px` wide.
+    Without noise the mask is returned as it is.
     """
     if noise_px == 0.0:
         return alpha
@@ -59,13 +55,10 @@ NOISE_FRAMES = 3.0
 
 
 def add_pose_noise(motion: Motion, *, degrees: float, centimetres: float, seed: int) -> Motion:
-    """What a tracker would have said: the motion with smooth noise on rotations and place.
+    """Add smooth noise to rotations and place, as a tracker would.
 
-    Args:
-        motion: The truth.
-        degrees: Standard deviation of each component of each axis-angle.
-        centimetres: Standard deviation of each component of the root's place.
-        seed: Of the noise.
+    `degrees` and `centimetres` are standard deviations of each component of each axis-angle, and of
+    the root's place.
     """
     if degrees == 0.0 and centimetres == 0.0:
         return motion
@@ -84,13 +77,7 @@ def add_pose_noise(motion: Motion, *, degrees: float, centimetres: float, seed: 
 def to_camera_space(
     motion: Motion, cameras: tuple[Camera, ...], pelvis: Float[np.ndarray, "3"]
 ) -> Motion:
-    """The motion as a tracker tells it that knows no world: each row in its frame's camera, with K.
-
-    Args:
-        motion: In the world, a row a frame.
-        cameras: One for each frame.
-        pelvis: Where the person's pelvis rests.
-    """
+    """Return the track of a tracker that knows no world: rows in their frames' cameras, with K."""
     views = np.stack([camera.camera_from_world for camera in cameras])
     return replace(
         transform_motion(motion, views, pelvis), space="camera", intrinsic=cameras[0].intrinsic
@@ -100,13 +87,7 @@ def to_camera_space(
 def smooth_noise(
     generator: np.random.Generator, shape: tuple[int, ...], over: float = NOISE_FRAMES
 ) -> Float[np.ndarray, "frames *rest"]:
-    """Gaussian noise of unit variance, smooth over a number of frames (a Gaussian's width).
-
-    Args:
-        generator: Where the noise comes from.
-        shape: Frames, and what each has.
-        over: Standard deviation of the smoothing, frames.
-    """
+    """Return Gaussian noise of unit variance, smoothed by a Gaussian of width `over`, in frames."""
     margin = max(1, int(4 * over))
     white = generator.standard_normal((shape[0] + 2 * margin, *shape[1:]))
     smooth = gaussian_filter1d(white, over, axis=0)[margin : margin + shape[0]]
@@ -117,26 +98,20 @@ def smooth_noise(
 BORDER_SHARE = 0.0028
 """Standard deviation of the border, as a share of the picture's width: 1.5 of 540 pixels."""
 HALO_SHARE = 0.0022
-"""Largest growth of the whole mask, as a share of the picture's width."""
+"""Swing of the whole mask's growth, as a share of the image's width; its mean is 0.4 of that."""
 SOFT_PX = 2.5
 """Width of the ramp from 0 to 1 at the border."""
 HOLE_FRAMES, HAND_GAPS_PER_S = 0.12, 0.35
-"""Share of frames with holes; how often a second a hand gets lost."""
+"""Share of frames with holes; lost hands a second."""
 HAND_RADIUS_M = 0.11
 
 
 @final
 class SegmenterErrors:
-    """What a segmenter does to the exact masks of one video, frame by frame in order."""
+    """Errors of a segmenter in the masks of one video, frame by frame in order."""
 
     def __init__(self, frames: int, fps: float, seed: int) -> None:
-        """Chooses when hands get lost.
-
-        Args:
-            frames: Of the video.
-            fps: Its frames per second.
-            seed: Of all that is random.
-        """
+        """Choose the frames in which hands get lost."""
         self._generator = np.random.default_rng([seed, 22])
         self._halo = np.tanh(smooth_noise(self._generator, (frames,), over=0.5 * fps))
         self._lost = np.zeros((frames, 2), dtype=bool)
@@ -151,13 +126,9 @@ class SegmenterErrors:
         hands_px: Float[np.ndarray, "2 2"],
         px_per_m: float,
     ) -> Float32[np.ndarray, "height width"]:
-        """The mask of one frame.
+        """Return a frame's mask with errors.
 
-        Args:
-            alpha: The exact mask.
-            row: Which frame.
-            hands_px: Where the left and the right hand are in the picture.
-            px_per_m: Pixels per metre at the actor.
+        `hands_px` are the left and the right hand; `px_per_m` is the scale at the actor.
         """
         width = alpha.shape[1]
         wrong = add_mask_noise(
@@ -191,19 +162,19 @@ def _disc(
 TRUNK_DEG, LIMBS_DEG, ENDS_DEG = 1.3, 2.5, 3.5
 """Errors of direction: standard deviation of the wandering part and, each, of the constant one."""
 WANDER_S = 0.3
-"""The directions wander this slowly: correlated over about 0.7 s."""
+"""Standard deviation of the smoothing of directions: correlated over about 0.7 s."""
 JITTER_DEG = 0.5
 ACROSS_VIEW, ALONG_VIEW = 1.0, 0.35
-"""Errors that turn a limb towards the camera, and those that turn it within the picture."""
+"""Factors of errors that turn a limb towards the camera, and of those within the picture."""
 LEAN_DEG, LEAN_WANDER_DEG, FACING_DEG = 2.5, 1.2, 2.0
 """The whole body leans in the camera's depth direction, and faces a little elsewhere."""
 DEPTH_M, DEPTH_WANDER_M = 0.04, 0.03
 SLOW_S = 1.2
-"""Lean and depth wander this slowly: correlated over seconds."""
+"""Standard deviation of the smoothing of lean and depth: correlated over seconds."""
 PLACE_SHARE = 0.004
 """Error of the place in the picture, as a share of its height."""
 FOCAL_ERROR = (0.08, 0.12)
-"""How far the focal length is off, as a share: between these, in either direction."""
+"""Least and largest error of the focal length, as a share, in either direction."""
 FACING_FLIPS, WRIST_FLIPS = 1, 2
 """Short mistakes of a film: front taken for back, and a hand turned over."""
 
@@ -213,13 +184,7 @@ MIRRORED = (0, 2, 1, 3, 5, 4, 6, 8, 7, 9, 11, 10, 12, 14, 13, 15, 17, 16, 19, 18
 
 
 def mistake_focal_length(camera: Camera, amount: float, seed: int) -> Camera:
-    """The camera with the focal length that a user would guess.
-
-    Args:
-        camera: The true one.
-        amount: 1: as `FOCAL_ERROR` says; 0: exact.
-        seed: Of the error.
-    """
+    """Return the camera with the focal length that a user would guess; 0 for `amount` is exact."""
     generator = np.random.default_rng([seed, 23])
     sign = 1.0 if generator.random() < 0.5 else -1.0
     factor = 1.0 + amount * sign * generator.uniform(*FOCAL_ERROR)
@@ -237,17 +202,14 @@ def track_poses(
     fps: float,
     seed: int,
 ) -> Motion:
-    """What a tracker would say of a film by a static camera.
+    """Return the poses of a tracker, with its errors, for a film by a static camera.
 
     Args:
-        truth: The true poses.
         true_body: The person.
-        body: What the tracker takes the person for: poses are placed so that its joints appear
-            about where the person's do.
+        body: Body that the tracker assumes: poses are placed so that its joints appear about where
+            the person's do.
         cameras: The true one, and the one that the tracker assumes; they differ in focal length.
         amount: Factor of all errors of rotation and depth; 1: as trackers'.
-        fps: Frames per second.
-        seed: Of the errors.
     """
     generator = np.random.default_rng([seed, 24])
     count = len(truth)
@@ -279,7 +241,6 @@ def _sizes_deg() -> Float[np.ndarray, "24"]:
 def _direction_errors(
     generator: np.random.Generator, count: int, fps: float, amount: float
 ) -> Float[np.ndarray, "poses 24 3"]:
-    """Rotation vectors in the camera's axes, of all joints."""
     slow = smooth_noise(generator, (count, 24, 3), over=max(WANDER_S * fps, 0.5))
     parts = np.array([ACROSS_VIEW, ACROSS_VIEW, ALONG_VIEW]) / np.hypot(1.0, 1.0)
     slow *= _sizes_deg()[:, None] * parts
@@ -292,14 +253,13 @@ def _direction_errors(
 def _lean_errors(
     generator: np.random.Generator, count: int, fps: float, amount: float
 ) -> Float[np.ndarray, "poses 3"]:
-    """Rotation vectors of the whole body in the camera's axes (x: leaning in depth)."""
+    """Return rotation vectors of the whole body in the camera's axes (x: leaning in depth)."""
     slow = smooth_noise(generator, (count, 2), over=max(SLOW_S * fps, 0.5))
     lean = LEAN_DEG * generator.choice([-1.0, 1.0]) + LEAN_WANDER_DEG * slow[:, 0]
     return np.deg2rad(amount * np.stack([lean, FACING_DEG * slow[:, 1], 0.0 * lean], axis=1))
 
 
 def _world_rotations(motion: Motion) -> Float[np.ndarray, "poses 24 3 3"]:
-    """Rotation of every joint relative to the rest pose, in the world."""
     local = rotation_matrices(
         np.concatenate([motion.root_rotations[:, None], motion.joint_rotations], axis=1)
     )
@@ -311,7 +271,6 @@ def _world_rotations(motion: Motion) -> Float[np.ndarray, "poses 24 3 3"]:
 
 
 def _from_world_rotations(motion: Motion, world: Float[np.ndarray, "poses 24 3 3"]) -> Motion:
-    """The motion with other rotations of its joints in the world."""
     local = world.copy()
     for joint, parent in enumerate(PARENTS):
         if parent >= 0:
@@ -323,13 +282,7 @@ def _from_world_rotations(motion: Motion, world: Float[np.ndarray, "poses 24 3 3
 def _flip_some(
     generator: np.random.Generator, motion: Motion, forward: Float[np.ndarray, "3"]
 ) -> Motion:
-    """Front taken for back and hands turned over, for 2 to 4 frames each.
-
-    Args:
-        generator: Chooses when.
-        motion: Without these mistakes.
-        forward: Where the camera looks, in the world.
-    """
+    """Take front for back and turn hands over, for 2 to 4 frames each."""
     world = _world_rotations(motion)
     in_depth, left_right = np.eye(3) - 2.0 * np.outer(forward, forward), np.diag([-1.0, 1.0, 1.0])
     wrist_turn = rotation_matrices(np.array([0.8 * np.pi, 0.0, 0.0]))
@@ -352,7 +305,7 @@ def _place_in_picture(
     bodies: tuple[ShapedBody, ShapedBody],
     cameras: tuple[Camera, Camera],
 ) -> Motion:
-    """The motion with its body's joints about where the picture shows the person's."""
+    """Move the body so that its joints appear about where the person's do."""
     true_body, body = bodies
     true_camera, assumed = cameras
     view = assumed.camera_from_world
@@ -370,7 +323,7 @@ def _place_in_picture(
 def _shift_in_depth(
     motion: Motion, body: ShapedBody, camera: Camera, depth_m: Float[np.ndarray, "poses"]
 ) -> Motion:
-    """The motion moved away from the camera along the ray through the pelvis."""
+    """Move the body away from the camera along the ray through the pelvis."""
     pelvis = body.joints[0] + motion.root_translations
     rays = pelvis - camera.center_world
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)

@@ -29,7 +29,7 @@ NO_FACE = -1
 @final
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ZBuffer:
-    """What the subsamples see.
+    """Nearest triangles of the subsamples.
 
     Attributes:
         face: Index of the nearest triangle, or -1.
@@ -54,16 +54,10 @@ def rasterize(
     materials: Int32[np.ndarray, "faces"] | None = None,
     measures: Float32[np.ndarray, "cuts"] | None = None,
 ) -> ZBuffer:
-    """Draws triangles into a z-buffer.
+    """Draw triangles, seen from both sides, into a z-buffer.
 
-    Args:
-        points_world: Vertices, metres; triangles with a corner nearer than 1 cm are left out.
-        faces: Triangles, seen from both sides.
-        camera: Where from; a bent lens bends the corners, not the edges between them.
-        supersampling: Subsamples along each side of a pixel.
-        template_points: Where each vertex lies on the undressed body at rest; with `materials`.
-        materials: What each triangle is made of; parts that `is_visible` denies are not drawn.
-        measures: The outfit's measures that `is_visible` reads.
+    A bent lens bends the corners, not the edges between them; triangles with a corner nearer than 1
+    cm are left out, and so are parts that `is_visible` denies by the last three arguments.
     """
     rotation, translation = camera.camera_from_world[:3, :3], camera.camera_from_world[:3, 3]
     depth = points_world @ rotation[2] + translation[2]
@@ -117,6 +111,8 @@ def _rasterize_faces(
             y = row + 0.5
             for column in range(left, right + 1):
                 x = column + 0.5
+                # shares of the triangle's area on the screen are barycentrics; 1 / depth is linear
+                # there, so dividing by the corners' depths makes them perspective-correct
                 on_b = ((x - xa) * (yc - ya) - (xc - xa) * (y - ya)) / area
                 on_c = ((xb - xa) * (y - ya) - (x - xa) * (yb - ya)) / area
                 on_a = 1.0 - on_b - on_c
@@ -149,7 +145,7 @@ LAMP_STRENGTH = 0.42
 """Light of the lamp, as a factor of color."""
 
 SHADOW_BIAS_M = 0.02
-"""A surface does not shade itself nearer than this."""
+"""Depth behind another surface at which half of the light has gone; no surface shades itself."""
 
 
 def bake_light(
@@ -196,12 +192,9 @@ def lamp_visibility(
     materials: Int32[np.ndarray, "faces"],
     measures: Float32[np.ndarray, "cuts"],
 ) -> Float[np.ndarray, "vertices"]:
-    """How much of each vertex a far lamp reaches past the others, in [0, 1].
+    """Return the light of a lamp far away that reaches each vertex past the others, in [0, 1].
 
-    Args:
-        points, faces: Vertices in the world, metres, and triangles.
-        toward: Unit vector to the lamp.
-        template_points, materials, measures: As `rasterize` reads them.
+    `toward` is the unit vector to the lamp; the last three arguments are as of `rasterize`.
     """
     camera = _directional_camera(points, toward)
     seen = rasterize(
@@ -250,7 +243,7 @@ def _visibility(
     camera: Camera,
     depth_seen: Float32[np.ndarray, "height width"],
 ) -> Float[np.ndarray, "vertices"]:
-    """How far each point is the first one on its way, in [0, 1], softened over 4 pixels."""
+    """Return the light that reaches each point, in [0, 1], softened over 4 pixels."""
     forward, away = camera.camera_from_world[2, :3], camera.camera_from_world[2, 3]
     depth = points @ forward + away
     pixel = camera.project(points)
@@ -273,13 +266,9 @@ def shade_pixels(
     measures: Float32[np.ndarray, "cuts"],
     checked: bool,
 ) -> tuple[Float32[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]:
-    """Color of the covered part of each pixel (sRGB in [0, 1]) and how much of it is covered.
+    """Return the color of each pixel's covered part (sRGB in [0, 1]) and the covered fraction.
 
-    Args:
-        zbuffer: What each subsample sees.
-        faces, materials: Triangles, and what each is made of.
-        template_points, light: Place on the undressed template and light on each vertex.
-        palette, measures, checked: The outfit, as `albedo_at` reads it.
+    `template_points` lie on the undressed template; `light` is a factor of color.
     """
     height, width = (
         zbuffer.face.shape[0] // zbuffer.supersampling,

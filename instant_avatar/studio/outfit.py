@@ -1,4 +1,4 @@
-"""What the three subjects wear, and what their bodies are like.
+"""Clothes and bodies of the three subjects.
 
 All places are on the *template* (the mean body in T-pose, metres), so every person wears the same
 cut; `x` is the body's left, `y` up, `z` out of the chest. Where each garment ends is decided per
@@ -47,7 +47,7 @@ def neckline(x: float, z: float, measures: Float32[np.ndarray, "cuts"]) -> float
 def height_above_hairline(
     x: float, y: float, z: float, measures: Float32[np.ndarray, "cuts"]
 ) -> float:
-    """How far above the hairline a place of the head is, in metres (negative: bare)."""
+    """Height of a place of the head above the hairline, metres (negative: bare)."""
     side = abs(x + 0.002)
     edge = measures[NAPE] + (0.478 - measures[NAPE]) * smoothstep(z, 0.02, 0.075)
     edge += 0.035 * smoothstep(z, 0.088, 0.104)
@@ -63,7 +63,7 @@ def height_above_hairline(
 def is_visible(
     material: int, x: float, y: float, z: float, measures: Float32[np.ndarray, "cuts"]
 ) -> bool:
-    """Whether a place of a garment is there, and a place of the skin is bare."""
+    """Tell whether a place of a garment is there, or a place of the skin is bare."""
     side = abs(x)
     if material == SHIRT:
         hem = measures[HEM] + 0.006 * np.sin(x * 31.0 + z * 17.0)
@@ -85,18 +85,15 @@ class Outfit:
     """One subject's looks; lengths in metres on the template.
 
     Attributes:
-        betas: The subject's shape, of the embedded body.
         sleeve: Distance of the sleeve's end from the middle of the body.
-        hem: Height of the shirt's hem.
-        cuff: Height of the trousers' end.
-        neck_depth: How far the collar drops in front.
-        nape: Height of the hairline at the back.
-        fringe: Height of the hairline above the face.
+        hem, cuff: Heights of the shirt's hem and of the trousers' end.
+        neck_depth: Drop of the collar in front.
+        nape, fringe: Heights of the hairline at the back and above the face.
         ears_covered: Whether hair falls over the ears.
         bun: Whether the hair is tied up in a knot.
         checked: A checked shirt; else a striped one.
-        palette: sRGB colors in [0, 1], in the order that `paint` names.
-        looseness: Factor of how far shirt and trousers stand off the body.
+        palette: sRGB colors in [0, 1], in the order of `procedural_albedo.TONE` and the others.
+        looseness: Factor of the distance between the body and shirt or trousers.
     """
 
     betas: tuple[float, ...]
@@ -114,7 +111,7 @@ class Outfit:
 
     @property
     def measures(self) -> Float32[np.ndarray, "cuts"]:
-        """The measures in the order that `cut` reads them."""
+        """Measures in the order of `SLEEVE` and the others."""
         ears = float(self.ears_covered)
         measures = (self.sleeve, self.hem, self.cuff, self.neck_depth, self.nape, ears, self.fringe)
         return np.array(measures, dtype=np.float32)
@@ -122,7 +119,7 @@ class Outfit:
     def shirt_thickness(
         self, place: Float[np.ndarray, "vertices 3"]
     ) -> Float[np.ndarray, "vertices"]:
-        """How far the shirt stands off: close at the shoulders, 3-4 cm at hem and sleeve end."""
+        """Distance of the shirt from the body: small at the shoulders, 3-4 cm at hem and sleeve."""
         x, y, z = place.T
         side = np.abs(x)
         torso = 0.010 + 0.024 * _smoothstep_array(-y, -0.22, 0.20)
@@ -137,7 +134,7 @@ class Outfit:
     def trouser_thickness(
         self, place: Float[np.ndarray, "vertices 3"]
     ) -> Float[np.ndarray, "vertices"]:
-        """How far the trousers stand off: 7 mm at the hip, 2 cm at the cuff."""
+        """Distance of the trousers from the body: 7 mm at the hip, 2 cm at the cuff."""
         x, y, z = place.T
         down = _smoothstep_array(-y, -BELT_Y, 1.1)
         knee = np.exp(-(((y + 0.70) / 0.10) ** 2)) + np.exp(-(((y + 1.08) / 0.07) ** 2))
@@ -147,7 +144,7 @@ class Outfit:
     def hair_thickness(
         self, place: Float[np.ndarray, "vertices 3"]
     ) -> Float[np.ndarray, "vertices"]:
-        """How far the hair stands off: fullest on the crown, thin at the nape."""
+        """Thickness of the hair: fullest on the crown, thin at the nape."""
         _, y, z = place.T
         crown = _smoothstep_array(y, 0.45, 0.60)
         tuft = 0.010 * _smoothstep_array(z, 0.05, 0.14) * _smoothstep_array(y, 0.55, 0.60)
@@ -158,13 +155,11 @@ class Outfit:
 def _smoothstep_array(
     value: Float[np.ndarray, "vertices"], low: float, high: float
 ) -> Float[np.ndarray, "vertices"]:
-    """0 below `low`, 1 above `high`, smooth between."""
     share = np.clip((value - low) / (high - low), 0.0, 1.0)
     return share * share * (3.0 - 2.0 * share)
 
 
 def _srgb_palette(*codes: str) -> tuple[tuple[float, float, float], ...]:
-    """Colors from hexadecimal codes."""
     return tuple(
         (int(c[0:2], 16) / 255, int(c[2:4], 16) / 255, int(c[4:6], 16) / 255) for c in codes
     )
@@ -240,14 +235,13 @@ class BodyProportions:
     """Sizes of body parts as factors of the body model's.
 
     Attributes:
-        height: Of everything.
+        height: Factor of everything.
         legs, arms: Lengths.
         trunk: Length from the pelvis to the neck.
         shoulders: Width.
-        girth: Of the trunk, across its length.
+        girth: Girth of the trunk, across its length.
         leg_girth, arm_girth: Across their lengths.
-        head, hands, feet: Sizes.
-        looseness: Of the garments: how far they stand off the body.
+        looseness: Factor of the distance between garments and body.
     """
 
     height: float = 1.0
@@ -264,7 +258,7 @@ class BodyProportions:
     looseness: float = 1.0
 
     def stretches(self, joints: Float[np.ndarray, "24 3"]) -> Float[np.ndarray, "24 3 3"]:
-        """How the part that hangs from each joint is stretched, in the rest pose's axes."""
+        """Stretch of the part that hangs from each joint, in the rest pose's axes."""
         stretch = np.stack([np.eye(3)] * 24)
         for joint in TRUNK:
             stretch[joint] = np.diag([self.girth, self.trunk, self.girth])
@@ -297,12 +291,9 @@ class BodyProportions:
         weights: Float[np.ndarray, "vertices 24"],
         joints: Float[np.ndarray, "24 3"],
     ) -> Float[np.ndarray, "vertices 3"]:
-        """Rest vertices of the person, metres: each blends the stretches of its joints.
+        """Move rest vertices of the body or its clothes: each blends the stretches of its joints.
 
-        Args:
-            vertices: Of the body or of what it wears, at rest.
-            weights: Their skinning weights.
-            joints: Rest joints of the body before it is stretched.
+        `joints` are the body's before it is stretched, metres.
         """
         stretch, moved = self.stretches(joints), self.move_joints(joints)
         shift = moved - np.einsum("jab,jb->ja", stretch, joints)
@@ -324,4 +315,4 @@ SUBJECT_PROPORTIONS = {
         leg_girth=0.95, arm_girth=0.94, head=0.98, hands=1.04, feet=1.02, looseness=0.5,
     ),
 }  # fmt: skip
-"""What each subject's body is like, filmed by a phone."""
+"""Body proportions of each subject, filmed by a phone."""

@@ -1,4 +1,4 @@
-"""What is painted: the backdrop behind the actor, and the patterns on the faces of a room.
+"""Painted things: the backdrop behind the actor, and the patterns on the faces of a room.
 
 A backdrop is a plain wall or a cluttered room, with the shadow on the floor. Of the patterns some
 never repeat, and some only do. The rich ones follow the dead-leaves model: shapes of all sizes that
@@ -19,7 +19,7 @@ Rgb = UInt8[np.ndarray, "height width 3"]
 Backdrop = Literal["plain", "clutter"]
 
 SUPERSAMPLING = 3
-"""The backdrop is painted this many times larger, and reduced."""
+"""Factor by which the backdrop is painted larger before it is reduced."""
 
 
 def paint_backdrop(kind: Backdrop, camera: Camera, generator: np.random.Generator) -> Rgb:
@@ -59,7 +59,7 @@ def add_foot_shadows(
 
 
 def _floor_row(camera: Camera) -> float:
-    """Where the wall, 1.5 m behind the actor, meets the floor."""
+    """Return the row in which the wall, 1.5 m behind the actor, meets the floor."""
     return float(camera.project(np.array([0.0, 0.0, -1.5]))[1])
 
 
@@ -176,9 +176,9 @@ TexturePainter = Callable[[tuple[int, int], float, np.random.Generator], Rgb]
 """Paints a face, given its size in texels (columns, rows) and the texel size in meters."""
 
 LEAF_SIZES_M = (0.012, 0.45)
-"""The smallest and the largest leaf."""
+"""Smallest and largest leaf."""
 SUBPIXEL_BITS = 4
-"""OpenCV draws at this many binary places behind the point."""
+"""Fractional bits of the coordinates that OpenCV draws at."""
 
 
 def plaster(color: tuple[int, int, int], contrast: float = 13.0) -> TexturePainter:
@@ -352,7 +352,6 @@ def _hang_print(
     size_m: tuple[float, float],
     generator: np.random.Generator,
 ) -> None:
-    """A framed print on a wall."""
     left, top = (int(at / texel_m) for at in corner_m)
     wide, tall = (max(int(at / texel_m), 2) for at in size_m)
     edge = max(round(0.02 / texel_m), 1)
@@ -371,7 +370,6 @@ def _add_stains(
     generator: np.random.Generator,
     strength: float,
 ) -> Rgb:
-    """The picture with stains of every size."""
     stains = np.zeros(picture.shape[:2], dtype=np.float32)
     for scale in (0.6, 0.2, 0.06, 0.02, 0.007):
         each = scale / texel_m

@@ -1,4 +1,4 @@
-"""Pictures as a phone takes them: portrait, with motion blur, drifting exposure, noise, loss.
+"""Images as a phone takes them: portrait, with motion blur, drifting exposure, noise, loss.
 
 Garments move a little, and light stays in the room while the actor turns.
 """
@@ -30,12 +30,7 @@ class MovingCloth:
     """The displacement of one actor's garments over time."""
 
     def __init__(self, actor: Actor, seed: int) -> None:
-        """Chooses the waves.
-
-        Args:
-            actor: Who wears the garments.
-            seed: Of the waves.
-        """
+        """Choose the waves."""
         generator = np.random.default_rng([seed, 21])
         self._normals = vertex_normals(actor.rest_vertices, actor.faces)
         self._reach = _looseness_m(actor)
@@ -45,13 +40,13 @@ class MovingCloth:
         self._turns_per_s = generator.uniform(0.3, 0.9, WAVES)
 
     def displacement_m(self, time_s: float) -> Float[np.ndarray, "vertices 3"]:
-        """Of each rest vertex, metres: along its normal; zero for skin, hair and shoes."""
+        """Displacement of each rest vertex along its normal; zero for skin, hair and shoes."""
         waves = np.sin(self._phases + 2.0 * np.pi * self._turns_per_s * time_s).mean(axis=1)
         return (self._reach * np.clip(1.6 * waves, -1.0, 1.0))[:, None] * self._normals
 
 
 def _looseness_m(actor: Actor) -> Float[np.ndarray, "vertices"]:
-    """How far each vertex may move: nothing where a garment is held, most at its loose end."""
+    """Return vertices' largest displacement: none where a garment is held, most at loose ends."""
     x, y, _ = actor.template_points.T.astype(np.float64)
     down = np.clip((0.25 - y) / 0.45, 0.0, 1.0)
     sleeve = np.clip((np.abs(x) - 0.18) / 0.20, 0.0, 1.0)
@@ -80,11 +75,7 @@ class RoomLight:
     """The light of a window and of the room's walls on one actor."""
 
     def __init__(self, actor: Actor) -> None:
-        """Bakes what the walls give in the A-pose: it is the only part that turns with the actor.
-
-        Args:
-            actor: As its pictures will be drawn, but for the light.
-        """
+        """Bake the walls' light in the A-pose: it is the only part that turns with the actor."""
         self._ambient = AMBIENT_STRENGTH * actor.with_baked_light(lamp_strength=0.0).baked_light
 
     def on(self, actor: Actor, pose: BodyPose) -> Float32[np.ndarray, "vertices 3"]:
@@ -105,7 +96,7 @@ class RoomLight:
 
 
 SHUTTER_FRAMES = 0.5
-"""How long a picture is exposed, in frames."""
+"""Exposure time of an image, in frames."""
 SUBFRAMES = 3
 """Moments that are averaged into one picture."""
 SUPERSAMPLING = 2
@@ -113,7 +104,7 @@ SUPERSAMPLING = 2
 GAIN_DRIFT, WARMTH_DRIFT = 0.15, 0.05
 """Largest drift of the exposure, and of red against blue."""
 DRIFT_S = 0.9
-"""They drift this slowly: correlated over about two seconds."""
+"""Standard deviation of their smoothing: correlated over about two seconds."""
 SENSOR_NOISE = 2.0
 """Standard deviation of the noise of each pixel and channel, of 255."""
 JPEG_QUALITY = 82
@@ -135,12 +126,9 @@ class PhoneScene:
     """The actor before a phone on a tripod.
 
     Attributes:
-        actor: Who is filmed.
         camera: The true camera.
         background: A painted backdrop.
-        light: Of the room.
         cloth: Displacement of the garments; None if they are still.
-        fps: Frames per second.
     """
 
     actor: Actor
@@ -189,13 +177,7 @@ def expose(
     gains: Float[np.ndarray, "3"],
     generator: np.random.Generator,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """The picture as the phone stores it: exposed, noisy and compressed.
-
-    Args:
-        rgb: Neutrally exposed.
-        gains: Of red, green and blue.
-        generator: Of the sensor's noise.
-    """
+    """Return a neutrally exposed image as the phone stores it: exposed, noisy and compressed."""
     noise = SENSOR_NOISE * generator.standard_normal(rgb.shape, dtype=np.float32)
     exposed = np.clip(rgb * gains + noise + 0.5, 0.0, 255.0).astype(np.uint8)
     options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]

@@ -1,8 +1,8 @@
-"""What a camera sees of boxes: the nearest face along every ray, and its texture, filtered.
+"""Images of boxes: the nearest face along every ray, and its texture, filtered.
 
 A solid is a box that may be turned about the vertical; the first is the room itself, seen from
 within. Rays are not normalised: they advance one metre along the camera's axis, so that the
-parameter of a hit is its depth. A pixel whose neighbours see another face is cast again with 4 x 4
+parameter of a hit is its depth. A pixel whose neighbors see another face is cast again with 4 x 4
 rays; elsewhere four lookups on the one face do, at one level of its pyramid.
 
 Letters: `o` and `d` are a ray's start and direction; `a` is the axis that a face is perpendicular
@@ -29,7 +29,7 @@ class TexturedBoxes:
             turned; the first is the room.
         yaw_cos_sin: Cosine and sine of its turn about the vertical through its middle.
         centers_xz: The center of each box (x, z).
-        textures: Of each face (low x, high x, low y, …), its texture.
+        textures: Texture of each face (low x, high x, low y, …).
         texels: All textures and their halvings, one after the other.
         mip_levels: Of each texture and level: first texel, rows, columns.
         texel_m: Size of a texel of the finest level.
@@ -50,7 +50,7 @@ class TexturedBoxes:
 @final
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RoomView:
-    """What a camera sees of the solids.
+    """Image of the solids by a camera.
 
     Attributes:
         rgb: Colors, 0 to 255, not rounded.
@@ -64,7 +64,7 @@ class RoomView:
 
 
 def raycast_boxes(solids: TexturedBoxes, camera: Camera) -> RoomView:
-    """The solids as a camera within the first of them sees them."""
+    """Cast the rays of a camera within the first of the solids."""
     width, height = camera.size_px
     seen = RoomView(
         rgb=np.empty((height, width, 3), dtype=np.float32),
@@ -123,6 +123,7 @@ def _hit(
         box = boxes[solid]
         o = _to_box_frame(box, view[0, 0], view[0, 1], view[0, 2], True)
         d = _to_box_frame(box, dx, dy, dz, False)
+        # slabs: in by the last of the three near planes, out by the first of the far ones
         into, out, entered = 1e-3, best, -1
         for axis in range(3):
             step = d[axis] if d[axis] != 0.0 else 1e-30
@@ -158,7 +159,7 @@ def _face_coordinates(
     x: float,
     y: float,
 ) -> tuple[float, float]:
-    """Where the ray through a point of the picture meets a face's plane: right, down, metres."""
+    """Return the place where the ray through a pixel meets a face's plane: right, down, metres."""
     box, axis, side = boxes[face // 6], (face % 6) // 2, face % 2
     o = _to_box_frame(box, view[0, 0], view[0, 1], view[0, 2], True)
     d = _to_box_frame(
@@ -185,7 +186,7 @@ def _add_texel(
     weight: float,
     out: Float32[np.ndarray, "3"],
 ) -> None:
-    """Adds a bilinear lookup in one level; `u`, `v` in its texels."""
+    """Add a bilinear lookup in one level; `u`, `v` in its texels."""
     first, rows, columns = level[0], level[1], level[2]
     u, v = min(max(u - 0.5, 0.0), columns - 1.0), min(max(v - 0.5, 0.0), rows - 1.0)
     left, top = int(u), int(v)
@@ -209,7 +210,7 @@ def _add_lookup(
     weight: float,
     out: Float32[np.ndarray, "3"],
 ) -> None:
-    """Adds a lookup between two levels; `u`, `v` in texels of the finest."""
+    """Add a lookup between two levels; `u`, `v` in texels of the finest."""
     level = min(max(level, 0.0), levels.shape[0] - 1.001)
     whole = int(level)
     part = level - whole
@@ -234,6 +235,7 @@ def _mip_level(
     u, v = _face_coordinates(view, boxes, face, x, y)
     u_x, v_x = _face_coordinates(view, boxes, face, x + 1.0, y)
     u_y, v_y = _face_coordinates(view, boxes, face, x, y + 1.0)
+    # log2 of the texels that one ray's step covers, along the axis on which they are more
     squared = max((u_x - u) ** 2 + (v_x - v) ** 2, (u_y - u) ** 2 + (v_y - v) ** 2)
     return 0.5 * np.log2(max(squared, 1e-12)) + np.log2(step)
 

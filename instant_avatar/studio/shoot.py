@@ -79,12 +79,12 @@ def _write_track(path: Path, *cameras: Camera) -> None:
 PHONE_ARM_LIFT_DEG = -64.0
 """Arms near the body: they fit into a portrait."""
 PHONE_TURNS, WALK_TURNS, TURNS = 1.25, -0.75, 2.0
-"""How often the actor turns round before a phone, a phone that is carried around, or the camera of
-the studio, if the user does not say."""
+"""Turns of the actor before a phone, a phone that is carried around, or the studio's camera, if the
+user names none."""
 
 
 def _write_phone_capture(folder: Path, config: ShootConfig, progress: ShootProgress) -> None:
-    """Films the actor as reality would, into an empty folder.
+    """Film the actor as reality would, into an empty folder.
 
     It then holds video.mp4, masks/, cameras.npz and poses.npz, all of them a little wrong;
     dance.npz; and truth/: body.npz (the person, a body model without betas), poses.npz,
@@ -182,7 +182,6 @@ def _write_novel(
     camera: Camera | None,
     done: Callable[[int], None],
 ) -> None:
-    """Poses never filmed with their true images, masks and, if given here, camera."""
     for name in ("images", "masks"):
         (folder / name).mkdir(parents=True)
     for index, (rgb, alpha) in enumerate(pictures):
@@ -230,10 +229,9 @@ def _write_body(path: Path, shaped: ShapedBody) -> None:
 @final
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StudioScene:
-    """What a motion is filmed on.
+    """Actor, cameras and background that a motion is filmed with.
 
     Attributes:
-        actor: Who is filmed.
         cameras: One for all pictures, or one for each.
         background: A painted backdrop (for one camera), or a room.
         first_frame_number: Number of the first image, on which a room's noise depends.
@@ -270,18 +268,13 @@ def film_capture(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Films the actor into the folder `out`, which appears whole or not at all.
+    """Film the actor into the folder `out`, which appears whole or not at all.
 
     Args:
         out: Folder that will hold video.mp4, preview.webm, masks/, cameras.npz (a walkaround's lie
             in truth/), poses.npz, dance.npz and truth/; see `_write_phone_capture` for a phone's.
-        config: What is filmed.
-        progress: Told after each picture; may raise to stop the shoot.
+        progress: Called after each image; may raise to stop the shoot.
         overwrite: Whether an older capture in `out` gives way, if all of it was written by `shoot`.
-
-    Raises:
-        InputError: If `out` is in the way, or a number of `config` is out of its range.
-        OSError: If the disk is full.
     """
     config.validate()
     _check_output(out, overwrite=overwrite)
@@ -330,7 +323,7 @@ def _write_capture(folder: Path, config: ShootConfig, progress: ShootProgress) -
 def _build_scenes(
     actor: Actor, truth: Motion, config: ShootConfig
 ) -> tuple[StudioScene, StudioScene]:
-    """Where the film is made, and where the poses that no film holds are pictured."""
+    """Return the scene of the film, and the scene of the poses that no film holds."""
     kind = config.effective_background
     if config.camera_moves:
         tall = staging.actor_height_m(actor)

@@ -1,4 +1,4 @@
-"""What ia-sample films, as a record that is read without loading what films it."""
+"""Settings of ia-sample's films, as a record that is read without loading what films it."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,7 +50,7 @@ class ShootConfig:
 
     @property
     def camera_moves(self) -> bool:
-        """Whether the camera moves."""
+        """Tell whether the camera moves."""
         return self.motion == "walkaround"
 
     @property
@@ -59,11 +59,7 @@ class ShootConfig:
         return self.background or ("room" if self.camera_moves else "clutter")
 
     def validate(self) -> None:
-        """Refuses what cannot be filmed.
-
-        Raises:
-            InputError: If a number is out of its range.
-        """
+        """Refuse numbers out of their range and contradictory options (`InputError`)."""
         ranges = {
             "frames": (1, 100_000), "fps": (0.1, 1000.0), "size": (16, 4096),
             "turns": (-100.0, 100.0), "seed": (0, 2**31 - 1), "pose_noise_deg": (0.0, 90.0),

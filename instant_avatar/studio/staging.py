@@ -1,4 +1,4 @@
-"""Staging: what the actor does, and where the camera stands, frame by frame.
+"""Staging: the actor's motion, and the camera's position, frame by frame.
 
 The actor turns, dances, dances a clip that is never filmed, or takes twelve poses apart. The camera
 stands 3.2 m away at chest height with the whole person in the picture, or a phone is carried around
@@ -139,16 +139,13 @@ def _interpolate_gestures(
 
 
 def tracked_motion(actor: Actor, track: Motion, *, frames: int, fps: float) -> Motion:
-    """A track's poses on the spot, evenly spread; one in a camera's axes (y down) is set upright.
-
-    Raises:
-        InputError: If the track holds no valid pose.
-    """
+    """Set a track's poses on the spot, evenly spread and upright; `InputError` if none is valid."""
     if not track.valid.any():
         raise InputError("The track holds no valid pose that could be filmed.")
     rows = np.flatnonzero(track.valid)
     rows = rows[np.linspace(0, len(rows) - 1, frames).round().astype(int)]
     turns = Rotation.from_rotvec(track.root_rotations[rows])
+    # the body's y axis points down in a camera's axes
     if turns.as_matrix()[:, 1, 1].mean() < 0.0:
         turns = Rotation.from_rotvec([np.pi, 0.0, 0.0]) * turns
     on_the_spot, turned = -actor.shaped.joints[0], turns.as_rotvec()
@@ -205,7 +202,7 @@ def _set_on_floor(actor: Actor, pose: BodyPose, hop: float) -> BodyPose:
 
 
 def nearest_pose_angles(novel: Motion, filmed: Motion) -> Float[np.ndarray, "poses"]:
-    """How far each pose is from the nearest filmed one: the largest joint angle, radians."""
+    """Return each pose's distance to the nearest filmed one: the largest joint angle, radians."""
     gaps = []
     for pose in novel.joint_rotations:
         difference = Rotation.from_rotvec(filmed.joint_rotations.reshape(-1, 3)).inv()
@@ -235,13 +232,7 @@ def static_camera(actor: Actor, size: int) -> Camera:
 
 
 def portrait_camera(actor: Actor, width: int, *, dances: bool = False) -> Camera:
-    """A phone held upright on a tripod, 9:16, set up for one actor; sides are even numbers.
-
-    Args:
-        actor: Who is filmed.
-        width: Of the pictures, px.
-        dances: Whether there must be room for a dance.
-    """
+    """Return a phone's camera upright on a tripod, 9:16, set up for one actor; sides are even."""
     size_px = 2 * round(width / 2), 2 * round(width * 8 / 9)
     if dances:
         return _frame_actor(actor, size_px, DANCE_HEIGHT_SHARE, DANCE_HEADROOM_SHARE)
@@ -302,7 +293,7 @@ WALK_DISTANCE_HEIGHTS = 1.52
 """Distance to the actor, in heights of the actor: the whole body is in the image."""
 HANDHELD_HEIGHT_M = 1.4
 STANDING_DISTANCE_M = 3.4
-"""From here the camera that stands still sees raised arms, too."""
+"""Distance from which the camera that stands still sees raised arms, too."""
 
 NEAR_FOOT_OFFSET_M = 0.2
 """Distance by which the nearer foot is closer to the camera than the body center, metres."""
@@ -310,19 +301,15 @@ NEAR_FOOT_OFFSET_M = 0.2
 SHAKE_M, SHAKE_DEG = 0.012, 0.6
 """Standard deviation of the hand's trembling, for each axis."""
 SHAKE_FRAMES = 2.5
-"""It is smooth over about this many frames."""
+"""Standard deviation of its smoothing, frames."""
 
 
 def handheld_cameras(
     actor_xz_m: Float[np.ndarray, "frames 2"], height_m: float, size: int, seed: int
 ) -> tuple[Camera, ...]:
-    """One camera a frame, on an arc of `ARC_DEG` around the actor, the actor in the picture.
+    """Return one camera a frame, on an arc of `ARC_DEG` around the actor, the actor in the image.
 
-    Args:
-        actor_xz_m: Where the actor stands on the floor (x, z), in each frame.
-        height_m: How tall the actor is.
-        size: Width of the pictures in pixels; the height is 9/16 of it.
-        seed: Of the walk and the trembling.
+    `size` is the images' width in pixels; the height is 9/16 of it.
     """
     frames = len(actor_xz_m)
     generator = np.random.default_rng([seed, 7])
@@ -357,7 +344,7 @@ def wide_image_size(size: int) -> tuple[int, int]:
 
 
 def actor_height_m(actor: Actor) -> float:
-    """How tall an actor stands, shoes and hair included, metres."""
+    """Height of the standing actor, shoes and hair included."""
     pose = BodyPose.rest()
     return float(actor.vertices(pose)[:, 1].max() - actor.sole_height_m(pose))
 
