@@ -56,11 +56,9 @@ OBSERVATION_INTERVAL = 4
 
 @final
 class OrientationShading:
-    """The room's light on the person.
+    """The room's light on the person: `coefficients` of a factor of the neutral color.
 
-    Attributes:
-        coefficients: Coefficients of the factor of the neutral color, for `_harmonics`.
-        is_neutral: Whether no shading has been found; the factor is then 1 everywhere.
+    While it `is_neutral`, no shading has been found, and the factor is 1 everywhere.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -98,10 +96,7 @@ class OrientationShading:
         return operations.mean_normals(raw, samples, step_m, rays.slots, cells, self._normals)
 
     def factors(self, normals: Float32[Tensor, "rays 3"]) -> PremultipliedPixels:
-        """Factors of the neutral color, and of alpha (1), where surfaces have these world normals.
-
-        All are 1 where there is no surface.
-        """
+        """Factors of color, and of alpha (1), at world normals; 1 where there is no surface."""
         factors = np.empty((len(normals), 4), dtype=np.float32)
         light_factors(
             normals.numpy(), self.coefficients.numpy(), MIN_NORMAL_LENGTH,
@@ -150,12 +145,8 @@ class OrientationShading:
 class Avatar:
     """A person who can be rendered in any pose.
 
-    Attributes:
-        rig: Articulation.
-        field: Canonical color and density.
-        occupancy: Occupied canonical cells.
-        sample_step_m: Distance between samples along a ray in training, metres.
-        shading: Light of the room in which the person was filmed.
+    `sample_step_m` is the distance between samples along a ray in training; `shading` is the light
+    of the room in which the person was filmed.
     """
 
     rig: Rig

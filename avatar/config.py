@@ -132,7 +132,7 @@ class TrainConfig:
 
     @property
     def poses_may_be_exact(self) -> bool:
-        """Whether a pose is corrected only where its rays agree that it is wrong."""
+        """True if a pose is corrected only where its rays agree that it is wrong."""
         return self.pose_uncertainty < MIN_ESTIMATED_UNCERTAINTY
 
     @property
@@ -159,12 +159,8 @@ class TrainConfig:
     ) -> "TrainConfig":
         """Derives the configuration from a budget and the size of a pixel on the body.
 
-        Args:
-            seconds, steps: Time budget, or training steps instead; 60 s if neither is given.
-            footprint_m: Size of a pixel on the body, metres.
-            filmed_footprint_m: The same before the film is reduced, as the head is learnt; None
-                where it is not reduced.
-            pose_uncertainty, seed, held_out_stride: As in the configuration.
+        `filmed_footprint_m` is that size before the video is reduced; None where it is not. The
+        budget is 60 s without `seconds` and `steps`.
         """
         if seconds is None:
             seconds = 60.0 if steps is None else steps / NOMINAL_STEPS_PER_S

@@ -9,8 +9,8 @@ respect to the pose.
 A rendering culls the cells that lead to unoccupied space, and the pixels that see none of the rest.
 It also drops spurious correspondences, which skinning does not carry to their ray: a cell
 extrapolates its warp from the root at its center, which in the folds of armpits and elbows ends
-within the cell. An image would show specks and floating pieces of the body. In an image of a bent
-body these are a few thousandths of the samples, few enough to skin each of them.
+within the cell. They would show as specks and floating pieces of the body; they are a few
+thousandths of the samples, few enough to skin each.
 """
 
 import dataclasses
@@ -37,7 +37,6 @@ from avatar.rig import CLOTHING_BAND_M, Rig
 from capture.camera import Camera
 
 CORRESPONDENCE_CELL_M = 0.03
-"""Edge of a cell, metres."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -46,7 +45,6 @@ class CorrespondenceGrid:
 
     Attributes:
         low: Corner of the grid, body frame, metres.
-        cell_m: Edge of a cell, metres.
         packed_cells: `first_row * 8 + bent * 4 + count` of each cell, 0 far from the body. A root
             takes one row, or three in a bent cell.
         roots: Canonical root at the cell's center, then A row by row. In a bent cell the next two
@@ -66,10 +64,7 @@ class CorrespondenceGrid:
         *,
         band_m: float = CLOTHING_BAND_M,
     ) -> "CorrespondenceGrid":
-        """Solves the correspondences of one pose, of which the root plays no part.
-
-        Up to `band_m` metres from the skin are covered, at most up to the rig's box.
-        """
+        """Solves a pose, but for its root, up to `band_m` from the skin, within the rig's box."""
         bones = rig.body_from_canonical(joint_rotations)[:, :3].reshape(24, 12)
         low, packed_cells, roots = operations.solve_correspondences(
             rig, bones.astype(np.float32), band_m, CORRESPONDENCE_CELL_M
@@ -130,10 +125,8 @@ MAX_RAY_DISTANCE_M = 0.005
 class CorrespondenceCheck:
     """Finds the spurious samples of one pose.
 
-    Attributes:
-        unreliable_rows: Root rows whose warp is wrong in some corner of their cell.
-        transforms: Blended 3×4 matrices at the nodes of the skinning volume.
-        low, nodes_per_m: Corner of that volume, metres, and nodes per metre.
+    `unreliable_rows` are the root rows whose warp is wrong in some corner of their cell;
+    `transforms` are blended 3×4 matrices at the nodes of the skinning volume.
     """
 
     unreliable_rows: Bool[Tensor, "rows"]

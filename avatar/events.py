@@ -19,15 +19,7 @@ class WaitingForFrame:
 
 @dataclass(frozen=True, kw_only=True)
 class Stepped:
-    """A training step has been made.
-
-    Attributes:
-        step: Number of steps so far.
-        wall_seconds: Training time so far.
-        loss: Mean loss of the step's rays.
-        samples_per_ray: Mean number of samples of the step's rays.
-        frames_seen: Frames trained on so far.
-    """
+    """A training step has been made; `step`, `wall_seconds` and `frames_seen` are totals so far."""
 
     step: int
     wall_seconds: float
@@ -38,13 +30,11 @@ class Stepped:
 
 @dataclass(frozen=True, kw_only=True)
 class HeldOutScore:
-    """How well one held-out frame is rendered, on white.
+    """Quality of one rendered held-out frame, on white.
 
     Attributes:
-        frame: Index of the frame in its source.
-        psnr: PSNR of the whole frame, dB.
+        psnr: Of the whole frame, as is `ssim`; dB.
         psnr_mask: PSNR where alpha > 0.5, dB.
-        ssim: SSIM of the whole frame, in [-1, 1].
         blur: Equivalent blur, as a share of the person's height (`image_metrics`); NaN if not
             measured.
         overlap: Soft IoU of the rendered alpha and the mask, in [0, 1]; NaN if not measured.

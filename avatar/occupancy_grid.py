@@ -43,9 +43,7 @@ FLOATER_INTERVAL = 4
 class OccupancyGrid:
     """Occupied cells of canonical space.
 
-    Attributes:
-        density_grid: Occupancy and cached densities, updated in place.
-        band_cells: Flat indices of the cells in the clothing band about the skin.
+    `density_grid` is updated in place; `band_cells` are the flat indices of the clothing band.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -85,14 +83,10 @@ class OccupancyGrid:
         """Probes a share of the band, once per cell at a random place, and updates the occupancy.
 
         Args:
-            log_density_at: Log density at canonical points.
-            share: Share of the band that is probed, in (0, 1].
             decay: Factor of a probed cell's cached density.
             min_density: Density below which a cell is empty whatever the step, 1/m.
-            drop_floaters: Whether small components, and those off the skin, are dropped. (The
-                paper's code keeps the largest component only, but a foot may be one of its own.)
-            sample_step_m: Distance between samples along a ray, metres.
-            generator: Draws cells and places.
+            drop_floaters: Drops small components, and those off the skin. (The paper's code keeps
+                the largest component only, but a foot may be one of its own.)
         """
         chosen = self._draw_cells(self.band_cells, int(len(self.band_cells) * share), generator)
         log_density = log_density_at(self._jittered_points(chosen, generator))
@@ -180,7 +174,7 @@ class OccupancyGrid:
 def in_occupied_cells(
     grid: DensityGrid, points: Float32[Tensor, "points 3"]
 ) -> Bool[Tensor, "points"]:
-    """Which points lie in occupied cells."""
+    """Mask of the points that lie in occupied cells."""
     shape = torch.tensor(grid.occupied.shape)
     cell = torch.floor((points - grid.low) * grid.cells_per_m).long()
     x, y, z = torch.minimum(cell.clamp(min=0), shape - 1).unbind(dim=1)

@@ -19,7 +19,6 @@ from avatar.kernels import operations
 from avatar.kernels.operands import FEATURES_PER_LEVEL, MAX_LOG_DENSITY, HashLevels
 
 HIDDEN_WIDTH = 64
-"""Width of the hidden layer."""
 INITIAL_LOG_DENSITY = 0.0
 """Raw density of an untrained field: 1 per metre, a fog thin enough to be cleared quickly."""
 POINTS_PER_CHUNK = 1 << 13
@@ -27,14 +26,7 @@ POINTS_PER_CHUNK = 1 << 13
 
 
 class Activations(NamedTuple):
-    """Intermediate values of the forward pass, for the backward pass.
-
-    Attributes:
-        points: Canonical positions, metres.
-        features: Hash-grid features.
-        hidden: Hidden layer after the ReLU.
-        raw: Color logits and log density (log 1/m).
-    """
+    """Values of the forward pass that the backward pass needs; `hidden` is that after the ReLU."""
 
     points: Float32[Tensor, "points 3"]
     features: Float32[Tensor, "points width"]
@@ -47,13 +39,12 @@ class Activations(NamedTuple):
 
 
 HAS_ONEDNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
-"""Whether torch's matrix products on the CPU can be oneDNN's."""
+"""Availability of oneDNN's matrix products on the CPU."""
 ROWS_PER_PRODUCT = 1024
 """Rows are padded to a multiple of this number, because oneDNN compiles a kernel for each size."""
 
 
 def _padded(values: Float32[Tensor, "points width"]) -> Float32[Tensor, "rows width"]:
-    """Values, and zeros up to a multiple of `ROWS_PER_PRODUCT`."""
     return torch.nn.functional.pad(values, (0, 0, 0, -len(values) % ROWS_PER_PRODUCT))
 
 
@@ -80,13 +71,9 @@ def _linear(
 class RadianceField:
     """Color and density at canonical points, without view direction (InstantAvatar, §3.1).
 
-    One network of `width → 64 → 4`: 2.8 times cheaper than the two of the paper's code.
-
-    Attributes:
-        levels: The grid's levels.
-        table: Entries of the grid.
-        layers: Weights and biases of both layers.
-        is_frozen: Whether `backward` leaves out the parameters' gradients.
+    One network of `width → 64 → 4`: 2.8 times cheaper than the two of the paper's code. `layers`
+    are the weights and biases of both layers; `backward` of a frozen field leaves their gradients
+    out.
     """
 
     is_frozen = False
@@ -152,8 +139,7 @@ class RadianceField:
     ) -> Float32[Tensor, "points width"]:
         """Writes the gradient of every parameter (the table's is added), unless it is frozen.
 
-        Returns:
-            The gradient of the grid's features.
+        Returns the gradient of the grid's features.
         """
         first, _, second, _ = self.layers
         padded = _linear(_padded(grad_raw), second.T)
@@ -334,12 +320,8 @@ def source_gradient(
 
     Cross-entropy acts where a point is empty and its source is not, too. The sources stand still.
     Their opacity is steepened about one half, so that the copy of a soft surface is firm; their
-    color counts as far as they are opaque.
-
-    Args:
-        raw: Raw outputs at the points, then at their sources.
-        weights: Weight of each pair, in [0, 1].
-        weight: Weight of a pair.
+    color counts as far as they are opaque. `raw` has the points, then their sources; `weights` are
+    the pairs' own, in [0, 1].
     """
     count, color = len(weights), torch.sigmoid(raw[:, :3])
     opacity = OpacityWithSlope.of(raw).value
@@ -354,7 +336,6 @@ def source_gradient(
 def _log_density_only(
     raw: Float32[Tensor, "points 4"], slope: Float32[Tensor, "points"]
 ) -> Float32[Tensor, "points 4"]:
-    """Gradient with a slope of the log density and none of the colors."""
     grad = torch.zeros_like(raw)
     grad[:, 3] = slope
     return grad

@@ -66,14 +66,10 @@ class PosedAvatar:
     """An avatar in one pose, ready to be seen by one camera.
 
     Attributes:
-        avatar: Avatar to render.
-        camera: Camera and size of the image.
-        world_from_body: Transform of the pose's body frame.
         grid: Occupancy outside which the field is taken to be empty.
         tables: Correspondence grid of the pose, without cells that lead to unoccupied space.
-        check: Finds spurious samples.
         bounds: Rows and columns of the image outside of which nothing is seen.
-        shaded: Whether the light of the room falls on the avatar; its colors are neutral otherwise.
+        shaded: Adds the light of the room to the colors, which are neutral otherwise.
     """
 
     avatar: Avatar
@@ -142,11 +138,9 @@ def render(
     over all lattice samples in `avatar.rendering_grid()` whose correspondences are valid
     (`avatar.correspondence_grid`).
 
-    Args:
-        avatar, pose, camera: What is rendered, in the camera's world frame.
-        cells: Correspondence grid of the pose, if it has been solved already.
-        shaded: Whether the light of the room in which the person was filmed falls on the avatar;
-            otherwise its colors are neutral, as in the package.
+    `cells` is the pose's correspondence grid, if it has been solved already. `shaded` adds the
+    light of the room in which the person was filmed; colors are neutral otherwise, as in the
+    package.
     """
     posed = PosedAvatar.of(avatar, pose, camera, cells=cells, shaded=shaded)
     width, height = camera.size_px
@@ -181,11 +175,8 @@ def trace_rays(
 ) -> tuple[Float32[Tensor, "rays 4"], Float32[Tensor, "rays 3"]]:
     """Premultiplied neutral color and alpha along rays, and the normals of what they see.
 
-    Args:
-        field, rays, cells, sample_step_m: As in training.
-        grid: Occupancy outside which the field is taken to be empty.
-        check: Finds spurious samples, whose density is taken to be zero.
-        shading: Has the normals, in the body frame; all are zero without it.
+    Density is taken to be zero outside `grid`, and at the samples that `check` finds spurious. The
+    normals, in the body frame, are all zero without `shading`.
     """
     normals = torch.zeros(len(rays.slots), 3)
     colors = torch.zeros(len(rays.slots), 4)

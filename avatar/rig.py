@@ -43,13 +43,9 @@ def canonical_rotations() -> Float[np.ndarray, "23 3"]:
 
 
 class SparseSkinningNodes(NamedTuple):
-    """Nodes of the skinning volume with their nonzero weights, packed node by node.
+    """Nodes of the skinning volume, by flat index, with their nonzero weights, packed.
 
-    Attributes:
-        node_indices: Flat indices of the nodes.
-        offsets: Index of each node's first joint, and the number of all joints.
-        joints: Joints that move the nodes.
-        weights: Weights of these joints, in (0, 1].
+    Joints and weights of the n-th node stand from `offsets[n]` to `offsets[n + 1]`.
     """
 
     node_indices: Int64[np.ndarray, "nodes"]
@@ -66,13 +62,11 @@ class Rig:
         rest_joints: Joints in the rest pose, metres.
         parents: Parent of each joint, -1 for the root.
         canonical_rotations: Axis-angle rotations of joints 1 to 23 in the canonical pose.
-        box_low, box_high: Corners of the canonical box, metres.
         weights: Skinning weights at nodes `low + (i, j, k) / (count - 1) * (high - low)`.
-        skin_distance: Distance from each occupancy cell's center to the body's skin, metres.
-        inside_skin: Whether that center lies under the skin.
+        skin_distance: Distance from each occupancy cell's center to the body's skin, metres;
+            `inside_skin` where that center lies under it.
         seeds: Canonical points of the skin at which root finding starts, metres; one per voxel of
             `SEED_SPACING_M` and body part.
-        seed_parts: The body part of each seed.
         seed_normals: Outward unit normals of the skin at the seeds, canonical.
     """
 
@@ -199,7 +193,6 @@ MIN_VERTEX_DISTANCE_M = 2e-3
 SMOOTHED_BEYOND_M = 0.03
 """Distance from the skin beyond which weights are smoothed, metres; clothes hang nearer."""
 SMOOTHING_PASSES = 2
-"""Passes of the smoothing filter."""
 
 
 def volume_shape(

@@ -52,11 +52,11 @@ class AllRoundVerdict:
 
     Attributes:
         verdict: The worst of the words; None if nothing was measured.
-        limit: What has the worst word: filmed, surface, player or held_out; None of a sharp avatar.
-        advice: What to do about it, a sentence; None of a sharp avatar, and of a failed one, whose
-            failure has causes of its own (`diagnose_failure`).
-        seen: Share of the skin that was filmed, in [0, 1].
-        half_transparent: Share of half-transparent pixels in views that were not filmed, in [0, 1].
+        limit: Its criterion: filmed, surface, player or held_out; None of a sharp avatar.
+        advice: The remedy, a sentence; None of a sharp avatar, and of a failed one, whose failure
+            has causes of its own (`diagnose_failure`).
+        seen, half_transparent: Shares, in [0, 1], of the skin that was filmed, and of
+            half-transparent pixels in views that were not filmed.
     """
 
     verdict: SharpnessVerdict | None
@@ -75,15 +75,7 @@ class AllRoundVerdict:
         player_psnr: float | None,
         film_advice: str,
     ) -> "AllRoundVerdict":
-        """Finds the worst word, and its cure.
-
-        Args:
-            held_out: Verdict on the held-out frames.
-            seen: Share of the skin that was filmed.
-            half_transparent: See `half_transparent_share`.
-            player_psnr: PSNR of the player's best tier to the renderer, dB.
-            film_advice: What to film next, a sentence.
-        """
+        """Finds the worst word, and its remedy; `player_psnr` is of the player's best tier, dB."""
         words: dict[str, SharpnessVerdict | None] = {
             "filmed": SEEN.word(seen),
             "surface": None if half_transparent is None else FIRM.word(1.0 - half_transparent),

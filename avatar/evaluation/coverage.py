@@ -47,7 +47,6 @@ class Coverage:
     Frames may be added on one thread while others read: nothing that was seen is ever unseen.
 
     Attributes:
-        patches: Patches of the person's skin.
         cosines: Largest cosine at which each patch was seen, in [0, 1]; 0 if it never was.
         stages: `VisibilityStage` of each patch.
     """
@@ -125,7 +124,7 @@ class Coverage:
 
 
 def expected_coverage(shaped: ShapedBody, views: Iterable[tuple[BodyPose, Camera]]) -> Coverage:
-    """What frames in some poses will show of the person, before any frame is read."""
+    """Coverage that frames in these poses will reach, before any frame is read."""
     coverage = Coverage(shaped)
     for pose, camera in views:
         small = camera.resize_longer_side(EXPECTED_PX)
@@ -182,7 +181,7 @@ ADVICE_BY_SIDE = {
     ("torso", "left"): "Turn until your left side has been seen.",
     ("torso", "right"): "Turn until your right side has been seen.",
 }
-"""What shows a piece of skin that faced away, by its limb and side; others have one sentence."""
+"""Advice about skin that faced away, by its limb and side; others have one sentence."""
 
 
 @dataclass(frozen=True, kw_only=True)

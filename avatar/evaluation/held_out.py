@@ -48,7 +48,6 @@ class HeldOutFrame:
     """A frame that is never trained on.
 
     Attributes:
-        observation: Image, mask, pose and camera.
         correspondences: Correspondence grid of the pose; None to solve it at every rendering. A
             grid is as large as its image, and most frames are rendered only once, at the end.
         gain: Factor of each color channel of the rendering, where the exposure has been fitted.
@@ -161,7 +160,6 @@ class PixelSample:
     """Pixels of a held-out frame by which it is scored.
 
     Attributes:
-        frame: The frame.
         places: Flat indices of the pixels.
         areas: Number of the image's pixels that each of them stands for.
         correspondences: Correspondence grid of the pose; None to solve it at every scoring.

@@ -1,4 +1,4 @@
-"""How well a picture is rendered: PSNR, SSIM, soft IoU, and its sharpness in one word.
+"""Quality of a rendered image: PSNR, SSIM, soft IoU, and its sharpness in one word.
 
 The word is sharp, soft, blurred or failed. A PSNR alone does not say whether a picture is good. On
 white it depends on how much of the frame the person fills, and inside the mask on the clothes: a
@@ -85,9 +85,7 @@ def psnr(
 ) -> float:
     """Peak signal-to-noise ratio in dB of images in [0, 1]; infinite if they are equal.
 
-    Args:
-        image, truth: Images to compare.
-        mask: Pixels that count; all if None. An empty mask gives NaN.
+    `mask` selects the pixels that count; an empty one gives NaN.
     """
     error = (image.astype(np.float64) - truth) ** 2
     return psnr_of_errors(error if mask is None else error[mask])
@@ -142,9 +140,8 @@ SharpnessVerdict = Literal["sharp", "soft", "blurred", "failed"]
 """Verdicts from the best to the worst."""
 
 MAX_SHARP_BLUR = 0.0075
-"""Largest equivalent blur of a sharp image, as a share of the person's height."""
+"""Largest equivalent blurs of sharp and soft images, as shares of the person's height."""
 MAX_SOFT_BLUR = 0.0125
-"""Largest equivalent blur of a soft image."""
 MAX_MEASURABLE_BLUR = 0.08
 """Largest equivalent blur of a blurred image; beyond it the avatar has failed."""
 MIN_OVERLAP = 0.5
@@ -191,13 +188,8 @@ def calibrate_blur(
 def equivalent_blur(psnr_mask: float, calibration: BlurCalibration) -> float:
     """The blur that lowers a frame's PSNR as much, as a share of the person's height.
 
-    Args:
-        psnr_mask: PSNR of the rendering where alpha > 0.5, dB.
-        calibration: Calibration of the same frame.
-
-    Returns:
-        A blur of at least the first of `CALIBRATION_BLURS`; infinite beyond the last; NaN without a
-        silhouette.
+    `psnr_mask` is the rendering's where alpha > 0.5, dB. The blur is at least the first of
+    `CALIBRATION_BLURS`; infinite beyond the last; NaN without a silhouette.
     """
     if not calibration or isnan(psnr_mask):
         return nan

@@ -24,10 +24,8 @@ LpipsNetwork = Literal["alex", "vgg"]
 class LpipsConvention:
     """One way in which published tables call LPIPS.
 
-    Attributes:
-        network: Network whose features are compared.
-        label: Heading in tables: network, and range of the images that it is fed.
-        rescaled: Whether images are rescaled to [-1, 1], for which the network was trained.
+    `label` heads a table: the network, and the range of the images that it is fed. `rescaled`
+    brings images to [-1, 1], for which the network was trained.
     """
 
     network: LpipsNetwork
@@ -76,23 +74,13 @@ def network_layers(network: LpipsNetwork) -> torch.nn.Sequential:
 
 @final
 class Lpips:
-    """LPIPS in the conventions whose weights were found.
+    """LPIPS in the `conventions` whose weights were found.
 
-    Attributes:
-        conventions: Names of the conventions that are measured.
-        unavailable: Why others are not, in a sentence; None if all are.
+    `unavailable` says in a sentence why others are not measured; None if all are.
     """
 
     def __init__(self, wanted: Sequence[str], folder: Path | None = None) -> None:
-        """Load the networks.
-
-        Args:
-            wanted: Names of `LPIPS_CONVENTIONS`.
-            folder: Folder of torchvision's weights; None for torch's cache.
-
-        Raises:
-            InputError: If a file holds no such weights.
-        """
+        """Load the networks of `wanted` conventions from `folder`; None is torch's cache."""
         folder = Path(torch.hub.get_dir()) / "checkpoints" if folder is None else folder
         networks: list[LpipsNetwork] = [LPIPS_CONVENTIONS[name].network for name in wanted]
         files: dict[LpipsNetwork, Path] = {

@@ -15,9 +15,9 @@ PART_NAMES = (
     "head", "left upper arm", "right upper arm", "left forearm", "right forearm", "left hand",
     "right hand",
 )  # fmt: skip
-"""The 14 body parts of `avatar.rig.PARTS`; left is the person's left."""
+"""The 14 body parts of `avatar.rig.PART_OF_JOINT`; left is the person's left."""
 SIDE_NAMES = ("front", "back", "left", "right", "top", "under")
-"""Where a patch looks while the person stands in the T-pose; `under` is the underside."""
+"""Directions of the patches in the T-pose; `under` is the underside."""
 ARM_PARTS, FOOT_PARTS = slice(8, 14), slice(5, 7)
 PATCH_M = 0.022
 OCCLUSION_TOLERANCE_M = 0.01
@@ -30,13 +30,10 @@ class SkinPatches:
     """Pieces of skin of about 2 cm that are visible from around the person.
 
     Attributes:
-        points: Their centres in the rest pose (SMPL's T-pose), metres.
-        normals: Unit outward normals in the rest pose.
+        points: Centres in the rest pose (SMPL's T-pose), metres; `normals` point outward.
         areas: In square metres.
-        weights: Skinning weights.
-        parts: Index into `PART_NAMES`.
-        sides: Index into `SIDE_NAMES`. Arms and hands have front, back, top and under; the
-            others front, back, left and right.
+        parts, sides: Indices into `PART_NAMES` and `SIDE_NAMES`. Arms and hands have front, back,
+            top and under; the others front, back, left and right.
     """
 
     points: Float32[np.ndarray, "patches 3"]
@@ -102,7 +99,7 @@ def _is_foot(parts: Int[np.ndarray, "patches"]) -> Bool[np.ndarray, "patches"]:
 def _visible_from_anywhere(
     points: Float32[np.ndarray, "patches 3"], normals: Float32[np.ndarray, "patches 3"]
 ) -> Bool[np.ndarray, "patches"]:
-    """Which patches anybody sees who walks around the T-pose, from above and below as well."""
+    """Mask of the patches that are seen from around the T-pose, from above and below as well."""
     shown = np.zeros(len(points), dtype=bool)
     for direction in np.ndindex(3, 3, 3):
         to_eye = np.array(direction, dtype=np.float64) - 1.0
@@ -123,10 +120,8 @@ def _visible_from_anywhere(
 class PatchView:
     """The patches of a posed body, as a camera sees them.
 
-    Attributes:
-        cosines: Of the angle between each normal and the direction to the camera.
-        unoccluded: Whether a patch faces the camera with no other before it.
-        pixels: Place in the image, px.
+    `cosines` are those between the normals and the directions to the camera; `unoccluded` patches
+    face it with no other before them.
     """
 
     cosines: Float[np.ndarray, "patches"]
@@ -155,12 +150,7 @@ def view_patches(
 def pose_patches(
     patches: SkinPatches, world_from_rest: Float[np.ndarray, "24 4 4"]
 ) -> tuple[Float32[np.ndarray, "patches 3"], Float32[np.ndarray, "patches 3"]]:
-    """Centres and unit normals of the patches in the world, by linear blend skinning.
-
-    Args:
-        patches: At rest.
-        world_from_rest: The joints' transforms (`PosedBody.world_from_rest`).
-    """
+    """Centres and unit normals of the patches in the world, by linear blend skinning."""
     joints = world_from_rest[:, :3].reshape(24, 12).astype(np.float32)
     blended = (patches.weights @ joints).reshape(-1, 3, 4)
     points = np.einsum("pab,pb->pa", blended[:, :, :3], patches.points) + blended[:, :, 3]

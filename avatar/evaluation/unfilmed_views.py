@@ -85,10 +85,8 @@ def render_unfilmed_views(
 ) -> list[Float32[np.ndarray, "height width 4"]]:
     """Premultiplied renderings of all views, in the order of `unfilmed_views`.
 
-    Args:
-        avatar: Avatar to render.
-        reduction: Factor by which pictures are smaller. A ray has no width: the share of
-            half-transparent pixels stays the same.
+    Images are smaller by the factor `reduction`. A ray has no width: the share of half-transparent
+    pixels stays the same.
     """
     size = VIEW_PX[0] // reduction, VIEW_PX[1] // reduction
     return [

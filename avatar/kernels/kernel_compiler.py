@@ -76,7 +76,7 @@ class Vector4(Type):
 
 @register_model(Vector4)
 class _Vector4Model(models.PrimitiveModel):
-    """How a `Vector4` is held: as LLVM's vector."""
+    """Data model of a `Vector4`: LLVM's vector."""
 
     def __init__(self, data_model_manager, numba_type):
         super().__init__(data_model_manager, numba_type, FLOAT4)
@@ -86,12 +86,12 @@ vector4 = Vector4()
 
 
 def operation(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A decorator: an operation of compiled code; who calls it leaves out the typing context."""
+    """Decorates an operation of compiled code, which is called without the typing context."""
     return intrinsic(function)
 
 
 def _row_pointer(context, builder, signature, arguments):
-    """Where the four numbers lie that begin at `array[row, column]`."""
+    """Pointer to the four numbers that begin at `array[row, column]`."""
     array_type = signature.args[0]
     array = context.make_array(array_type)(context, builder, arguments[0])
     pointer = cgutils.get_item_pointer(

@@ -109,7 +109,7 @@ def _skin_distance(x, y, z, distance, low, cells_per_m):
 
 @compile_kernel(inline="always", **FAST_MATH)
 def _is_known_root(chain, following, found, x, y, z):
-    """Whether a cell's chain of roots holds one near a point, or holds no more."""
+    """True if a cell's chain holds a root near a point, or is full."""
     count = 0
     while chain >= 0:
         dx, dy, dz = found[chain, 0] - x, found[chain, 1] - y, found[chain, 2] - z
@@ -125,7 +125,7 @@ def _search_root(
     transforms, low, nodes_per_m, distance, cells_per_m, band_m, grid_low, cell_m,
     chains, following, cell_of, found, total, i, j, k, flat, x, inverse, p, blend,
 ):  # fmt: skip
-    """Looks for a root of cell (i, j, k) near x, and takes it in; how many roots there are then."""
+    """Solves for a root of cell (i, j, k) from x and adds it if it is new; returns their count."""
     if _is_known_root(chains[flat], following, found, x[0], x[1], x[2]):
         return total
     off = _skin_distance(x[0], x[1], x[2], distance, low, cells_per_m)
@@ -156,23 +156,22 @@ def flood_fill_roots(
     transforms, low, nodes_per_m, seeds, posed, seed_inverses, distance, cells_per_m, band_m,
     grid_low, cell_m, shape, chains, following, cell_of, found, bent, room,
 ):  # fmt: skip
-    """Finds all roots of one frame; returns how many there are.
+    """Finds all roots of one frame; returns their number, which above the capacity is too many.
 
     Args:
-        transforms, low, nodes_per_m: Blended 3×4 transforms on the weight volume's nodes
-            (x, y, z, `LANES`), zero on nodes too far from the skin to matter; where the nodes are.
-        seeds, posed, seed_inverses: Where to start: canonical, posed, inverse 3×3 blends.
+        transforms, low, nodes_per_m: Blended 3×4 transforms on the weight volume's nodes (x, y, z,
+            `MATRIX_LANES`), zero on nodes too far from the skin to matter.
+        seeds, posed, seed_inverses: Starting points: canonical, posed, inverse 3×3 blends.
         distance, cells_per_m, band_m: Distance from the canonical skin in cells of the same box;
             roots farther from it than the band are dropped.
         grid_low, cell_m, shape: Low corner, edge of a cell and cells of the frame's grid.
-        chains: (cells) the last root found in each cell, -1 where there is none.
+        chains: (cells) the last root of each cell, -1 where there is none; written, as the next
+            four.
         following: (capacity) the root of the same cell that was found before each.
         cell_of: (capacity, 3) the cell of each root.
-        found: (capacity, 30) each root and what `probe_faces` and `probe_corners` say about it.
-        bent: (capacity) whether the corners were asked.
-        room: For `LANES` + 15 floats.
-
-    The last six are written. A returned number above the capacity means that it did not do.
+        found: (capacity, 30) each root and its derivatives by `probe_faces` and `probe_corners`.
+        bent: (capacity) whether the corners were probed.
+        room: Scratch for `MATRIX_LANES` + 15 floats.
     """
     blend, inverse = room[:MATRIX_LANES], room[MATRIX_LANES : MATRIX_LANES + 9]
     x, p = room[MATRIX_LANES + 9 : MATRIX_LANES + 12], room[MATRIX_LANES + 12 : MATRIX_LANES + 15]
@@ -186,6 +185,7 @@ def flood_fill_roots(
         k = I32((posed[s, 2] - grid_low[2]) / cell_m)
         for n in range(9):
             inverse[n] = seed_inverses[s, n]
+        # first guess: x = seed + B⁻¹ (center - posed seed), with B the blended 3×3 matrix
         ux, uy, uz = rotate_vector(
             inverse,
             grid_low[0] + (F32(i) + F32(0.5)) * cell_m - posed[s, 0],
@@ -209,6 +209,7 @@ def flood_fill_roots(
             for n in range(9):
                 inverse[n] = root[3 + n]
             bend = probe_faces(transforms, low, nodes_per_m, p, t, x, inverse, blend, root)
+            # at a face, d = cell_m / 2, the warp is about |c_ii| d² from affine
             bent[done] = bend * F32(0.25) * cell_m * cell_m > F32(MIN_SECOND_ORDER_M)
             if bent[done]:
                 for n in range(9):
@@ -223,6 +224,7 @@ def flood_fill_roots(
                 )
                 if a < 0 or b < 0 or c < 0 or a >= shape[0] or b >= shape[1] or c >= shape[2]:
                     continue
+                # guess of the neighbor's root: x ± cell_m A e, along a column of A
                 axis, step_m = side // 2, cell_m * F32(1 - 2 * (side % 2))
                 x[0] = root[0] + step_m * root[3 + axis]
                 x[1] = root[1] + step_m * root[6 + axis]
@@ -240,7 +242,7 @@ def flood_fill_roots(
 
 @compile_kernel(**FAST_MATH)
 def pack_roots(chains, following, found, bent, index):
-    """Writes `CorrespondenceGrid.index`, flat, and returns `CorrespondenceGrid.roots`."""
+    """Writes `CorrespondenceGrid.packed_cells`, flat, and returns `CorrespondenceGrid.roots`."""
     rows = 1  # row 0 stays unused, so that no packed index is 0
     for cell in range(index.shape[0]):
         count, bends, chain = 0, False, chains[cell]
@@ -280,6 +282,7 @@ def _cell_span(root, across, low, per_m, cells):
 def _image_extent(roots, row, bent, half):
     """Bound of the extent of a cell's image about its root, along each canonical axis."""
     r = roots[row]
+    # for |d_i| ≤ h on axis k: |A d|_k ≤ h Σ |A_ki|, and |Σ c_ij d_i d_j| ≤ h² Σ |c_ij|
     x = half * (abs(r[3]) + abs(r[4]) + abs(r[5]))
     y = half * (abs(r[6]) + abs(r[7]) + abs(r[8]))
     z = half * (abs(r[9]) + abs(r[10]) + abs(r[11]))
@@ -330,15 +333,11 @@ def cull_cells(packed_cells, roots, cell_m, occupied, low, cells_per_m, culled_c
 def find_unreliable_roots(
     packed_cells, roots, grid_low, cell_m, transforms, low, nodes_per_m, far_m, unreliable, room
 ):
-    """Marks the roots whose warp is wrong at a corner of their cell.
+    """Marks the rows of roots whose warp is wrong at a corner of their cell.
 
-    Args:
-        packed_cells, roots, grid_low, cell_m: As in `CorrespondenceGrid`, with a leading axis of
-            `roots`.
-        transforms, low, nodes_per_m: Blended transforms as for `flood_fill_roots`.
-        far_m: Largest distance between a corner and its skinned canonical point, metres.
-        unreliable: Flag of each root row; written where true.
-        room: Scratch for `MATRIX_LANES` floats.
+    The grid is a `CorrespondenceGrid` with a leading axis of `roots`; transforms are as for
+    `flood_fill_roots`. A corner's canonical point may be skinned up to `far_m` metres away from it.
+    `room` is scratch for `MATRIX_LANES` floats.
     """
     half = F32(0.5) * cell_m
     for i in range(packed_cells.shape[0]):
@@ -356,6 +355,7 @@ def find_unreliable_roots(
                         x, y, z = canonical_point(roots, 0, row, bent, dx, dy, dz)
                         interpolate_at(transforms, low, nodes_per_m, x, y, z, MATRIX_LANES, room)
                         x, y, z = transform_point(room, x, y, z)
+                        # LBS(x) - p, with p the corner
                         x -= grid_low[0] + (F32(i) + F32(0.5)) * cell_m + dx
                         y -= grid_low[1] + (F32(j) + F32(0.5)) * cell_m + dy
                         z -= grid_low[2] + (F32(k) + F32(0.5)) * cell_m + dz
@@ -375,6 +375,7 @@ def find_off_ray_points(
         interpolate_at(transforms, low, nodes_per_m, x, y, z, MATRIX_LANES, room)
         x, y, z = transform_point(room, x, y, z)
         x, y, z = x - origins[n, 0], y - origins[n, 1], z - origins[n, 2]
+        # the part of LBS(x) - o across the ray: its length is the distance from the ray
         along = x * directions[n, 0] + y * directions[n, 1] + z * directions[n, 2]
         x -= along * directions[n, 0]
         y -= along * directions[n, 1]

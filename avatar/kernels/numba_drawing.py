@@ -74,12 +74,11 @@ def draw_rays(
         pixels: Of each picture: numbers of pixels near the person and of all (0: there is none),
             width, number of runs (pictures, 4).
         runs: `PixelRuns.ends` and `shifts` (pictures, runs, 2).
-        sights: Points of the plane at depth 1 seen by every `SIGHT_SPACING_PX`-th pixel
-            (pictures, nodes, 2).
+        sights: Points of the plane at depth 1 seen by every `SIGHT_SPACING_PX`-th pixel (pictures,
+            nodes, 2).
         colors: Premultiplied RGBA of the pixels near the person (pictures, pixels, 4).
         all_origins, turns: Origin of the rays and body-from-camera rotation of each slot.
         world_from_camera: Rotation of each slot's camera.
-        slots, origins, directions, targets, world_from_body: Of each ray.
     """
     rays, stop = slots.shape[0], 0
     drawn, numbers, found = np.zeros(frames, I32), np.empty(rays, np.int64), np.empty(rays, I32)
@@ -122,12 +121,8 @@ def draw_rays(
 def draw_strong_gradients(grads, faint_share, chances, points, drawn):
     """Draws points by the strength of their gradients; returns how many.
 
-    Args:
-        grads: Gradients (points, 4).
-        faint_share: Strength, as a share of the mean, below which a gradient is drawn by chance.
-        chances: Random numbers in [0, 1).
-        points: The points that were drawn; written, as far as there are any.
-        drawn: Their gradients, divided by the chance of each; written.
+    Gradients below the share `faint_share` of the mean strength are drawn by chance. `points` and
+    their gradients, divided by the chance of each, are written from the front.
     """
     mean, count = 0.0, 0
     for n in range(grads.shape[0]):

@@ -29,7 +29,7 @@ PRIME_Y, PRIME_Z = U32(PRIMES[1]), U32(PRIMES[2])
 
 @compile_kernel(inline="always")
 def _box_coordinates(points, start, stop, low, places):
-    """Where the points of a block lie in the box, metres."""
+    """Offsets of a block's points from the box's corner, metres."""
     for i in range(stop - start):
         for axis in range(3):
             places[axis, i] = points[start + i, axis] - low[axis]
@@ -37,7 +37,7 @@ def _box_coordinates(points, start, stop, low, places):
 
 @compile_kernel(inline="always")
 def _locate_cells(places, number, scale, counts, cells, within):
-    """The cell of each place on one level, and where in it the place lies."""
+    """The cell of each place on one level, and the place's offset in it, in cells."""
     for axis in range(3):
         last = I32(counts[axis] - 2)
         for i in range(number):
@@ -74,7 +74,6 @@ def _corner_entries(cells, number, counts, dense, first, size, entries):
 
 @compile_kernel(inline="always")
 def _trilinear_weights(within, number, weights):
-    """Trilinear weights of the corners."""
     for i in range(number):
         x, y, z = within[0, i], within[1, i], within[2, i]
         u, v, w = F32(1) - x, F32(1) - y, F32(1) - z
@@ -164,6 +163,7 @@ def _add_point_gradient(within, corner_gradients, number, scale, total):
             corner_gradients[6, i],
             corner_gradients[7, i],
         )
+        # ∂/∂x Σ weight · pull: differences along an axis, bilinear in the other two
         total[0, i] += scale * (
             v * w * (p1 - p0) + y * w * (p3 - p2) + v * z * (p5 - p4) + y * z * (p7 - p6)
         )

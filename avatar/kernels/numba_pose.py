@@ -42,14 +42,9 @@ sums in single precision are not positive definite."""
 
 @compile_kernel(inline="always", **FAST_MATH)
 def _weights_at(weights, shape, low, nodes_per_m, x, y, z, out):
-    """Trilinear skinning weights at a point, four bones at once, in the first row of `out`.
+    """Trilinear weights of a point, four bones at once, in the first row of `out` (rows, 24).
 
-    Args:
-        weights: (nodes, 24).
-        shape: Nodes along each axis.
-        low, nodes_per_m: Corner and nodes per metre.
-        x, y, z: The point.
-        out: (rows, 24).
+    `weights` is (nodes, 24); `shape`, `low` and `nodes_per_m` say how its nodes lie.
     """
     a = min(max((x - low[0]) * nodes_per_m[0], F32(0)), F32(shape[0]) - F32(1.001))
     b = min(max((y - low[1]) * nodes_per_m[1], F32(0)), F32(shape[1]) - F32(1.001))
@@ -86,7 +81,6 @@ def bone_wrenches(
         rows: Root of `cell_roots[slot]` that each sample was warped with.
         first, count, slots: Each ray's samples and its frame's slot.
         cell_roots: Roots and inverse Jacobians (slots, roots, 12).
-        weights, shape, low, nodes_per_m: The skinning volume, as for `_weights_at`.
         bones: Body-from-canonical matrices (slots, 24, 12).
         out: (rays, 24, 6), zero before: force then moment about the body frame's origin.
     """
@@ -101,6 +95,7 @@ def bone_wrenches(
             if a * a + b * b + c * c <= F32(MIN_PULL_SHARE**2) * strongest:
                 continue
             n = rows[i]
+            # force at the posed point: f = Aᵀ g, with A = J⁻¹ at the cell's center
             fx = (
                 cell_roots[slot, n, 3] * a + cell_roots[slot, n, 6] * b + cell_roots[slot, n, 9] * c
             )
@@ -119,6 +114,7 @@ def bone_wrenches(
                 if w < F32(1e-3):
                     continue
                 px, py, pz = transform_point(bones[slot, joint], x, y, z)
+                # wrench on the bone: w f, and w (B x) × f
                 out[ray, joint, 0] += w * fx
                 out[ray, joint, 1] += w * fy
                 out[ray, joint, 2] += w * fz
@@ -146,12 +142,8 @@ def update_roots(
 ):
     """Moves a frame's roots to follow its pose, by one chord step towards the cell's center.
 
-    Args:
-        packed_cells: Packed cells of the frame, flat.
-        cells, grid_low, cell_m: Shape, corner and cell size of their grid.
-        roots: Roots, updated in place; inverse Jacobians and second-order terms stay.
-        weights, shape, low, nodes_per_m: The skinning volume, as for `_weights_at`.
-        bones: The new pose's matrices (24, 12).
+    Cells are flat; their grid has the shape `cells`. Roots are updated in place, inverse Jacobians
+    and second-order terms stay. `bones` are the new pose's matrices (24, 12).
     """
     for i in prange(cells[0]):
         room, last = np.empty((2, 24), F32), cells[0] * cells[1] * cells[2] - 1
@@ -184,6 +176,7 @@ def update_roots(
                     store4(room, 1, 4, two)
                     store4(room, 1, 8, three)
                     sx, sy, sz = transform_point(room[1], x, y, z)
+                    # chord step: x ← x + A e, with e = center - LBS(x)
                     ex = grid_low[0] + (F32(i) + F32(0.5)) * cell_m - sx
                     ey = grid_low[1] + (F32(j) + F32(0.5)) * cell_m - sy
                     ez = grid_low[2] + (F32(k) + F32(0.5)) * cell_m - sz
@@ -204,13 +197,13 @@ def add_rays(
     """Adds rays to the normal equations of their slots' poses, in units of the prior's sigmas.
 
     By virtual work: a joint at c that rotates by ω moves every bone below it, so that
-    dL/dω = -Σ (M - c × F) over these bones' wrenches (F, M), in body-frame axes. It is expressed
-    in the axes of the joint, in which the corrections are. The root's shift is in the given body
+    dL/dω = -Σ (M - c × F) over these bones' wrenches (F, M), in body-frame axes. It is expressed in
+    the axes of the joint, in which the corrections are. The root's shift is in the given body
     frame, the forces are in the corrected one. Each ray's loss ℓ is half of a square, ℓ = ρ²/2, so
     that its curvature is ∇ℓ ∇ℓᵀ / 2ℓ.
 
     Args:
-        slots, wrenches, loss: Slot, wrenches (24, 6) and loss of each ray.
+        wrenches: Of each ray's bones (rays, 24, 6).
         min_loss: Added to the loss in the curvature.
         scale: Sigma of a rotation, radians, and of the root's shift, metres.
         room: Most rays of each slot; rays beyond are left out.
@@ -220,7 +213,7 @@ def add_rays(
         counts: Rays of each slot so far; these and the following are updated.
         gradients: Sums of gradients (slots, `PADDED`).
         curvatures: Sums of curvatures (slots, 75, `PADDED`).
-        moments: Sums of ∇ℓ ∇ℓᵀ, alike; of zero slots if they are not asked for.
+        moments: Sums of ∇ℓ ∇ℓᵀ, alike; of zero slots if they are not needed.
         powers: Sums of |∇ℓ|² and of |∇ℓ|² / 2ℓ (slots, 2).
     """
     total, g = np.empty((JOINTS, 6), F32), np.zeros(PADDED, F32)
@@ -230,12 +223,14 @@ def add_rays(
             continue
         counts[slot] += 1
         total[:] = wrenches[ray]
+        # the wrench of the whole branch below each joint
         for joint in range(JOINTS - 1, 0, -1):
             for q in range(6):
                 total[parents[joint], q] += total[joint, q]
         for joint in range(JOINTS):
             x, y, z = places[slot, joint, 0], places[slot, joint, 1], places[slot, joint, 2]
             fx, fy, fz = total[joint, 0], total[joint, 1], total[joint, 2]
+            # u = c × F - M, and its derivative by the correction, σ Rᵀ u
             ux = y * fz - z * fy - total[joint, 3]
             uy = z * fx - x * fz - total[joint, 4]
             uz = x * fy - y * fx - total[joint, 5]
@@ -245,6 +240,7 @@ def add_rays(
                     + turns[slot, joint, 1, a] * uy
                     + turns[slot, joint, 2, a] * uz
                 )
+        # the shift moves the whole body: -σ R F, with R the root's correction
         for a in range(3):
             g[72 + a] = -F32(scale[1]) * (
                 root_turns[slot, a, 0] * total[0, 0]
@@ -269,17 +265,14 @@ def add_rays(
 def solve_with_prior(curvature, gradient, stiffness, back, factor, found):
     """Solves (curvature + stiffness) found = gradient + stiffness back by Cholesky's method.
 
-    Args:
-        curvature: Positive semidefinite but for rounding (n, n or more).
-        gradient: (n).
-        stiffness: Of the prior in each direction; positive.
-        back: Distance to the prior's mean (n).
-        factor: Scratch (n, n).
-        found: (n), written.
+    The curvature (n, n or more) is positive semidefinite but for rounding; the prior's stiffness is
+    positive, and alike in all directions. `back` is the distance to the prior's mean, `factor`
+    scratch (n, n); `found` is written.
     """
     n, ridge = found.shape[0], stiffness
     for i in range(n):
         ridge = max(ridge, MIN_RIDGE * curvature[i, i])
+    # L Lᵀ = curvature + ridge, and L y = gradient + stiffness back
     for i in range(n):
         for j in range(i + 1):
             s = np.float64(curvature[i, j])
@@ -292,6 +285,7 @@ def solve_with_prior(curvature, gradient, stiffness, back, factor, found):
         for k in range(i):
             s -= factor[i, k] * found[k]
         found[i] = s / factor[i, i]
+    # Lᵀ found = y
     for i in range(n - 1, -1, -1):
         found[i] /= factor[i, i]
         for k in range(i):
@@ -307,6 +301,7 @@ def _rotation(vector, out):
     sine = math.sin(angle) / angle if angle > 1e-6 else 1.0
     half = math.sin(0.5 * angle)
     cosine = 2.0 * half * half / square if angle > 1e-6 else 0.5
+    # I + sin θ / θ [v]× + (1 - cos θ) / θ² (v vᵀ - θ² I), with 1 - cos θ = 2 sin² (θ / 2)
     diagonal = 1.0 - cosine * square
     out[0, 0], out[1, 1], out[2, 2] = (
         diagonal + cosine * x * x,
@@ -329,7 +324,6 @@ def pose_joints(
         correction: Axis-angle correction of each joint's rotation, the root's first (25, 3).
         rest: Joints of the rest pose, metres.
         parents: Parent of each joint, before its children.
-        rest_from_canonical: (24, 4, 4).
         turns, places, bones, root_turn: Rotations (24, 3, 3) and places (24, 3) of the joints,
             body-from-canonical matrices (24, 12), rotation of the root's correction; written.
     """
@@ -342,6 +336,7 @@ def pose_joints(
     for joint in range(1, JOINTS):
         parent = parents[joint]
         _rotation(correction[joint], own)
+        # c = c_parent + R_parent (rest - rest_parent), R = R_parent · given · correction
         for a in range(3):
             place[joint, a] = place[parent, a]
             for b in range(3):
@@ -352,6 +347,7 @@ def pose_joints(
                 for c in range(3):
                     turn[joint, c, b] += turn[parent, c, a] * whole
     for joint in range(JOINTS):
+        # B = [R | c - R rest] · rest_from_canonical
         for a in range(3):
             away[a] = place[joint, a]
             for b in range(3):

@@ -52,7 +52,7 @@ def _second_order_term(roots, slot, row, x, y, z):
 
 @compile_kernel(inline="always", **FAST_MATH)
 def canonical_point(roots, slot, row, bent, x, y, z):
-    """The canonical point of what lies (x, y, z) from the centre of a cell with a root."""
+    """The canonical point of the offset (x, y, z) from the center of a cell with a root."""
     u = roots[slot, row, U32(0)] + (
         roots[slot, row, U32(3)] * x + roots[slot, row, U32(4)] * y + roots[slot, row, U32(5)] * z
     )
@@ -88,8 +88,7 @@ def _cached_density(occupied, density, low, cells_per_m, x, y, z, needs_density)
 def _enter_grid(origins, directions, ray, low, shape, slot, cell_m):
     """A ray in the cells of its slot's grid: `g = o + t d` is in cells, t in metres.
 
-    Returns:
-        o; d; dt / dg along each axis; t where the ray enters the grid, and where it leaves.
+    Returns o; d; dt / dg along each axis; t where the ray enters the grid, and where it leaves.
     """
     cells_a_m = F32(1) / cell_m
     ox = (origins[ray, 0] - low[slot, 0]) * cells_a_m
@@ -232,7 +231,7 @@ def march(
 
 @compile_kernel(**NO_ALLOCATION)
 def prefix_sum(counts, first):
-    """Writes where each ray's samples begin when they stand without gaps; how many there are."""
+    """Writes the index of each ray's first sample in a list without gaps; returns its length."""
     total = 0
     for ray in range(counts.shape[0]):
         first[ray] = total
@@ -275,6 +274,7 @@ def composite(raw, offsets, counts, sample_step_m, rendered):
     for ray in prange(offsets.shape[0]):
         through = F32(1)
         red, green, blue = F32(0), F32(0), F32(0)
+        # 1 - α = exp(-σ Δ); a sample weighs T α, and leaves T (1 - α)
         for i in range(offsets[ray], offsets[ray] + counts[ray]):
             kept = np.exp(-np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * sample_step_m)
             weight = through * (F32(1) - kept)
@@ -299,6 +299,7 @@ def _mean_huber(error, excess_alpha):
     dark, bright = F32(DARK_GRAY), F32(BRIGHT_GRAY)
     on_dark, on_bright = error - excess_alpha * dark, error - excess_alpha * bright
     p, q = _half_huber_slope(on_dark), _half_huber_slope(on_bright)
+    # half of Huber's loss of e is p e - δ p², with p its slope, so that their sum is the mean
     loss = p * on_dark + q * on_bright - F32(COLOR_HUBER_DELTA) * (p * p + q * q)
     return loss, p + q, -(p * dark + q * bright)
 
@@ -345,6 +346,7 @@ def composite_loss(
         g0, g1, g2, g_alpha = share * g0, share * g1, share * g2, share * (a0 + a1 + a2)
         if abs(off) > F32(ALPHA_DEAD_ZONE):
             g_alpha += alpha_weight * share * (F32(1) if off > F32(0) else F32(-1))
+        # hard surface: -log(exp(-α) + exp(α - 1)), of slope tanh(1/2 - α)
         solid, empty = np.exp(-alpha), np.exp(alpha - F32(1))
         g_alpha += hard_surface_weight * share * (solid - empty) / (solid + empty)
         loss[ray] = (
@@ -361,6 +363,7 @@ def composite_loss(
             grad_raw[i, 0] = weight * g0 * q0 * (F32(1) - q0)
             grad_raw[i, 1] = weight * g1 * q1 * (F32(1) - q1)
             grad_raw[i, 2] = weight * g2 * q2 * (F32(1) - q2)
+            # dL / d log σ = σ Δ (T behind · value - Σ weight · value of all samples behind)
             optical = np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * sample_step_m
             inside = raw[i, 3] < F32(MAX_LOG_DENSITY)
             grad_raw[i, 3] = optical * (through * value - behind) if inside else F32(0)

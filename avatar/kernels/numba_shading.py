@@ -34,6 +34,7 @@ def mean_normals(
             c = cell_index_at((points[i, 2] - low[2]) * cells_per_m[2], I32(nz))
             n = U32(rows[i])
             p, q, r = normals[a, b, c, 0], normals[a, b, c, 1], normals[a, b, c, 2]
+            # in the body frame: Aᵀ normal, normalised
             u = cell_roots[slot, n, 3] * p + cell_roots[slot, n, 6] * q + cell_roots[slot, n, 9] * r
             v = (
                 cell_roots[slot, n, 4] * p + cell_roots[slot, n, 7] * q
@@ -55,6 +56,7 @@ def _factor(normals, ray, coefficients, min_length, bounds):
     length = np.sqrt(x * x + y * y + z * z)
     if length <= F32(min_length):
         return F32(1), length
+    # c_0 + (c_1, c_2, c_3) · normal / |normal|
     light = coefficients[1] * x + coefficients[2] * y + coefficients[3] * z
     light = coefficients[0] + light / length
     return min(max(light, F32(bounds[0])), F32(bounds[1])), length
@@ -81,7 +83,6 @@ def add_light(
         target, rendered: Pixels, and their shaded rendering, premultiplied RGBA.
         coefficients: Those that the rendering is shaded by.
         min_alpha: Alpha of both above which a ray counts.
-        min_length, bounds: As for `light_factors`.
         memory_rays: Rays after which an earlier one weighs 1/e.
         sums: Products, with one another, of each ray's unshaded brightness times the four
             harmonics, and of its pixel's brightness (5, 5); updated.

@@ -47,14 +47,10 @@ def transform_point(m, x, y, z):
 
 @compile_kernel(**NO_ALLOCATION)
 def blend_nodes(nodes, first, joints, shares, bones, transforms):
-    """Blends the bones' matrices at some nodes of a volume (flat, `LANES`), in place.
+    """Blends the bones' matrices at some nodes of a volume (flat, `MATRIX_LANES`), in place.
 
-    Args:
-        nodes: Which nodes.
-        first, joints, shares: The bones that move each, and how much: those of node n stand from
-            `first[n]` to `first[n + 1]`.
-        bones: (24, `LANES`).
-        transforms: (nodes of the volume, `LANES`); only the named ones are written.
+    The bones that move `nodes[n]`, and their shares, stand from `first[n]` to `first[n + 1]`.
+    `bones` is (24, `MATRIX_LANES`).
     """
     for n in range(nodes.shape[0]):
         node = nodes[n]
@@ -75,6 +71,7 @@ LONGEST_STEP_M = 0.3
 def invert_rotation(m, out):
     """Inverse of the 3×3 part of a row-major 3×4 matrix."""
     a, b, c, d, e, f, g, h, i = m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]
+    # adjugate by determinant, which is kept away from zero
     p, q, r = e * i - f * h, f * g - d * i, d * h - e * g
     det = a * p + b * q + c * r
     s = F32(1) / (det if abs(det) > F32(1e-6) else F32(1e-6))
@@ -96,6 +93,7 @@ def rotate_vector(m, x, y, z):
 @compile_kernel(inline="always", **FAST_MATH)
 def _broyden_update(inverse, dx, dy, dz, yx, yy, yz):
     """Broyden's good update of an inverse Jacobian: a step d has changed the value by y."""
+    # J⁻¹ ← J⁻¹ + (d - J⁻¹ y) (dᵀ J⁻¹) / (dᵀ J⁻¹ y)
     jx, jy, jz = rotate_vector(inverse, yx, yy, yz)
     den = dx * jx + dy * jy + dz * jz
     den = F32(1) / (den if abs(den) > F32(1e-12) else F32(1e-12))
@@ -127,13 +125,12 @@ def solve_root(transforms, low, nodes_per_m, p, x, blend, inverse, initialize_in
     """Broyden's method (good update) for LBS(x) = p, from x; True if it came to rest.
 
     Args:
-        transforms: Blended 3×4 transforms on the weight volume's nodes (x, y, z, 12 or `LANES`).
-        low, nodes_per_m: Place and scale of those nodes.
-        p: The posed point.
+        transforms: Blended 3×4 transforms on the weight volume's nodes (x, y, z, 12 or
+            `MATRIX_LANES`).
         x: Initial point, replaced by the root.
         blend: Scratch for `MATRIX_LANES` floats.
         inverse: Initial inverse Jacobian, row by row, replaced by the updated one.
-        initialize_inverse: Whether to start from the blended rotation's inverse instead.
+        initialize_inverse: Starts from the blended rotation's inverse instead.
     """
     _blended_transform(transforms, low, nodes_per_m, x[0], x[1], x[2], blend)
     if initialize_inverse:
@@ -166,7 +163,7 @@ def solve_root(transforms, low, nodes_per_m, p, x, blend, inverse, initialize_in
 
 @compile_kernel(inline="always", **FAST_MATH)
 def _probe_root(transforms, low, nodes_per_m, p, dx, dy, dz, x, inverse, blend):
-    """Where, relative to the root x of p, the root of p + d lies: linearly, and one chord step."""
+    """Offset from the root x of p to the root of p + d: linear, and one chord step."""
     ux, uy, uz = rotate_vector(inverse, dx, dy, dz)
     interpolate_at(
         transforms, low, nodes_per_m, x[0] + ux, x[1] + uy, x[2] + uz, MATRIX_LANES, blend
@@ -180,18 +177,11 @@ def _probe_root(transforms, low, nodes_per_m, p, dx, dy, dz, x, inverse, blend):
 
 @compile_kernel(**NO_ALLOCATION)
 def probe_faces(transforms, low, nodes_per_m, p, t, x, inverse, blend, warp):
-    """How roots move about the root x of a cell's centre p, from probes t towards its six faces.
+    """Derivatives of the warp at the root x of a cell's center p, by probes t towards the faces.
 
-    A root of p + d is x + A d + Σ c_ij d_i d_j. What is known of it after this: A and the c_ii.
-
-    Args:
-        transforms, low, nodes_per_m, blend: As in `solve`.
-        p, t: Cell's centre; how far from it the warp is probed.
-        x, inverse: Its root and about the inverse Jacobian there.
-        warp: (30) root, A row by row, c_xx c_yy c_zz c_xy c_xz c_yz; the first 21 are written.
-
-    Returns:
-        Norm of all c_ii: how bent the warp is, 1/m.
+    A root of p + d is x + A d + Σ c_ij d_i d_j; A and the c_ii are found. `inverse` is about the
+    inverse Jacobian at x. `warp` (30) is the root, A row by row, c_xx c_yy c_zz c_xy c_xz c_yz, of
+    which the first 21 are written. Returns the norm of all c_ii: how bent the warp is, 1/m.
     """
     bend, half, over = F32(0), F32(0.5) / t, F32(0.5) / (t * t)
     for axis in range(3):
@@ -200,6 +190,7 @@ def probe_faces(transforms, low, nodes_per_m, p, t, x, inverse, blend, warp):
         dz = t if axis == 2 else F32(0)
         ax, ay, az = _probe_root(transforms, low, nodes_per_m, p, dx, dy, dz, x, inverse, blend)
         bx, by, bz = _probe_root(transforms, low, nodes_per_m, p, -dx, -dy, -dz, x, inverse, blend)
+        # central differences: A e = (a - b) / 2t and c_ii = (a + b) / 2t²
         warp[axis] = x[axis]
         warp[3 + axis], warp[6 + axis], warp[9 + axis] = (
             (ax - bx) * half, (ay - by) * half, (az - bz) * half,
@@ -212,7 +203,7 @@ def probe_faces(transforms, low, nodes_per_m, p, t, x, inverse, blend, warp):
 
 @compile_kernel(**NO_ALLOCATION)
 def probe_corners(transforms, low, nodes_per_m, p, t, x, inverse, blend, warp):
-    """Betters what `probe_faces` has written by probes towards the eight corners, and adds c_ij."""
+    """Improves the result of `probe_faces` by probes towards the eight corners; adds the c_ij."""
     for c in range(3, 12):
         warp[c] *= F32(0.5)  # the mean of what faces say and of what corners say
     for c in range(21, 30):
@@ -227,6 +218,7 @@ def probe_corners(transforms, low, nodes_per_m, p, t, x, inverse, blend, warp):
         )
         ux, uy, uz = ux / (F32(8) * t * t), uy / (F32(8) * t * t), uz / (F32(8) * t * t)
         mean_x, mean_y, mean_z = mean_x + ux, mean_y + uy, mean_z + uz
+        # least squares over the corners d = t (±1, ±1, ±1): A by Σ u d_i, c_ij by Σ u d_i d_j
         for c, u in enumerate((ux, uy, uz)):
             warp[3 + 3 * c] += F32(0.5) * t * u * i
             warp[4 + 3 * c] += F32(0.5) * t * u * j
@@ -235,6 +227,7 @@ def probe_corners(transforms, low, nodes_per_m, p, t, x, inverse, blend, warp):
             warp[24 + c] += u * i * k
             warp[27 + c] += u * j * k
     for c, mean in enumerate((mean_x, mean_y, mean_z)):
+        # corners measure c_xx + c_yy + c_zz: half of the difference, spread over the three
         more = (mean - warp[12 + c] - warp[15 + c] - warp[18 + c]) / F32(6)
         warp[12 + c] += more
         warp[15 + c] += more

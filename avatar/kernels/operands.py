@@ -46,13 +46,9 @@ class HashLevels:
         levels: int,
         table_size: int,
     ) -> "HashLevels":
-        """Levels in geometric progression between two cell sizes.
+        """Levels in geometric progression between two cell sizes, in a box from `low` to `high`, m.
 
-        Args:
-            low, high: Corners of the box, metres.
-            coarsest_m, finest_m: Cell sizes of the first and last level, metres.
-            levels: Number of levels.
-            table_size: Entries of a hashed level, a power of two.
+        A hashed level has `table_size` entries, a power of two.
         """
         if table_size & (table_size - 1):
             raise ValueError(f"The table size must be a power of two, not {table_size}.")
@@ -71,7 +67,7 @@ class HashLevels:
         )
 
     def coarser_than(self, cell_m: float) -> "HashLevels":
-        """The levels whose cells are at least so large, metres; the coarsest in any case."""
+        """The levels whose cells are at least `cell_m` metres wide; the coarsest in any case."""
         kept = max(int((1.0 / self.cells_per_m >= cell_m).sum()), 1)
         return replace(
             self,
@@ -105,13 +101,9 @@ PremultipliedPixels = Float32[Tensor, "rays 4"]
 
 
 class RaySamples(NamedTuple):
-    """Canonical samples of a batch of rays, packed ray by ray.
+    """Canonical samples of a batch of rays, metres, packed ray by ray from `offsets` on.
 
-    Attributes:
-        points: Canonical positions, metres.
-        offsets: Index of each ray's first sample.
-        counts: Number of samples of each ray.
-        root_rows: Row of the root, in its slot's grid, that each sample was warped with.
+    `root_rows` are the rows of the roots, in their slots' grids, that they were warped with.
     """
 
     points: Float32[Tensor, "samples 3"]
@@ -121,13 +113,10 @@ class RaySamples(NamedTuple):
 
 
 class RayBatch(NamedTuple):
-    """Rays in the body frame of the frame that each belongs to.
+    """Rays in the body frame of the frame that each belongs to; directions are unit vectors.
 
-    Attributes:
-        origins: Origins, metres.
-        directions: Unit directions.
-        slots: Slot whose correspondence grid each ray is marched through.
-        jitter: Offset of each ray's sample lattice, in steps; the integer part skips samples.
+    Each is marched through the grid of its slot. `jitter` is the offset of its sample lattice, in
+    steps; the integer part skips samples.
     """
 
     origins: Float32[Tensor, "rays 3"]
@@ -143,9 +132,7 @@ class CorrespondenceTables(NamedTuple):
         packed_cells: `first_row * 8 + bent * 4 + count` of each cell; an empty cell holds 0, or -n
             if all cells within n - 1 cells of it are empty as well.
         roots: Canonical roots and the derivatives of the warp at them.
-        low: Corner of each slot's grid, body frame, metres.
-        shape: Number of cells along each axis of each slot's grid.
-        cell_m: Edge of a cell, metres.
+        low, shape: Corner of each slot's grid, body frame, metres, and its number of cells.
     """
 
     packed_cells: Int32[Tensor, "slots cells"]
@@ -156,14 +143,7 @@ class CorrespondenceTables(NamedTuple):
 
 
 class DensityGrid(NamedTuple):
-    """Canonical occupancy: the occupied cells, and the density cached in each cell.
-
-    Attributes:
-        occupied: 1 in occupied cells, 0 elsewhere.
-        density: Cached density, 1/m.
-        low: Corner of the box, metres.
-        cells_per_m: Cells per metre along each axis.
-    """
+    """Canonical occupancy, 1 in occupied cells, and the density cached in each cell, 1/m."""
 
     occupied: UInt8[Tensor, "x y z"]
     density: Float32[Tensor, "x y z"]
@@ -172,13 +152,7 @@ class DensityGrid(NamedTuple):
 
 
 class SkinningVolume(NamedTuple):
-    """The volume of skinning weights (`avatar.rig.Rig`).
-
-    Attributes:
-        weights: Weights of the 24 bones at the nodes of the canonical box.
-        low: Corner of the box, metres.
-        nodes_per_m: Nodes per metre along each axis.
-    """
+    """Skinning weights (`avatar.rig.Rig`) at the nodes of the canonical box."""
 
     weights: Float32[Tensor, "x y z 24"]
     low: Float32[Tensor, "3"]
@@ -186,13 +160,7 @@ class SkinningVolume(NamedTuple):
 
 
 class NormalVolume(NamedTuple):
-    """The skin's outward normals in canonical space.
-
-    Attributes:
-        normals: Unit normals of the cells of the canonical box.
-        low: Corner of the box, metres.
-        cells_per_m: Cells per metre along each axis.
-    """
+    """The skin's outward unit normals in the cells of the canonical box."""
 
     normals: Float32[Tensor, "x y z 3"]
     low: Float32[Tensor, "3"]
@@ -203,11 +171,9 @@ class MarchSettings(NamedTuple):
     """Spacing, end and number of the samples of a ray.
 
     Attributes:
-        sample_step_m: Distance between samples, metres.
         opaque_margin_m: Distance that a ray is marched past the depth at which the cached density
             is opaque, metres; infinity for exact rendering. A margin in samples would shrink with
             the step and cut grazing rays in front of the surface.
-        max_samples: Largest number of samples on a ray.
     """
 
     sample_step_m: float
@@ -221,14 +187,7 @@ class MarchSettings(NamedTuple):
 
 
 class AdamSettings(NamedTuple):
-    """Rates of one step of Adam (Kingma and Ba 2015).
-
-    Attributes:
-        rate: Learning rate.
-        betas: Decays of the running means of the gradients and of their squares.
-        eps: Added to the root of the latter.
-        steps: Number of steps, this one included.
-    """
+    """Rates of one step of Adam (Kingma and Ba 2015); `steps` counts this one in."""
 
     rate: float
     betas: tuple[float, float]

@@ -33,18 +33,14 @@ from preprocess.observation import Observation
 CHECKPOINT_FORMAT = 3
 """Version of the checkpoint's layout; another version is refused."""
 CHECKPOINT_FILE = "state.pt"
-"""File name of the checkpoint in its folder."""
 COUNTERS = ("steps", "rays", "samples", "frames_seen", "wall_seconds", "cpu_seconds")
 """Attributes of `Trainer` that the checkpoint saves as plain numbers."""
 
 
 def save(trainer: Trainer, folder: Path, *, notes: dict[str, Any] | None = None) -> Path:
-    """Writes the trainer's state, the rig and the caller's notes into `folder`.
+    """Writes the trainer's state, the rig and the caller's notes (plain data) into `folder`.
 
-    Args:
-        trainer: What has been learnt. Frames are not kept: the video still has them.
-        folder: Made if it is not there.
-        notes: What the caller wants back (plain data: numbers, text, lists, dicts).
+    Frames are not kept: the video still has them.
     """
     return write_state(current_state(trainer, notes=notes), folder)
 
@@ -185,12 +181,7 @@ def video_age(index: int) -> int:
 
 
 class SavedFrames(NamedTuple):
-    """The frames that are saved.
-
-    Attributes:
-        replay_frames: Frames to train on.
-        held_out: Frames to score, never trained on.
-    """
+    """The frames that are saved: those to train on, and held-out ones, only scored."""
 
     replay_frames: list[ReplayFrame]
     held_out: list[HeldOutFrame]
@@ -271,7 +262,6 @@ def _to_plain(value: Any) -> Any:
 
 
 def _from_plain(value: Any) -> Any:
-    """Records and arrays from what `_to_plain` made of them."""
     if isinstance(value, torch.Tensor):
         return value.numpy()
     if isinstance(value, dict):

@@ -38,11 +38,7 @@ MAX_FRAME_GAP = 30
 
 @final
 class FrameExposures:
-    """Gains of the replay buffer's frames, slot by slot.
-
-    Attributes:
-        gains: Factor of each slot's color channels against the neutral avatar.
-    """
+    """Gains of the replay buffer's frames against the neutral avatar, slot by slot."""
 
     def __init__(self, capacity: int, *, avatar_frozen: bool = False) -> None:
         """Starts without frames.
@@ -105,11 +101,8 @@ class FrameExposures:
 def _update_gains(slots, target, rendered, avatar_frozen, pixels, renderings, gains):
     """Adds the colors of a batch's rays to the running sums of their slots, and finds the gains.
 
-    Args:
-        slots, target, rendered: Slot, pixel and rendering of each ray, premultiplied RGBA.
-        avatar_frozen: Whether gains are neither centered nor shrunk.
-        pixels, renderings: Running sums (slots, 3), which fade with each new ray; updated.
-        gains: Of the slots that hold a frame (held, 3); written.
+    The sums (slots, 3) fade with each new ray. `gains` (held, 3) are of the slots that hold a
+    frame; those of a frozen avatar are neither centered nor shrunk.
     """
     held = gains.shape[0]
     sums, log_gains = np.zeros((held, 7)), np.empty(held)

@@ -31,14 +31,11 @@ class TrainingFrame:
 
     Attributes:
         index: Index of the frame in its source.
-        pose: Pose of the body.
-        correspondences: Correspondence grid of the pose.
         origin: Origin of the rays, body frame, metres.
         body_from_camera: Rotation of the rays.
-        pixels: Training pixels.
-        colors: Premultiplied RGBA of those near the person; that of the others is zero.
+        colors: Premultiplied RGBA of the pixels near the person; that of the others is zero.
         view: View from which the frame can be rebuilt with its colors alone.
-        head: The picture of the head in the film's own resolution; None where it shows nothing.
+        head: The head's image in the resolution of the video; None where it shows nothing.
     """
 
     index: int
@@ -77,7 +74,7 @@ def rebuild_frame(
     *,
     head: tuple[RayView, UInt8[np.ndarray, "near 4"]] | None = None,
 ) -> TrainingFrame:
-    """Makes a frame ready from what is kept of it: finds its rays, and solves its warp."""
+    """Prepares a frame from what is saved of it: finds its rays, and solves its warp."""
     pixels = None if head is None else head_pixels(*head)
     return _assemble_frame(index, pose, view, colors, pixels, rig)
 
@@ -85,7 +82,7 @@ def rebuild_frame(
 def camera_in_body(
     camera: Camera, pose: BodyPose, rig: Rig
 ) -> tuple[Float32[np.ndarray, "3"], Float32[np.ndarray, "3 3"]]:
-    """Where a camera's rays start in the body frame, metres, and their rotation into it."""
+    """Origin of a camera's rays in the body frame, metres, and their rotation into it."""
     world_from_body = rig.world_from_body(pose)
     camera_from_body = camera.camera_from_world[:3, :3] @ world_from_body[:3, :3]
     origin = (camera.center_world - world_from_body[:3, 3]) @ world_from_body[:3, :3]
@@ -139,8 +136,8 @@ def view_descriptor(origin: Shaped[np.ndarray, "3"], pose: BodyPose) -> Float[np
 class KeyframeSelector:
     """Chooses the frames of a long stream that show something new.
 
-    At 30 frames a second most look like the one before: to make each ready would cost more than
-    it teaches, and take the time from training.
+    At 30 frames a second most look like the one before: to prepare each would cost more than it
+    teaches, and take the time from training.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -149,7 +146,7 @@ class KeyframeSelector:
         self._last: tuple[float, Float[np.ndarray, " 72"]] | None = None
 
     def accepts(self, observation: Observation) -> bool:
-        """Whether a frame is worth learning from, after those that were taken before."""
+        """Checks whether a frame is worth learning from, after those that were taken before."""
         world_from_body = self._rig.world_from_body(observation.pose)
         away = observation.camera.center_world - world_from_body[:3, 3]
         now = view_descriptor(away @ world_from_body[:3, :3], observation.pose)
@@ -179,13 +176,10 @@ StreamItem = TrainingFrame | HeldOutFrame | DroppedFrame | RedundantFrame
 
 
 def is_held_out(position: int, *, stride: int, total: int | None) -> bool:
-    """Whether the frame at a position of the stream is held out: 9, 19, 29, ...
+    """Checks whether the frame at a position of the stream is held out: 9, 19, 29, ...
 
-    Args:
-        position: Number of frames before it.
-        stride: Every `stride`-th frame is held out; 0 for none.
-        total: Number of frames of the stream, if known. Of fewer than two strides the last quarter
-            is held out, at least one frame.
+    That is every `stride`-th frame; 0 for none. If the stream has a known `total` of fewer than two
+    strides, the last quarter is held out, at least one frame.
     """
     if stride == 0:
         return False
@@ -197,10 +191,7 @@ def is_held_out(position: int, *, stride: int, total: int | None) -> bool:
 def separate_held_out(
     observations: Iterable[Observation | DroppedFrame], *, stride: int, total: int | None
 ) -> Iterator[SplitItem]:
-    """Wraps the observations that are held out (`is_held_out`), one item for each observation.
-
-    The only place that decides which these are.
-    """
+    """Wraps held-out observations, one item for each; alone decides which (`is_held_out`)."""
     for position, item in enumerate(observations):
         if isinstance(item, Observation) and is_held_out(position, stride=stride, total=total):
             yield HeldOutFrame(observation=replace(item, filmed_rgb=None))

@@ -1,7 +1,7 @@
-"""The picture of a frame's head, cut out of the frame as it was filmed.
+"""The image of a frame's head, cut out of the frame as it was filmed.
 
-People look at faces, and a film is reduced before it is learnt: a head of 270 pixels has 75 then.
-The rest of the body is learnt from the reduced picture.
+People look at faces, and a video is reduced before it is learnt: a head of 270 pixels has 75 then.
+The rest of the body is learnt from the reduced frame.
 """
 
 import cv2

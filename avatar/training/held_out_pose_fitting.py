@@ -73,7 +73,6 @@ def _fit_frames(
     exposures: FrameExposures,
     progress: Callable[[float], None],
 ) -> None:
-    """Fits poses and exposures to the frames of `replay`."""
     avatar = replace(trainer.avatar, field=trainer.avatar.field.frozen())
     at_once = min(2, len(replay))
     config = dataclasses.replace(

@@ -41,9 +41,8 @@ MAX_PERSISTENCE = 0.9
 class PosePrior(NamedTuple):
     """Prior of a correction, before the evidence of its frame's rays.
 
-    Attributes:
-        mean: Expected correction: radians, and metres in the last row.
-        precision: Precision relative to that of a frame without neighbors.
+    The mean has radians, and metres in the last row; the precision is relative to that of a frame
+    without neighbors.
     """
 
     mean: Float[np.ndarray, "25 3"]
@@ -59,7 +58,7 @@ class TemporalPosePrior:
     """Estimates of the replay frames' corrections, as neighbors of one another."""
 
     def __init__(self, capacity: int) -> None:
-        """Starts without frames, for a number of slots."""
+        """Starts without frames."""
         self._frames = np.zeros(capacity, dtype=np.int64)
         self._unregularized = np.zeros((capacity, 25, 3))
         self._is_sequential, self._has_estimate = np.zeros((2, capacity), dtype=bool)
@@ -92,12 +91,10 @@ def neighbor_correlations(
     estimates: Float[np.ndarray, "frames 25 3"],
     known: Bool[np.ndarray, "frames"],
 ) -> tuple[float, float]:
-    """How alike estimates are one frame apart, and two, in [-1, 1]; zeros if too few tell.
+    """Correlations of estimates one frame apart, and two, in [-1, 1]; zeros if there are too few.
 
-    Args:
-        frames: Indices of the frames, in any order; the next known one counts as one apart.
-        estimates: Correction of each frame by its rays alone, in any unit.
-        known: Which frames have an estimate.
+    Frames may be in any order; the next known one counts as one apart. `estimates` are each frame's
+    correction by its rays alone, in any unit.
     """
     order = np.argsort(frames)
     triples, power, one_apart, two_apart, first, middle = 0, 0.0, 0.0, 0.0, -1, -1
@@ -136,6 +133,7 @@ def neighbor_precision(
     share = (one_apart - MIN_CORRELATION) / (FULL_CORRELATION - MIN_CORRELATION)
     if share <= 0.0:
         return 0.0
+    # with e the errors' share of the power, the correlations are e r and e r²
     persistence = min(max(two_apart / one_apart, one_apart), MAX_PERSISTENCE)
     errors = one_apart / persistence
     unknown = errors * (1.0 - persistence**2) / (1.0 + persistence**2)
@@ -165,16 +163,14 @@ def prior_from_neighbors(
 ) -> PosePrior:
     """Prior of a correction: the mean of neighboring frames' corrections, weighted by nearness.
 
-    Args:
-        frame: Index of the frame.
-        frames, corrections: Indices and corrections of all frames; its own is ignored.
-        held: Which of these count.
-        precision: Precision of all neighbors together, relative to that of the tracker's pose.
+    Frames that are not `held`, and `frame` itself, are ignored. `precision` is that of all
+    neighbors together, relative to that of the tracker's pose.
     """
     total = np.zeros((25, 3))
     weights = _add_up_neighbors(frame, frames, corrections, held, total)
     if precision == 0.0 or weights == 0.0:
         return UNINFORMATIVE_PRIOR
+    # product of two Gaussians: the tracker's pose (mean 0, precision 1) and the neighbors' mean
     return PosePrior(precision / (1.0 + precision) / weights * total, 1.0 + precision)
 
 
@@ -215,7 +211,7 @@ class NormalEquations(NamedTuple):
     Attributes:
         curvature: Sum of the rays' curvatures ∇ℓ ∇ℓᵀ / 2ℓ.
         gradient: Sum of their gradients ∇ℓ.
-        moments: Sum of ∇ℓ ∇ℓᵀ; None if the rays' agreement is not asked for.
+        moments: Sum of ∇ℓ ∇ℓᵀ; None if the rays' agreement is not needed.
         ray_stiffness: Curvature of a mean ray.
     """
 
@@ -226,12 +222,9 @@ class NormalEquations(NamedTuple):
 
 
 class JointFrames(NamedTuple):
-    """Joints of the slots' corrected poses, in their body frames.
+    """Rotations and places, metres, of the joints of the slots' corrected poses, in body frames.
 
-    Attributes:
-        turns: Rotation of each joint.
-        places: Place of each joint, metres.
-        root_turns: Correction of the root's rotation.
+    `root_turns` are the corrections of the roots' rotations.
     """
 
     turns: Float32[np.ndarray, "slots 24 3 3"]
@@ -243,8 +236,7 @@ class JointFrames(NamedTuple):
 class RaySums:
     """Sums over the rays of each slot, of which its pose's normal equations consist.
 
-    Attributes:
-        counts: Rays since the slot's last correction.
+    `counts` has the rays since each slot's last correction.
     """
 
     def __init__(
@@ -267,10 +259,7 @@ class RaySums:
         room: Int64[np.ndarray, "slots"],
         joints: JointFrames,
     ) -> None:
-        """Adds rays, by the wrenches that they exert on the bones; `room` is the most of a slot.
-
-        The wrenches were found at the poses of `joints`.
-        """
+        """Adds rays by their bones' wrenches at the poses of `joints`, at most `room` of a slot."""
         numba_pose.add_rays(
             slots, wrenches, loss, MIN_RAY_LOSS, (PRIOR_SIGMA_RAD, PRIOR_SIGMA_M), room,
             self._parents, *joints, self.counts, self._gradients, self._curvatures,
@@ -292,6 +281,7 @@ class RaySums:
         """
         curvature, gradient = self._curvatures[slot], self._gradients[slot]
         steps = (moved / PRIOR_SIGMAS).astype(np.float32).reshape(75)
+        # linearized at the new correction: g + (Σ ∇ℓ ∇ℓᵀ / 2ℓ) moved, in prior sigmas
         gradient[:75] = decay * (gradient[:75] + curvature[:, :75] @ steps)
         curvature *= decay
         self.counts[slot], self._powers[slot] = 0, 0.0
@@ -327,12 +317,9 @@ def gauss_newton_step(
 ) -> GaussNewtonStep:
     """The step towards the pose at which the rays fit, in the directions that they determine.
 
-    Args:
-        rays: Normal equations of the pose's rays, at the correction.
-        correction: Current correction; undetermined directions return to the prior.
-        shared_evidence: Mean evidence of all frames, which one tracker produced; infinite if the
-            pose is to move in any case, and `moments` are not asked for.
-        prior: Prior of the correction.
+    Undetermined directions of the current `correction` return to the prior. `shared_evidence` is
+    the mean evidence of all frames, which one tracker produced; infinite if the pose is to move in
+    any case, and `moments` are not needed.
     """
     evidence, share = math.inf, 1.0
     if math.isfinite(shared_evidence):
@@ -348,6 +335,7 @@ def gauss_newton_step(
         numba_pose.solve_with_prior(rays.curvature, rays.gradient, stiffness, back, room, found)
         return found.reshape(25, 3)
 
+    # Gauss-Newton: (C + s) Δ = -(g + s (correction - mean)), in prior sigmas
     change = -share * PRIOR_SIGMAS * asked(prior)
     shortened = MAX_STEP / max(float(np.abs(change).max()), MAX_STEP)
     alone = correction / PRIOR_SIGMAS - asked(UNINFORMATIVE_PRIOR)
@@ -355,12 +343,13 @@ def gauss_newton_step(
 
 
 def _agreement(rays: NormalEquations) -> float:
-    """`GaussNewtonStep.evidence` of the rays."""
+    """Mean agreement of the rays (`GaussNewtonStep.evidence`)."""
     assert rays.moments is not None
     determined, axes = np.linalg.eigh(rays.curvature[:, :75])
     axes = axes[:, determined > rays.ray_stiffness]
     if not axes.size:
         return 0.0
+    # (Σ g)² and Σ g² along each determined axis
     along = rays.gradient[:75] @ axes
     power = ((rays.moments[:, :75] @ axes) * axes).sum(axis=0)
     return float(np.mean(along**2 / (power + 1e-12)))

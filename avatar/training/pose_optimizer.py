@@ -78,12 +78,8 @@ MAX_CORRECTION = 0.35
 class RootCorrection(NamedTuple):
     """Correction of a frame's root relative to the tracker's pose.
 
-    A point of the given body frame is at `pivot + rotationᵀ (x - pivot - shift)` in the corrected.
-
-    Attributes:
-        rotation: Rotation about the pivot.
-        shift: Shift in the given body frame, metres.
-        pivot: Pelvis in the rest pose, metres.
+    A point x of the given body frame is at `pivot + rotationᵀ (x - pivot - shift)` in the corrected
+    one, metres. The pivot is the pelvis in the rest pose.
     """
 
     rotation: Float[np.ndarray, "3 3"]
@@ -99,9 +95,7 @@ class PoseOptimizer:
     its own frame before the tracker's rotation, and the root's shift in the given body frame, m.
 
     Attributes:
-        poses_may_be_exact: Whether a pose moves only where its rays agree that it is wrong.
         min_gradient_cell_m: Smallest cells of the hash levels whose gradient reaches the poses.
-        corrections: Root rotation, joint rotations and root shift of each slot.
         bones: Body-from-canonical transforms of the corrected poses.
     """
 
@@ -118,8 +112,6 @@ class PoseOptimizer:
         """Starts without poses.
 
         Args:
-            rig: Rig of the person.
-            capacity: Number of slots.
             poses_may_be_exact: Whether a pose moves only where its rays agree that it is wrong, and
                 then by half steps. Otherwise, with estimated poses or a fixed avatar, every pose
                 makes whole steps.
@@ -169,12 +161,9 @@ class PoseOptimizer:
         frame: int | None = None,
         step: int = 0,
     ) -> None:
-        """Assigns the tracker's pose of a frame to a slot.
+        """Assigns the tracker's pose of a frame, trained on from `step`, to a slot.
 
-        Args:
-            slot, pose, correction: The pose, and its initial correction if one is known.
-            frame: Index of the frame, whose neighbors have similar errors; None if it has none.
-            step: Training step from which the frame is trained on.
+        Neighbors by the index `frame` have similar errors; None if the frame has no neighbors.
         """
         self._tracker_poses[slot] = pose
         self._added_at_step[slot] = step
@@ -193,9 +182,8 @@ class PoseOptimizer:
     def replace_pose(self, slot: int, pose: BodyPose, *, frame: int, step: int) -> bool:
         """Assigns a better pose of its tracker to a slot's frame, without a correction.
 
-        Returns:
-            Whether it is too far from the one before for the roots to follow: the caller is
-            expected to solve the correspondences again then.
+        Returns True if that is too far from the one before for the roots to follow: the caller is
+        expected to solve the correspondences again then.
         """
         before = np.stack([self._joints.places[slot], self._joints_at_solve[slot]])
         self.set_pose(slot, pose, frame=frame, step=step)
@@ -257,8 +245,7 @@ class PoseOptimizer:
     def correct_next(self, *, rate: float) -> int | None:
         """Corrects the pose with the most accumulated rays; its roots and rays have to follow.
 
-        Returns:
-            The slot, or None if no frame has enough rays or the pose does not move.
+        Returns its slot, or None if no frame has enough rays or the pose does not move.
         """
         slot = int(self._rays.counts.argmax())
         if self._rays.counts[slot] < MIN_RAYS_SHARE * self._rays_per_frame:
@@ -297,7 +284,7 @@ class PoseOptimizer:
         return min(max(round(0.5 / max(rate, 1e-3)), 1), MAX_ESTIMATED_INTERVAL)
 
     def needs_resolve(self, slot: int) -> bool:
-        """Whether the slot's pose is too far from the one its correspondences were solved for.
+        """Checks if the slot's pose is too far from the one its correspondences were solved for.
 
         The caller is expected to solve them when the answer is True.
         """
@@ -327,7 +314,6 @@ class PoseOptimizer:
             self._update_bones(slot)
 
     def _update_bones(self, slot: int) -> None:
-        """Updates the slot's joints and bones to its correction."""
         turns, places, root_turns = self._joints
         bones = np.empty((24, 12), dtype=np.float32)
         pose_joints(

@@ -26,13 +26,13 @@ from preprocess.body.body_pose import BodyPose
 NEAR_PERSON_RAY_SHARE = 0.9
 """Share of the rays that pass through pixels near the person."""
 HEAD_SIDE_RAY_SHARE = 0.5
-"""Share of the rays near the person that are drawn from the picture of the head, where people look,
+"""Share of the rays near the person that are drawn from the image of the head, where people look,
 if it has as many pixels as the person in the whole frame; it falls with their square root, to 0.15
-where the film is not reduced."""
+where the video is not reduced."""
 MAX_HEAD_RAY_SHARE = 0.35
 """Largest share of these rays."""
 PICTURES = 2
-"""Pictures of a slot: the whole frame, and the head in the film's own resolution."""
+"""Images of a slot: the whole frame, and the head in the video's own resolution."""
 DRAWS_PER_RAY = 5
 """Random numbers that decide a ray: its frame, near the person or not, its pixel, the head or not,
 where its samples begin."""
@@ -41,12 +41,8 @@ where its samples begin."""
 class ReplayFrame(NamedTuple):
     """The part of a frame that has to be saved to train on it again.
 
-    Attributes:
-        index: Index of the frame in its source.
-        pose: The tracker's pose.
-        view: Camera and pixels.
-        colors: Premultiplied RGBA of the pixels near the person.
-        head: The same of the picture of the head, if there is one.
+    `colors` are premultiplied RGBA of the pixels near the person; `head` has a view and colors of
+    its own, if there is an image of it.
     """
 
     index: int
@@ -57,12 +53,9 @@ class ReplayFrame(NamedTuple):
 
 
 class TrainingBatch(NamedTuple):
-    """Rays and their ground truth.
+    """Rays and their ground truth, premultiplied color and alpha in [0, 1].
 
-    Attributes:
-        rays: Rays in the body frames of their slots.
-        target: Premultiplied color and alpha, in [0, 1].
-        world_from_body: Rotations from the rays' body frames to the world.
+    `world_from_body` are rotations from the rays' body frames to the world.
     """
 
     rays: RayBatch
@@ -72,11 +65,7 @@ class TrainingBatch(NamedTuple):
 
 @final
 class ReplayBuffer:
-    """Bounded buffer of prepared frames with distinct views and poses, one slot each.
-
-    Attributes:
-        frame_indices: Index in its source of the frame that each slot holds.
-    """
+    """Bounded buffer of prepared frames with distinct views and poses, one slot each."""
 
     def __init__(self, capacity: int) -> None:
         """Starts empty, for at most `capacity` frames."""
@@ -109,10 +98,9 @@ class ReplayBuffer:
         )
 
     def add(self, frame: TrainingFrame) -> int:
-        """Adds a frame; a full buffer drops the more redundant of its two most similar frames.
+        """Adds a frame, and returns its slot.
 
-        Returns:
-            The slot of the frame.
+        A full buffer drops the more redundant of its two most similar frames.
         """
         if len(self) < self.capacity:
             slot = len(self)
@@ -226,7 +214,6 @@ class ReplayBuffer:
         return store
 
     def _update_distances(self, slot: int, descriptor: Float[np.ndarray, " 72"]) -> None:
-        """Notes how far a slot's frame is from every other."""
         held = len(self)
         self._descriptors[slot] = descriptor
         gap = np.linalg.norm(self._descriptors[:held] - descriptor, axis=1)

@@ -1,4 +1,4 @@
-"""What the frames have shown of the skin: how squarely each of its patches was seen.
+"""Evidence of the skin in the frames: how squarely each of its patches was seen.
 
 A patch is a seed of the rig, about 2 cm wide. Evidence only grows, costs a millisecond a frame, and
 needs no image but the frame's mask.
@@ -23,11 +23,7 @@ which it counts as seen (66°)."""
 
 @final
 class SkinEvidence:
-    """Evidence of each patch of a rig's skin.
-
-    Attributes:
-        cosines: Largest cosine at which each patch was seen, in [0, 1]; 0 if it never was.
-    """
+    """Largest cosine at which each patch of a rig's skin was seen, in [0, 1]; 0 if it never was."""
 
     cosines: Float32[np.ndarray, "seeds"]
 
@@ -58,7 +54,7 @@ class SkinEvidence:
 
     @property
     def seen(self) -> Float32[np.ndarray, "seeds"]:
-        """How far each patch was seen, in [0, 1]: a smooth step of its cosine."""
+        """Degree to which each patch was seen, in [0, 1]: a smooth step of its cosine."""
         share = (self.cosines - UNSEEN_COSINE) / (SEEN_COSINE - UNSEEN_COSINE)
         share = np.clip(share, 0.0, 1.0)
         return (share * share * (3.0 - 2.0 * share)).astype(np.float32)
@@ -67,7 +63,7 @@ class SkinEvidence:
 def _lies_in_mask(
     in_camera: Float[np.ndarray, "points 3"], frame: TrainingFrame
 ) -> Bool[np.ndarray, "points"]:
-    """Whether the pixels onto which points in camera axes fall show the person."""
+    """Mask of the points in camera axes that fall onto pixels of the person."""
     camera = replace(frame.view.camera, camera_from_world=np.eye(4))
     width, height = camera.size_px
     column, row = np.floor(camera.project(in_camera)).astype(np.int64).T

@@ -91,10 +91,8 @@ def train(
     for the first. A live source is left when the time is up. Where steps are counted, one more
     frame of a recording is read before each step until all are read.
 
-    Held-out frames that arrive are appended to `held_out`.
-
-    Yields:
-        Events, on the caller's thread; the time the caller spends on one counts as training time.
+    Held-out frames that arrive are appended to `held_out`. Events are yielded on the caller's
+    thread; the time the caller spends on one counts as training time.
     """
     stream, marks = _FrameIntake(trainer, inbox, held_out), _EvaluationSchedule(trainer)
     while True:
@@ -179,7 +177,6 @@ class _FrameIntake:
 
     @property
     def ended(self) -> bool:
-        """Whether no more frames will arrive."""
         return self._ended_at is not None
 
     def receive(self, now: float) -> Iterator[FrameArrived | Warned]:
@@ -218,11 +215,11 @@ class _FrameIntake:
 
     @property
     def _one_frame_per_step(self) -> bool:
-        """Whether one frame is read per step, which makes a run reproducible."""
+        """True if one frame is read per step, which makes a run reproducible."""
         return bool(self._trainer.config.steps) and not self._inbox.paced
 
     def needs_frame(self) -> bool:
-        """Whether the next step has to wait for one more frame."""
+        """True if the next step has to wait for one more frame."""
         return (
             self._one_frame_per_step
             and not self.ended
@@ -230,7 +227,7 @@ class _FrameIntake:
         )
 
     def is_behind(self, now: float) -> bool:
-        """Whether reading takes precedence over training; a paced source cannot be hurried."""
+        """True if reading takes precedence over training; a paced source cannot be hurried."""
         if self._one_frame_per_step:
             return False
         began, end = self._began, self._trainer.config.seconds
@@ -238,7 +235,7 @@ class _FrameIntake:
         return late and not (self.ended or self._inbox.paced)
 
     def is_done(self, now: float) -> bool:
-        """Whether the schedule is over and every frame has been trained on."""
+        """True if the schedule is over and every frame has been trained on."""
         config, admitted_at = self._trainer.config, self._last_frame_step
         if not (self.ended and now >= config.seconds):
             return False
@@ -264,14 +261,10 @@ class _EvaluationSchedule:
         self._samples: dict[int, PixelSample] = {}
 
     def is_due(self, now: float) -> bool:
-        """Whether the next evaluation is due."""
         return now >= self._next
 
     def score(self, held_out: list[HeldOutFrame], clock: TrainingClock) -> Evaluated:
-        """Scores held-out frames, evenly over the stream, until the evaluation's time is spent.
-
-        Each is scored by a sample of its pixels (`PixelSample`).
-        """
+        """Scores samples of held-out frames, evenly over the stream, until the time is spent."""
         trainer, scores = self._trainer, list[HeldOutScore]()
         at, cpu_at = trainer.wall_seconds, trainer.cpu_seconds
         enough = clock.read() + EVALUATION_TIME_SHARE * trainer.config.seconds
@@ -306,16 +299,13 @@ def _evaluation_times(*, after: float) -> Iterator[float]:
 
 
 WARMUP_IMAGE_PX = 16
-"""Width and height of the warm-up's image, pixels."""
 
 
 def warm_up(trainer: Trainer) -> float:
     """Compiles, or loads from disk, every kernel that training and rendering use.
 
-    Must run on the thread that will train. The trainer itself is not changed.
-
-    Returns:
-        How many seconds it took: tens on a machine's first run, about one later.
+    Must run on the thread that will train. The trainer itself is not changed. Returns the seconds
+    that it took: tens on a machine's first run, about one later.
     """
     began = time.perf_counter()
     rig = trainer.avatar.rig

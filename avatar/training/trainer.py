@@ -109,20 +109,14 @@ class Trainer:
     """The state that training changes, and one training step.
 
     Attributes:
-        config: The configuration.
         field: The field that steps change.
         learner: Avatar with `field`, which the samplers query.
         avatar: Avatar to render; its field is the running mean of `field`.
-        sampler: Chooses the samples along rays.
-        replay: Frames to train on.
-        poses: Poses of these frames, corrected if the configuration says so.
-        unseen: What frames have shown of the skin, and what the other skin is drawn to.
-        exposures: Exposures of these frames, estimated if the configuration says so.
-        generator: Source of random numbers.
+        poses, exposures: Of the replay frames, corrected if the configuration says so.
+        unseen: The skin that frames have shown, and the sources of the other skin.
         pose_corrections: Correction of each frame's pose, by the frame's index in its source; a
             frame that is read again starts from it. To be cleared before another source is read;
             keeps at most twice the replay capacity.
-        steps, rays, samples: Numbers of steps, rays and samples so far.
         wall_seconds, cpu_seconds: Training time so far, continued by a resumed run.
         frames_seen: Frames added so far, whether or not the replay buffer still holds them.
         step_wall_seconds, step_cpu_seconds: Time inside steps of this process.
@@ -194,10 +188,7 @@ class Trainer:
         return slot
 
     def revise_pose(self, frame: int, pose: BodyPose) -> None:
-        """Gives a frame a better pose of its tracker, from which corrections start again.
-
-        Nothing happens if the replay buffer does not hold the frame.
-        """
+        """Gives a frame that replay holds a better pose of its tracker, without a correction."""
         self.pose_corrections.pop(frame, None)
         if frame not in self.replay.frame_indices:
             return
@@ -311,8 +302,7 @@ def resolve_correspondences(replay: ReplayBuffer, poses: PoseOptimizer, slot: in
 def correct_one_pose(replay: ReplayBuffer, poses: PoseOptimizer, *, rate: float) -> int | None:
     """Corrects one pose by a step times `rate`; its frame's correspondences and rays follow.
 
-    Returns:
-        The slot of the corrected pose, or None if no pose has enough evidence.
+    Returns the slot, or None if no pose has enough evidence.
     """
     slot = poses.correct_next(rate=rate)
     if slot is not None:

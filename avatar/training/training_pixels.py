@@ -15,12 +15,7 @@ BOX_MARGIN_SHARE = 0.04
 
 
 class RayView(NamedTuple):
-    """Camera and pixels of a training frame.
-
-    Attributes:
-        camera: Camera of the image.
-        near_person_bits: Mask of the pixels near the person, row by row, eight to a byte.
-    """
+    """Camera of a training frame, and the mask of the pixels near the person, packed in bits."""
 
     camera: Camera
     near_person_bits: UInt8[np.ndarray, "bytes"]
@@ -40,12 +35,9 @@ class RayView(NamedTuple):
 class PixelRuns(NamedTuple):
     """Pixels of an image in runs of adjacent ones: those near the person, then those about them.
 
-    The pixels are numbered through; 100 bytes of runs stand for a thousand pixels.
-
-    Attributes:
-        ends: Number of pixels up to the end of each run.
-        shifts: Difference between a pixel's flat index in the image and its number, by run.
-        near_count: Number of pixels near the person.
+    The pixels are numbered through; 100 bytes of runs stand for a thousand pixels. `ends` are the
+    numbers of pixels up to the end of each run, `shifts` the differences between a pixel's flat
+    index in the image and its number.
     """
 
     ends: Int32[np.ndarray, "runs"]
@@ -74,12 +66,10 @@ class PixelRuns(NamedTuple):
 
 
 class TrainingPixels(NamedTuple):
-    """The pixels of a picture to train on.
+    """The pixels of an image to train on.
 
-    Attributes:
-        view: View from which they can be rebuilt with the colors alone.
-        runs: Which pixels these are.
-        colors: Premultiplied RGBA of those near the person; that of the others is zero.
+    `colors` are premultiplied RGBA of those near the person; that of the others is zero. With the
+    colors alone they can be rebuilt from `view`.
     """
 
     view: RayView

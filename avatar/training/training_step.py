@@ -50,8 +50,7 @@ class RaySampler(Protocol):
 class OccupancySampler:
     """Samples occupied canonical cells, up to the cached surface that makes a ray opaque.
 
-    Attributes:
-        sample_step_m: Distance between samples along a ray, metres; may be changed at any time.
+    `sample_step_m`, the distance between samples along a ray, may be changed at any time.
     """
 
     def __init__(
@@ -89,14 +88,7 @@ class OccupancySampler:
 
 
 class StepResult(NamedTuple):
-    """Result of a training step.
-
-    Attributes:
-        loss: Loss of each ray.
-        rendered: Premultiplied color and alpha of each ray, shaded.
-        normals: World normal of what each ray sees.
-        sample_count: Samples of all rays together.
-    """
+    """Loss, shaded rendering and world normal of each ray, and the number of all their samples."""
 
     loss: Float32[Tensor, "rays"]
     rendered: PremultipliedPixels
@@ -121,15 +113,11 @@ def compute_gradients(
     """Renders a batch and adds the gradient of its mean loss to the field's parameters.
 
     Args:
-        learner, sampler: Avatar whose field receives the gradients, at the sampler's points.
-        correspondences, batch: Rays and pixels, and the grids of the frames that these name.
-        config: Weights, step lengths and sample counts.
         hard_surface_share: Share of the hard-surface loss's weight, in [0, 1]; it grows in, because
             a surface has to be found before it can be made hard.
         surface_share: Progress from smooth densities to firm surfaces, in [0, 1].
         caches_density: Whether the samples raise the occupancy's cached densities.
         poses: Accumulates the samples' wrenches, if poses are refined.
-        generator: Draws regularization points and samples.
     """
     field = learner.field
     samples = sampler.sample_rays(batch.rays, correspondences)
@@ -236,11 +224,9 @@ def draw_by_strength(
     """Draws the points whose gradients are propagated, faint ones by chance ("Russian roulette").
 
     Half of the samples have a negligible gradient. Leaving these out biases the sum, and Adam
-    enlarges small gradients; a few of them, divided by their chance, keep the expected sum.
-    A gradient is faint below `faint_share` of the mean strength.
-
-    Returns:
-        The points that were drawn, and their gradients, divided by the chance of each.
+    enlarges small gradients; a few of them, divided by their chance, keep the expected sum. A
+    gradient is faint below `faint_share` of the mean strength. Returns points and divided
+    gradients.
     """
     if not faint_share:
         return torch.arange(len(grads)), grads

@@ -52,7 +52,7 @@ FACE_MIN_NORMAL = -0.2
 MAX_COST_M = 0.6
 """Cost from which a source counts nothing, metres; its weight falls from half of it on."""
 MIN_SOURCE_SEEN = 0.5
-"""How far a source must have been seen."""
+"""Degree to which a source must have been seen."""
 NEAR_SKIN_M = 0.025
 """Distance from the skin within which most surfaces lie, metres."""
 NEAR_SKIN_FACTOR = 4
@@ -65,13 +65,12 @@ MIN_WEIGHT = 0.02
 
 
 class Sources(NamedTuple):
-    """Where each patch's color and density come from.
+    """The source of each patch's color and density.
 
     Attributes:
-        patch: Patch that is the source.
         reflection: 0: none, the source lies around the limb; 1: mirrored; 2: the limb's other face;
             3: both.
-        weight: How strongly the patch is drawn to it, in [0, 1].
+        weight: How strongly the patch is drawn to its source, in [0, 1].
     """
 
     patch: Int[np.ndarray, "seeds"]
@@ -80,12 +79,7 @@ class Sources(NamedTuple):
 
 
 class SourcePairs(NamedTuple):
-    """Points of unseen skin and their sources.
-
-    Attributes:
-        points: Canonical points, then their sources.
-        weights: How strongly each point is drawn to its source, in [0, 1].
-    """
+    """Points of unseen skin, then their sources, and the weight of each pair, in [0, 1]."""
 
     points: Float32[Tensor, "points 3"]
     weights: Float32[Tensor, "pairs"]
@@ -121,24 +115,17 @@ class _BoneFrames(NamedTuple):
     def to_bone(
         self, points: Float[np.ndarray, "points 3"], parts: Int[np.ndarray, "points"]
     ) -> Float[np.ndarray, "points 3"]:
-        """Canonical points in the frames of their parts' bones."""
         return np.einsum("pab,pb->pa", self.axes[parts], points - self.origin[parts])
 
     def from_bone(
         self, points: Float[np.ndarray, "points 3"], parts: Int[np.ndarray, "points"]
     ) -> Float[np.ndarray, "points 3"]:
-        """Canonical points of points in the frames of bones."""
         return np.einsum("pba,pb->pa", self.axes[parts], points) + self.origin[parts]
 
 
 @final
 class UnseenSkin:
-    """Random points of unseen skin, and their sources.
-
-    Attributes:
-        evidence: What frames have shown.
-        sources: Sources of all patches, as of the last update.
-    """
+    """Random points of unseen skin, and their sources as of the last update."""
 
     def __init__(self, rig: Rig) -> None:
         """Starts with everything unseen, and so without any source."""
@@ -235,10 +222,7 @@ def reflect(
     reflection: Int[np.ndarray, "points"],
     middle_x: float,
 ) -> Float[np.ndarray, "points 3"]:
-    """Canonical points mirrored in the body's middle plane, through a limb's bone, or both.
-
-    `reflection` says which (`Sources`).
-    """
+    """Canonical points reflected as `Sources.reflection` says; the body's middle is `middle_x`."""
     mirrors, reverses = np.isin(reflection, (1, 3)), np.isin(reflection, (2, 3))
     local = frames.to_bone(points, parts)
     local[:, 0] = np.where(reverses, -local[:, 0], local[:, 0])
@@ -286,7 +270,7 @@ def find_sources(
 
 
 def _faces(frames: _BoneFrames, rig: Rig) -> Bool[np.ndarray, "seeds"]:
-    """Which patches are part of a face: the head's front, below the hairline."""
+    """Mask of the patches of a face: the head's front, below the hairline."""
     local = frames.to_bone(rig.seeds, rig.seed_parts)
     head = rig.seed_parts == HEAD
     height = local[:, 2]
