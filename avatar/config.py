@@ -14,7 +14,7 @@ ESTIMATED_POSE_SAMPLING_M = 0.0045
 HEAD_SIDE_M = 0.32
 """Side of the square that holds the head, metres."""
 MAX_HEAD_PX = 256
-"""Longest side of a picture of the head; one of more pixels is reduced."""
+"""Longest side of an image of the head, pixels; a larger one is reduced."""
 ESTIMATED_POSE_PRIORS: Mapping[str, float] = {
     "double_well_weight": 0.2, "interior_weight": 0.0125, "density_slope_weight": 0.02,
     "color_tv_weight": 0.025, "min_occupied_density": 150.0, "off_skin_weight": 0.1,

@@ -12,7 +12,7 @@ does. Each of these gets a word of its own, and the worst one counts:
 | failed | | | | |
 
 Where the bounds come from: avatars of people who turn have 5 to 10 % half-transparent pixels in
-`unfilmed_views`, most of them outlines; those that fog has torn to shreds have 17 to 41 %. A film
+`unfilmed_views`, most of them outlines; those that fog has torn to shreds have 17 to 41 %. A video
 from one side shows 44 to 59 % of the skin, a third of a turn 79 %, a whole turn 97 to 99 %.
 """
 

@@ -64,7 +64,7 @@ class Coverage:
     def add(self, observation: Observation) -> None:
         """Takes in what one frame shows.
 
-        A patch is seen if it faces the camera (cosine above 0.3), lands inside the picture, has
+        A patch is seen if it faces the camera (cosine above 0.3), lies inside the image, has
         no other patch before it, and the mask says that a person is there.
         """
         view = view_patches(self.patches, self._shaped, observation)

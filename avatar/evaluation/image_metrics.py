@@ -1,12 +1,12 @@
 """Quality of a rendered image: PSNR, SSIM, soft IoU, and its sharpness in one word.
 
-The word is sharp, soft, blurred or failed. A PSNR alone does not say whether a picture is good. On
+The word is sharp, soft, blurred or failed. A PSNR alone does not say whether an image is good. On
 white it depends on how much of the frame the person fills, and inside the mask on the clothes: a
 plain shirt scores well however it is drawn, a striped one badly as soon as it is a pixel off. Each
 held-out frame is therefore its own scale. The frame is blurred by Gaussians of growing width, each
 blurred copy is scored as a rendering would be (PSNR where alpha > 0.5, on white), and the rendering
 is given the width of the copy that scores as it does: its **equivalent blur**, the standard
-deviation σ as a share of the person's height in the picture. A shift of the person counts as blur,
+deviation σ as a share of the person's height in the image. A shift of the person counts as blur,
 too.
 
 The verdict on an image, or on several (`overall_verdict`), comes from the equivalent blur and from

@@ -1,4 +1,4 @@
-"""Views that no film shows: new poses from four sides, and how solid an avatar is in them.
+"""Views that no video shows: new poses from four sides, and how solid an avatar is in them.
 
 Held-out frames come from the filmed side, where fog that imitates each view scores best. From
 elsewhere, in other poses, fog shows as pixels that are neither opaque nor empty.

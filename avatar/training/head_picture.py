@@ -31,7 +31,7 @@ EDGE_VARIANCE = 100.0
 def picture_head(observation: Observation, rig: Rig) -> TrainingPixels | None:
     """Cuts out the head; None where no pixel of the person is about it.
 
-    The mask has the size of the reduced frame; enlarged, it follows the edges of the picture by
+    The mask has the size of the reduced frame; enlarged, it follows the edges of the image by
     a guided filter (He et al. 2010).
     """
     rgb, alpha = observation.filmed_rgb, observation.alpha
@@ -77,7 +77,7 @@ def head_pixels(view: RayView, colors: UInt8[np.ndarray, "near 4"]) -> TrainingP
 
 
 def head_box(camera: Camera, pose: BodyPose, rig: Rig) -> tuple[int, int, int, int]:
-    """Left, upper, right and lower border of the head in the picture, pixels."""
+    """Left, upper, right and lower border of the head in the image, pixels."""
     head = body_from_rest(rig.rest_joints, rig.parents, pose.joint_rotations)[HEAD_JOINT]
     middle = rig.rest_joints[HEAD_JOINT] + np.array([0.0, HEAD_UP_M, 0.0])
     placed = camera.camera_from_world @ rig.world_from_body(pose) @ head @ np.append(middle, 1.0)

@@ -1,4 +1,4 @@
-"""Training pixels of a picture: those near the person in runs of adjacent ones, and those about."""
+"""Training pixels of an image: those near the person in runs of adjacent ones, and those about."""
 
 from typing import NamedTuple
 
