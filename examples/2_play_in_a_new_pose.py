@@ -12,11 +12,7 @@ try:
     import numpy as np
     from PIL import Image
 
-    from capture.camera import Camera
-    from capture.input_error import InputError
-    from export.player import Player
-    from preprocess.body.body_pose import BodyPose
-    from preprocess.body.kinematics import JOINT_NAMES
+    from instant_avatar import JOINT_NAMES, BodyPose, Camera, InputError, Player
 except ModuleNotFoundError as missing:
     sys.exit(f"{missing}. Install the player for this Python: pip install instant-avatar-stream")
 

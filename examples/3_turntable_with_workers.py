@@ -14,10 +14,7 @@ try:
     import numpy as np
     from PIL import Image
 
-    from capture.camera import Camera
-    from capture.input_error import InputError
-    from export.player import Player
-    from preprocess.body.body_pose import BodyPose
+    from instant_avatar import BodyPose, Camera, InputError, Player
 except ModuleNotFoundError as missing:
     sys.exit(f"{missing}. Install the player for this Python: pip install instant-avatar-stream")
 
