@@ -146,6 +146,8 @@ def _interpolate_motion(hypothesis: CaptureGeometry, frames: int) -> Motion:
     numbers = np.arange(max(0, int(np.ceil(places[0]))), min(frames, int(places[-1]) + 1))
     right = np.searchsorted(places, numbers).clip(1, len(places) - 1)
     near = places[right] - places[right - 1] <= 1.5 * frame_step(places)
+    gaps = np.minimum(np.abs(places[right] - numbers), np.abs(places[right - 1] - numbers))
+    near |= gaps < INTEGER_TOLERANCE  # this frame's own pose, which may lie beside a gap
 
     def turned(vectors: np.ndarray) -> np.ndarray:
         return Slerp(places, Rotation.from_rotvec(vectors[order]))(numbers).as_rotvec()

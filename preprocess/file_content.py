@@ -3,7 +3,7 @@
 Three readers: `read_npz` and `read_pickled_arrays` for files whose keys are known, and
 `read_untrusted_file` for files of any container, which is recognised by its first bytes: people
 rename files. All raise InputError for a file that is missing or damaged, or holds anything that
-would have to be executed; the last two also for one beyond `MAX_BYTES`.
+would have to be executed, or is larger than `MAX_BYTES`.
 """
 
 import io
@@ -34,6 +34,7 @@ def read_npz(
         raise InputError(f"{path} does not exist (or is no file); an .npz archive was expected.")
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            _check_unpacked_size(archive.zip)
             chosen = [key for key in (keys or archive.files) if key in archive.files]
             arrays = {key: archive[key] for key in chosen}
     except Exception as cause:  # numpy reads headers as Python: damaged ones fail in any way
@@ -140,10 +141,15 @@ def _decode_zip(data: bytes) -> Any:
         names = archive.namelist()
         if any(name.endswith("data.pkl") for name in names):
             return _plain(load_safe_pickle(data), {})
-        if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:
-            raise ValueError(f"it unpacks to more than {MAX_BYTES >> 20} MiB")
+        _check_unpacked_size(archive)
         arrays = [name for name in names if name.endswith(".npy")]
         return {name.removesuffix(".npy"): _decode_npy(archive.read(name)) for name in arrays}
+
+
+def _check_unpacked_size(archive: zipfile.ZipFile) -> None:
+    """Refuse an archive of more than `MAX_BYTES` by the sizes that it lists."""
+    if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:
+        raise ValueError(f"it unpacks to more than {MAX_BYTES >> 20} MiB")
 
 
 def _decode_npy(data: bytes) -> Any:

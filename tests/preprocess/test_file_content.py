@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from capture.input_error import InputError
+from preprocess import file_content
 from preprocess.file_content import read_npz
 
 
@@ -36,3 +37,11 @@ def test_a_zip_of_something_else_has_no_arrays(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
         archive.writestr("readme.txt", "hello")
     assert read_npz(tmp_path / "a.npz") == {}
+
+
+def test_an_archive_that_unpacks_to_too_much_is_refused_before_it_is_read(tmp_path, monkeypatch):
+    path = tmp_path / "a.npz"
+    np.savez_compressed(path, a=np.zeros(10000))
+    monkeypatch.setattr(file_content, "MAX_BYTES", 1 << 12)
+    with pytest.raises(InputError, match="unpacks to more than"):
+        read_npz(path)
