@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.occupancy_grid import SOLID_DENSITY
 from avatar.render import render
 
 
@@ -32,20 +31,3 @@ def bones_of():
         return torch.from_numpy(bones.astype(np.float32))
 
     return bones
-
-
-@pytest.fixture(scope="session")
-def solid_in(bones_of):
-    """Where skinning carries the centres of dense canonical cells, body frame."""
-
-    def solid(avatar, pose):
-        grid = avatar.occupancy.density_grid
-        cells = (grid.density > SOLID_DENSITY).nonzero()
-        points = ((cells + 0.5) / grid.cells_per_m + grid.low).numpy()
-        matrix = (avatar.rig.weights_at(points) @ bones_of(avatar.rig, pose).numpy()).reshape(
-            -1, 3, 4
-        )
-        carried = (matrix[..., :3] @ points[..., None])[..., 0] + matrix[..., 3]
-        return torch.from_numpy(carried.astype(np.float32))
-
-    return solid

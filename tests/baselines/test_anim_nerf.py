@@ -36,11 +36,6 @@ def posed(person, joints):
     return person.pose(torch.from_numpy(np.asarray(joints)).float()[None], torch.tensor([-1]))
 
 
-def test_bones_are_those_of_the_rig(person, rig, bent_pose):
-    found = posed(person, bent_pose).bones[0]
-    np.testing.assert_allclose(found.numpy(), rig.body_from_canonical(bent_pose), atol=1e-5)
-
-
 def test_a_vertex_moves_as_its_own_weights_say(person, bent_pose):
     method = AnimNerf(person, TINY)
     bodies = posed(person, bent_pose)

@@ -59,16 +59,6 @@ def test_samples_lie_a_step_apart_and_fill_a_box_that_is_full(boxes, generator):
     torch.testing.assert_close(apart, torch.full_like(apart, STEP_M), atol=1e-5, rtol=0)
 
 
-def test_an_empty_cell_has_no_samples(boxes, generator):
-    rays = rays_at(boxes, 300, generator)
-    points, counts = sample_occupied_cells(rays, boxes, STEP_M)
-    slot = rays.slots.long().repeat_interleave(counts)
-    cell = ((points - boxes.low[slot]) * boxes.cells_per_m[slot]).long()
-    cell = torch.minimum(cell.clamp(min=0), boxes.shape[slot] - 1)
-    flat = (cell[:, 0] * boxes.shape[slot, 1] + cell[:, 1]) * boxes.shape[slot, 2] + cell[:, 2]
-    assert (boxes.occupied[slot, flat] > 0).float().mean() > 0.999
-
-
 # --- roots ------------------------------------------------------------------------------------
 
 

@@ -43,18 +43,6 @@ def trainer_of(rig, clip, name, **changes):
 
 
 @pytest.mark.parametrize(
-    ("choices", "changes", "advice"),
-    [
-        ({"roots": "broyden"}, {"refine_poses": True}, "refine_poses=False"),
-        ({"skipping": "none"}, {}, "empty_space_weight=0 or empty_term='global'"),
-    ],
-)
-def test_contradictory_choices_are_refused_with_advice(choices, changes, advice):
-    with pytest.raises(ValueError, match=advice):
-        BaselineScheme(**choices).check(dataclasses.replace(SMALL, **changes))
-
-
-@pytest.mark.parametrize(
     "name", slow_where(sorted({*SCHEMES, *LOSSES}), lambda name: "broyden" in name)
 )  # whose kernel takes seven seconds to compile
 def test_every_variant_learns(rig, clip, name):

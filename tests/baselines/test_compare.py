@@ -6,7 +6,6 @@ import math
 import pytest
 
 from baselines import compare, comparison_scores
-from baselines.comparison_table import with_better_poses
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 
 
@@ -48,14 +47,3 @@ def test_what_is_done_is_not_trained_again(compared, monkeypatch):
 
     monkeypatch.setattr(compare, "_train_method", fail)
     assert compare.main([*compared[1], "--methods", "ours"]) == 0
-
-
-def test_a_pose_that_was_better_before_it_was_fitted_stays():
-    def scored(*values):
-        return {"frames": [{"psnr": value, "psnr_mask": value, "ssim": value} for value in values]}
-
-    result = {
-        "novel": scored(40.0, 20.0), "novel_fitted": scored(38.0, 26.0),
-        "held_out": scored(), "held_out_fitted": scored(),
-    }  # fmt: skip
-    assert with_better_poses(result)["novel_fitted"]["psnr"] == 33.0

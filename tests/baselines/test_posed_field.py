@@ -4,7 +4,7 @@ import torch
 
 from avatar.render import correspondence_tables
 from baselines.instant_avatar.broyden_kernels import find_all_roots
-from baselines.instant_avatar.posed_field import BroydenWarp, CorrespondenceWarp
+from baselines.instant_avatar.posed_field import BroydenWarp
 
 
 def test_of_several_roots_the_densest_counts(rig, avatar, novel, generator, bones_of):
@@ -26,20 +26,3 @@ def test_of_several_roots_the_densest_counts(rig, avatar, novel, generator, bone
     assert (valid.sum(dim=1) > 1).sum() > 40
     chosen = avatar.field.raw_outputs_at(warped.points)[:, 3]
     torch.testing.assert_close(chosen, score.amax(dim=1)[warped.has_root], atol=1e-5, rtol=0)
-
-
-def test_both_warps_agree_on_the_person(rig, avatar, novel, bones_of, solid_in):
-    _, seen, cells = novel
-    points = solid_in(avatar, seen.pose)
-    slots = torch.zeros(len(points), dtype=torch.int32)
-    broyden = BroydenWarp(avatar.field, rig, 1, kept_in=avatar.occupancy.density_grid)
-    broyden.set_pose(0, bones_of(rig, seen.pose))
-    tables = correspondence_tables(cells)
-    cells_warp = CorrespondenceWarp(avatar.occupancy)
-    exact, ours = (warp(points, slots, tables) for warp in (broyden, cells_warp))
-    both = exact.has_root & ours.has_root
-    assert float(both.float().mean()) > 0.99
-    places = [torch.zeros_like(points) for _ in range(2)]
-    places[0][exact.has_root], places[1][ours.has_root] = exact.points, ours.points
-    gap = (places[0] - places[1])[both].norm(dim=1)
-    assert float((gap < 2e-3).float().mean()) > 0.97

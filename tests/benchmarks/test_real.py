@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.real import RealJob, ingest_command, table_lines
+from benchmarks.real import RealJob, ingest_command
 from benchmarks.real_scores import pose_error_deg
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
@@ -19,14 +19,6 @@ CAMERA = Camera(
         [[1.0, 0, 0, 0], [0, -1.0, 0, 0.2], [0, 0, -1.0, 3.5], [0, 0, 0, 1.0]]
     ),
 )
-
-
-def a_pose(rng):
-    return BodyPose(
-        root_rotation=np.array([0.0, 0.7, 0.0]),
-        root_translation=np.array([0.1, 0.2, -0.1]),
-        joint_rotations=0.2 * rng.standard_normal((23, 3)),
-    )
 
 
 def test_the_pose_error_is_the_mean_angle_over_joints():
@@ -45,10 +37,3 @@ def test_exact_inputs_all_come_from_the_truth():
         assert words[words.index(option) + 1].startswith(str(capture / "truth"))
     assert words[words.index("--steps") + 1] == "300"
     assert "--poses" not in ingest_command(job, capture)
-
-
-def test_the_table_has_a_column_for_each_capture_and_their_mean():
-    lines = table_lines({"one": {"dB": 20.0, "cm": None}, "two": {"dB": 30.0}})
-    assert [cell.strip() for cell in lines[0].split("|")[1:-1]] == ["figure", "one", "two", "mean"]
-    assert [cell.strip() for cell in lines[2].split("|")[1:-1]] == ["dB", "20.0", "30.0", "25.0"]
-    assert [cell.strip() for cell in lines[3].split("|")[1:-1]] == ["cm", "-", "-", "-"]

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from PIL import Image, ImageOps
 
-from capture.image_folder import list_images, read_image
 from capture.input_error import InputError
 from capture.source_opening import open_source
 
@@ -35,19 +34,6 @@ def test_an_alpha_channel_comes_along(tmp_path):
     assert source.has_alpha
     np.testing.assert_array_equal(frame.rgb, rgba[..., :3])
     np.testing.assert_array_equal(frame.alpha, rgba[..., 3])
-
-
-def test_a_picture_is_turned_upright_by_its_exif_tag(tmp_path):
-    upright = np.zeros((40, 20, 3), np.uint8)
-    upright[:20] = 255
-    exif = Image.Exif()
-    exif[0x0112] = 6  # stored lying: to be turned 90° clockwise
-    lying = Image.fromarray(np.ascontiguousarray(np.rot90(upright)))
-    lying.save(tmp_path / "0.jpg", exif=exif, quality=95)
-    rgb, alpha = read_image(tmp_path / "0.jpg")
-    assert rgb.shape == upright.shape
-    assert alpha is None
-    assert np.abs(rgb.astype(int) - upright).mean() < 3
 
 
 @pytest.mark.parametrize("ending", ["png", "webp"])
@@ -148,12 +134,6 @@ def test_two_videos_in_a_folder_are_too_many(write_video, tmp_path):
     write_video("b.mp4", frames=2)
     with pytest.raises(InputError, match=r"a\.mp4, b\.mp4"):
         open_source(tmp_path)
-
-
-def test_hidden_files_are_no_pictures(write_images):
-    folder = write_images(2)
-    (folder / "._shot_0.png").write_bytes(b"a file of another system")
-    assert [path.name for path in list_images(folder)] == ["shot_0.png", "shot_1.png"]
 
 
 @pytest.mark.parametrize(

@@ -130,39 +130,6 @@ def stretched(folder: Path) -> None:
     np.savez(folder / "cameras.npz", **camera)
 
 
-def test_two_persons_who_touch_in_the_masks_are_named(spoilt, call_check):
-    folder = spoilt()
-    for path in (folder / "masks").iterdir():
-        mask = cv2.imread(str(path), 0)
-        moved = np.roll(mask, round(0.25 * mask.shape[1]), axis=1)
-        cv2.imwrite(str(path), np.maximum(mask, moved))
-    _, said, found = call_check(folder)
-    assert found["cause"] is None
-    assert "times the body's area" in said
-
-
-def test_poses_that_are_not_numbers_disturb_nothing(spoilt, call_check, recwarn):
-    _, said, found = call_check(spoilt(without_numbers))
-    assert found["cause"] is None
-    assert said.count("not valid") == 1
-    assert not [each for each in recwarn if issubclass(each.category, RuntimeWarning)]
-
-
-def without_numbers(folder: Path) -> None:
-    poses = dict(np.load(folder / "poses.npz"))
-    poses["body_pose"][3], poses["transl"][5] = np.nan, np.inf
-    np.savez(folder / "poses.npz", **poses)
-
-
-@pytest.mark.slow
-def test_inverted_masks_are_called_good_with_a_note(spoilt, call_check):
-    _, said, found = call_check(spoilt(SPOILS["mask_polarity"]))
-    assert (found["verdict"], found["cause"]) == ("good", "mask_polarity")
-    assert f"IoU of body and masks: {found['iou']['after_fix']:.2f}" in said
-    assert "nothing needs to be done" in said
-    assert "To correct it" not in said
-
-
 FILM_SPOILS = {
     "video_rotation": capture_corruptions.rotate_video(1),
     "video_mirrored": capture_corruptions.mirror_video,
@@ -279,11 +246,6 @@ def test_mending_needs_a_mistake_and_a_free_place(dancing, tmp_path, call_check)
     code, said, _ = call_check(dancing, "--fix", tmp_path / "full")
     assert code == 2
     assert "--fix" in said
-
-
-def test_a_sheet_that_is_no_picture_is_refused_before_anything_is_looked_at(tmp_path, capsys):
-    assert check.main([str(tmp_path / "nothing"), "--sheet", str(tmp_path / "sheet.pdf")]) == 2
-    assert ".png" in capsys.readouterr().err
 
 
 def test_unreadable_input_is_reported_in_the_json_too(tmp_path, call_check):

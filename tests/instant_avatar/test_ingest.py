@@ -302,22 +302,6 @@ def test_ctrl_c_saves_what_was_learnt(film, tmp_path):
     assert (tmp_path / "run" / "checkpoint" / "state.pt").exists()
 
 
-def test_pictures_are_shrunk_but_never_enlarged(capture, call_ingest, without_baking, tmp_path):
-    for size, expected in ((48, [48, 48]), (200, [64, 64])):
-        out = tmp_path / f"run{size}"
-        assert call_ingest(capture, *FEW, "--out", out, "--size", size).code == 0
-        report = json.loads((out / "report.json").read_text())
-        assert report["held_out"]["size"] == expected
-
-
-def test_few_frames_hold_out_the_last_quarter(capture, call_ingest, without_baking, tmp_path):
-    out = tmp_path / "run"
-    assert call_ingest(capture, "--out", out, "--frames", "2:14:1").code == 0
-    report = json.loads((out / "report.json").read_text())
-    assert report["held_out"]["frames"] == [11, 12, 13]
-    assert report["frames"]["read"] == 12
-
-
 def test_lost_poses_are_left_out_and_listed(
     capture, call_ingest, without_baking, tmp_path, changed
 ):

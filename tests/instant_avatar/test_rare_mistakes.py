@@ -107,25 +107,6 @@ def test_boxes_are_called_boxes_and_no_focal_length_is_fitted_to_them(capture, d
     assert found["corrections"] == []
 
 
-def test_masks_that_are_turned_here_and_there_are_named_and_left_out(capture, diagnosed):
-    change_masks(capture, lambda row, mask: 255 - mask if 10 <= row < 20 else mask)
-    code, said, found = diagnosed()
-    assert "4 of 16 sampled masks cannot be used" in said
-    assert "is it inverted?" in said
-    assert (code, found["verdict"], found["corrections"]) == (0, "warn", [])
-    assert found["iou"]["now"] > 0.8
-
-
-def test_times_in_milliseconds_are_said_to_be(capture, diagnosed):
-    with np.load(capture / "poses.npz") as stored:
-        arrays = {key: stored[key] for key in stored.files if key != "frame"}
-    np.savez(capture / "poses.npz", **{**arrays, "time": 1000.0 * arrays["time"]})
-    code, said, found = diagnosed()
-    assert code == 2
-    assert "Milliseconds, or another clock?" in said
-    assert "in milliseconds, or by another clock?" in found["refused"]
-
-
 @pytest.mark.slow
 def test_a_reversed_video_is_detected_and_corrected(capture, diagnosed, tmp_path):
     true = read_motion(capture / "poses.npz")

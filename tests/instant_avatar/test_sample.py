@@ -1,10 +1,8 @@
-import errno
 import shlex
 
 import pytest
 
 from instant_avatar import sample
-from instant_avatar.studio import shoot
 
 
 def run(*arguments):
@@ -49,23 +47,3 @@ def test_an_existing_folder_is_refused_with_advice(tmp_path, capsys):
     assert run(tmp_path / "c", *small) == 2
     assert "--overwrite" in " ".join(capsys.readouterr().err.split())
     assert run(tmp_path / "c", *small, "--overwrite") == 0
-
-
-def test_unknown_subjects_are_bad_input(tmp_path):
-    assert run(tmp_path / "c", "--subject", 4) == 2
-
-
-@pytest.mark.parametrize(
-    ("error", "code"),
-    [
-        (KeyboardInterrupt(), 130),
-        (OSError(errno.ENOSPC, "No space left on device"), 3),
-        (PermissionError(errno.EACCES, "Permission denied"), 2),
-    ],
-)
-def test_what_goes_wrong_has_an_exit_code(monkeypatch, tmp_path, error, code):
-    def fail(*_, **__):
-        raise error
-
-    monkeypatch.setattr(shoot, "film_capture", fail)
-    assert run(tmp_path / "c") == code

@@ -8,17 +8,13 @@ import struct
 import subprocess
 import sys
 import types
-from contextlib import suppress
 from typing import ClassVar
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from scipy import sparse
 
 from capture.input_error import InputError
-from preprocess import file_content
 from preprocess.body.parametric_body import load_body_model
 from preprocess.file_content import read_pickled_arrays
 
@@ -177,23 +173,3 @@ def test_what_is_no_array_is_refused_by_its_key(tmp_path, chumpy):
         path.write_bytes(python2_pickle({"a": thing}))
         with pytest.raises(InputError, match="`a`"):
             read_pickled_arrays(path, ("a",))
-
-
-def test_a_file_beyond_the_limit_is_not_even_read(tmp_path, monkeypatch):
-    path = tmp_path / "a.pkl"
-    path.write_bytes(pickle.dumps({"a": np.zeros(1000)}))
-    monkeypatch.setattr(file_content, "MAX_BYTES", 1000)
-    with pytest.raises(InputError, match="are not read"):
-        read_pickled_arrays(path, ("a",))
-
-
-@settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(data=st.data())
-def test_damage_anywhere_is_refused_or_read_but_never_worse(tmp_path, data):
-    whole = bytearray(pickle.dumps({"a": np.arange(5.0), "b": {"c": [1, 2]}}, 2))
-    for _ in range(data.draw(st.integers(1, 4))):
-        whole[data.draw(st.integers(0, len(whole) - 1))] = data.draw(st.integers(0, 255))
-    path = tmp_path / "a.pkl"
-    path.write_bytes(whole)
-    with suppress(InputError):
-        read_pickled_arrays(path, ("a",))

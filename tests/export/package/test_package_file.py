@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from avatar.config import TrainConfig
-from avatar.training.trainer import Trainer
 from capture.input_error import InputError
 from export import build
 from export.bake.bake_tables import MAX_VOXEL_M, MIN_VOXEL_M, BakeConfig, ExportRefused
-from export.build import GOOD_PSNR, POOR_PSNR, export_avatar, export_field, quality_warnings
+from export.build import POOR_PSNR, export_field
 from export.package.manifest import FORMAT_VERSION
 from export.package.package_file import read_package, write_package
 from export.player import Player
@@ -75,13 +73,6 @@ def test_every_altered_byte_of_a_stream_is_noticed(exported, tmp_path):
             assert package.manifest.to_json() == whole
     assert len(noticed) > 6
     assert all("damaged.iavatar" in message for message in noticed)
-
-
-def test_metrics_without_a_value_are_null(exported):
-    manifest = replace(
-        read_package(exported.path).manifest, metrics={"psnr": [float("nan"), 1.5], "n": 3}
-    )
-    assert json.loads(manifest.to_json())["metrics"] == {"psnr": [None, 1.5], "n": 3}
 
 
 def test_a_resealed_entry_is_noticed_by_its_sum(exported, tmp_path):
@@ -203,14 +194,6 @@ def test_a_player_that_differs_from_the_renderer_is_written_with_a_warning(expor
     assert read_package(report.path).manifest.metrics["warnings"] == [warning]
 
 
-@pytest.mark.parametrize(
-    ("score", "said"), [(GOOD_PSNR, None), (37.9, "simplifies"), (29.9, "poorly"), (8.0, "poorly")]
-)
-def test_warnings_follow_the_psnr(score, said):
-    warnings = quality_warnings(score)
-    assert [said in warning for warning in warnings] == ([] if said is None else [True])
-
-
 def test_a_graph_that_differs_from_its_reference_is_refused(export, tmp_path, monkeypatch):
     right = build.build_graph
     monkeypatch.setattr(
@@ -227,19 +210,6 @@ def test_an_avatar_of_nothing_is_refused(export, stand_in, tmp_path):
     with pytest.raises(ExportRefused, match="empty"):
         export(occupied=np.zeros_like(stand_in.occupied))
     assert list(tmp_path.iterdir()) == []
-
-
-def test_the_fog_of_an_untrained_avatar_is_written_with_a_warning(
-    stand_in, views, coarse, tmp_path
-):
-    config = TrainConfig(table_size=1 << 10, finest_m=0.03)
-    avatar = Trainer(stand_in.rig, config).avatar
-    pose, camera = views["canonical"]
-    report = export_avatar(
-        avatar, tmp_path / "a.iavatar", views=[(pose, camera)], metrics={}, config=coarse.quick()
-    )
-    assert any("poorly" in warning for warning in report.warnings)
-    assert Player(read_package(report.path)).render(pose, camera)[..., 3].max() > 0
 
 
 def test_voxels_follow_the_field_within_bounds():

@@ -85,11 +85,6 @@ def test_a_webm_keeps_soft_alpha(tmp_path):
         assert np.abs(alpha - rgba[..., 3]).mean() < 2.0
 
 
-def test_an_mp4_keeps_no_alpha(tmp_path):
-    with pytest.raises(InputError, match="no transparency"):
-        written(tmp_path / "a.mp4", disc(1), blend=None)
-
-
 def frames_in(path):
     with Image.open(path) as clip:
         for number in range(clip.n_frames):
@@ -117,16 +112,6 @@ def test_a_gif_is_clear_where_nothing_is_and_keeps_its_pace(tmp_path):
         np.testing.assert_array_equal(frame[..., 3] > 0, rgba[..., 3] > 127)
         solid = frame[..., 3] > 0
         assert np.abs(frame[solid][:, :3] - [230, 130, 40]).max() <= 4
-
-
-def test_a_gif_shows_what_was_drawn(tmp_path, rng):
-    """A palette for each picture: smooth shades stay within a few steps."""
-    path, blend = tmp_path / "a.gif", background_compositor("white")
-    ramp = np.linspace(0, 255, 80)[None, :, None] * np.ones((60, 1, 1))
-    smooth = np.concatenate([ramp, 255 - ramp, np.full_like(ramp, 90), np.full_like(ramp, 255)], 2)
-    written(path, iter([smooth.astype(np.uint8)] * 2), blend=blend)
-    for frame, _ in frames_in(path):
-        assert np.abs(frame[..., :3] - smooth[..., :3]).max() <= 6
 
 
 def test_a_png_is_one_picture_exactly(tmp_path):

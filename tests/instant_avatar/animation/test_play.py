@@ -18,9 +18,7 @@ from capture.atomic_files import LIST_NAME as LIST
 from export import player_page
 from export.package.package_file import read_package, write_package
 from export.player import Player
-from instant_avatar import ingest, play
 from instant_avatar.animation.driving_motion import FollowingCamera, demo_motion
-from instant_avatar.animation.player_checks import package_warnings
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import rotation_matrices
 from preprocess.poses.pose_file import read_motion
@@ -93,21 +91,6 @@ def test_clips_show_what_the_player_draws(call_play, package, novel, tmp_path, s
     expected = rgba[..., :3] * alpha + np.array([64, 128, 192]) * (1.0 - alpha)
     assert np.abs(frames[0][..., ::-1] - expected).mean() < 6.0
     assert [file.name for file in tmp_path.iterdir()] == [out.name]
-
-
-def test_a_gif_has_its_pictures_and_its_pace(call_play, package, novel, tmp_path):
-    out = tmp_path / "clip.gif"
-    assert call_play(package, "--poses", novel, "--out", out, "--size", SIZE, "--fps", 20).code == 0
-    with Image.open(out) as clip:
-        assert clip.n_frames == 8  # 12 poses, 30 a second
-        assert clip.info["duration"] == 50
-        assert clip.size == (SIZE, SIZE)
-
-
-def test_odd_sizes_become_even_in_clips(call_play, package, novel, tmp_path):
-    out = tmp_path / "clip.webm"
-    assert call_play(package, "--poses", novel, "--out", out, "--size", "95x63").code == 0
-    assert frames_of(out)[0].shape == (64, 96, 3)
 
 
 def test_a_clip_without_a_name_lies_beside_the_package(call_play, package, novel):
@@ -226,16 +209,6 @@ def test_a_provider_that_is_not_there_is_named(call_play, package):
         assert "no provider 'abacus' here; it has: " in outcome.complaint("ia-play")
 
 
-def test_warnings_of_the_export_are_repeated_when_played(package):
-    manifest = replace(Player.load(package).manifest, metrics={})
-    assert package_warnings(manifest) == []
-    mark = {"psnr": 6.9, "verdict": "failed"}
-    told = replace(manifest, metrics={"warnings": ["It is fog."], "held_out": mark})
-    fog, failed = package_warnings(told)
-    assert fog == "It is fog."
-    assert "6.9 dB (failed)" in failed
-
-
 @pytest.mark.parametrize("mode", ["--verify", "--bench"])
 def test_warnings_of_the_package_are_printed(call_play, package, tmp_path, mode):
     sound, path = read_package(package, tier=None), tmp_path / "avatar.iavatar"
@@ -309,34 +282,12 @@ def test_poses_in_other_units_are_refused(
         assert [file.name for file in tmp_path.iterdir()] == ["poses.npz"]
 
 
-def test_what_a_proof_would_not_listen_to_is_refused(call_play, package, tmp_path):
-    for words in (["--tier", "lite"], ["--size", "64"], ["--out", tmp_path / "a.webm"]):
-        outcome = call_play(package, "--verify", *words)
-        assert outcome.code == 2
-        assert f"leave out {words[0]}" in outcome.complaint("ia-play")
-
-
 def test_a_folder_or_a_pipe_in_the_packages_place_is_named(call_play, package, tmp_path):
     said = call_play(package.parent, "--verify").complaint("ia-play")
     assert f"the package in it is {package}" in said
     assert "is a folder" in call_play(tmp_path, "--verify").complaint("ia-play")
     os.mkfifo(tmp_path / "pipe.iavatar")  # it would be waited on for ever
     assert "is no file" in call_play(tmp_path / "pipe.iavatar", "--verify").complaint("ia-play")
-
-
-@pytest.mark.parametrize("command", [play, ingest])
-def test_missing_arguments_are_named(command, capsys):
-    with pytest.raises(SystemExit) as end:
-        command.main([])
-    assert end.value.code == 2
-    assert "--help" in capsys.readouterr().err
-
-
-def test_things_that_are_not_there(call_play, package, novel, tmp_path):
-    none = tmp_path / "none"
-    assert "--poses" in call_play(package, "--still", 0).complaint("ia-play")
-    assert "none.npz" in call_play(package, "--poses", f"{none}.npz").complaint("ia-play")
-    assert "none.iavatar" in call_play(f"{none}.iavatar", "--poses", novel).complaint("ia-play")
 
 
 def test_a_full_disk_leaves_nothing(package, novel, tmp_path):

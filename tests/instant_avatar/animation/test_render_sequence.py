@@ -1,19 +1,15 @@
 """ia-play's turntables, stills, backgrounds and workers, and motions of other people's programs."""
 
 import os
-import pickle
 import signal
-from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from export.player import Player
-from instant_avatar.animation import play_arguments
 from instant_avatar.animation.driving_motion import FollowingCamera, canonical_pose_of, demo_motion
 from instant_avatar.animation.play_arguments import Viewpoint
-from instant_avatar.cli import hardware
 from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
 from preprocess.poses.pose_file import read_motion
 
@@ -125,13 +121,6 @@ def test_pictures_do_not_depend_on_the_workers(frames, novel):
     assert len(one) == 12
 
 
-def test_by_itself_there_is_a_worker_for_each_core(monkeypatch, package):
-    monkeypatch.setattr(hardware, "CGROUP", Path("/none"))
-    monkeypatch.setattr(hardware.os, "sched_getaffinity", lambda process: {0, 2, 5})
-    assert play_arguments.PlayArguments(avatar=package).worker_count == 3
-    assert play_arguments.PlayArguments(avatar=package, workers=2).worker_count == 2
-
-
 @pytest.mark.parametrize("workers", [1, 3])
 def test_ctrl_c_keeps_what_was_drawn(frames, novel, monkeypatch, workers):
     whole, render, drawn = frames("--poses", novel), Player.render, []
@@ -184,25 +173,6 @@ def amass(motion, pelvis, folder):
     return path, ["--fps", "120"]
 
 
-def humans(motion, pelvis, folder):
-    """4D-Humans (PHALP): rotation matrices in the camera, y down, and a second person."""
-    down = np.diag([1.0, -1.0, -1.0])
-    roots = down @ rotation_matrices(motion.root_rotations)
-    joints = rotation_matrices(motion.joint_rotations)
-    content = {}
-    for row in range(len(motion)):
-        place = (pelvis + motion.root_translations[row]) @ down - pelvis + [0.0, 0.0, 4.0]
-        smpl = {"global_orient": roots[row, None], "body_pose": joints[row], "betas": np.zeros(10)}
-        ghost = {**smpl, "global_orient": np.eye(3)[None]}
-        content[f"img/{row:06d}.jpg"] = {
-            "tid": [3, 8], "tracked_ids": [3, 8], "tracked_time": [0, 0], "time": row,
-            "size": [[640, 360]] * 2, "smpl": [ghost, smpl], "camera": [place + 1.0, place],
-        }  # fmt: skip
-    path = folder / "demo_clip.pkl"
-    path.write_bytes(pickle.dumps(content))
-    return path, ["--person", "8"]
-
-
 def animation(motion, pelvis, folder):
     """InstantAvatar's dances: SMPL's 72 numbers, and nothing about time."""
     path = folder / "dance.npz"
@@ -212,28 +182,7 @@ def animation(motion, pelvis, folder):
     return path, []
 
 
-@pytest.mark.parametrize("write", [amass, humans])
-def test_motions_of_other_programs_look_the_same(frames, player, novel, tmp_path, write):
-    """Whatever world they are in: the camera stands before their first pose."""
-    motion = read_motion(novel)
-    motion.joint_rotations[:, 21:] = 0.0  # AMASS knows no SMPL hands
-    own, _ = animation(motion, player.manifest.rest_joints[0], tmp_path)
-    expected = frames("--poses", own)
-    path, wishes = write(motion, player.manifest.rest_joints[0], tmp_path)
-    drawn = frames("--poses", path, *wishes)
-    assert drawn.shape == expected.shape
-    assert np.abs(drawn - expected).mean() < 0.5
-    assert (expected[..., 3] > 127).mean() > 0.05
-
-
 def test_motion_capture_of_120_poses_shows_every_second_one(frames, player, novel, tmp_path):
     path, _ = amass(read_motion(novel), player.manifest.rest_joints[0], tmp_path)
     fast, usual = frames("--poses", path, "--fps", "120"), frames("--poses", path)
     np.testing.assert_array_equal(usual, fast[::2])
-
-
-def test_a_person_who_is_not_there_is_named(call_play, package, player, novel, tmp_path):
-    path, _ = humans(read_motion(novel), player.manifest.rest_joints[0], tmp_path)
-    outcome = call_play(package, "--poses", path, "--person", "5")
-    assert outcome.code == 2
-    assert "no person called '5'" in outcome.complaint("ia-play")

@@ -152,9 +152,3 @@ def test_a_capture_that_fits_no_node_is_bad_input(tmp_path, copies):
     assert "--memory" in done.stderr
     assert "Traceback" not in done.stderr
     assert not (tmp_path / "out").exists()
-
-
-def test_the_help_teaches(capsys):
-    with pytest.raises(SystemExit):
-        batch.main(["--help"])
-    assert "ia-batch captures/ --out avatars" in capsys.readouterr().out

@@ -2,7 +2,7 @@
 
 import pytest
 
-from instant_avatar.batching.summary_page import headline, summary_page
+from instant_avatar.batching.summary_page import summary_page
 
 
 @pytest.fixture
@@ -11,11 +11,6 @@ def results(named, ended):
     ends = {"good": (0, 35.0), "blurred": (0, 25.0), "b<d": (2,)}
     made = {name: ended(named(name), *end).record for name, end in ends.items()}
     return {**made, "new": None}
-
-
-def test_counts_and_medians_are_said_in_a_sentence(results):
-    assert headline(results) == "2 done, 1 waiting, 1 refused. Median 30.00 dB, 60 s."
-    assert headline({"new": None}) == "1 waiting."
 
 
 def test_the_page_shows_avatars_and_causes_the_worst_first(results):

@@ -15,7 +15,7 @@ from capture.image_folder import read_image
 from capture.input_error import InputError
 from instant_avatar.animation.clip_file import background_compositor
 from instant_avatar.cli.command_line import CommandExit, run_command, stop_on_interrupt
-from instant_avatar.cli.console import MAX_PRINTED_WARNINGS, Console, format_duration
+from instant_avatar.cli.console import MAX_PRINTED_WARNINGS, Console
 
 
 def raising(error):
@@ -160,51 +160,6 @@ def test_warnings_are_said_once_and_not_for_ever():
     assert "and 3 more" in said.getvalue()
     assert "[bold]" in said.getvalue()
     assert len(console.warnings) == MAX_PRINTED_WARNINGS + 3
-
-
-def test_a_log_gets_plain_lines_and_few(monkeypatch):
-    said = io.StringIO()
-    console = Console(RichConsole(file=said))
-    with console.progress("learning", 60.0) as bar:
-        for step in range(100):
-            bar.update(float(step), f"step {step}")
-        monkeypatch.setattr("instant_avatar.cli.console.LOG_INTERVAL_S", 0.0)
-        bar.update(60.0, "the end")
-    assert said.getvalue() == "learning\nlearning: the end\n"
-
-
-def test_a_count_says_how_long_the_rest_takes(monkeypatch):
-    """A quarter is done after ten seconds, so thirty are left."""
-    now, said = [100.0], io.StringIO()
-    monkeypatch.setattr("instant_avatar.cli.console.time.perf_counter", lambda: now[0])
-    with Console(RichConsole(file=said)).progress("scoring 12 held-out frames", 12.0) as bar:
-        bar.set_count(1)  # too early to say
-        now[0] += 10.0
-        bar.set_count(3)
-        now[0] += 30.0
-        bar.set_count(12)
-    assert said.getvalue().splitlines() == [
-        "scoring 12 held-out frames",
-        "scoring 12 held-out frames: 3 of 12, about 30 s left",
-        "scoring 12 held-out frames: 12 of 12",
-    ]
-
-
-def test_a_long_note_leaves_a_bar_its_name():
-    said = io.StringIO()
-    rich = RichConsole(file=said, force_terminal=True, width=100, color_system=None)
-    with Console(rich).progress("writing the package", 1.0) as bar:
-        bar.update(0.4, "40% " + 200 * "x")
-    assert "writing the package" in said.getvalue()
-    assert "40%" in said.getvalue()
-
-
-@pytest.mark.parametrize(
-    ("seconds", "said"),
-    [(0.2, "1 s"), (8.4, "8 s"), (43.0, "45 s"), (89.0, "90 s"), (130.0, "2 min")],
-)
-def test_durations_as_people_say_them(seconds, said):
-    assert format_duration(seconds) == said
 
 
 def test_colors_and_images_serve_as_backgrounds(tmp_path, rng):

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import subprocess
 
 import numpy as np
 import pytest
@@ -10,16 +9,10 @@ import pytest
 from avatar.evaluation.image_metrics import ground_truth_on_white, ground_truth_over
 from avatar.evaluation.perceptual import Lpips
 from instant_avatar import evaluate
-from instant_avatar.cli import hardware
 from instant_avatar.cli.command_line import INTERRUPTED
 from instant_avatar.evaluation import datasets
 from instant_avatar.evaluation.evaluation_session import FrameScorer
-from instant_avatar.evaluation.frame_scoring import SHOWN_FRAMES, FrameScore, score_picture
-from instant_avatar.evaluation.score_table import (
-    AvatarEvaluation,
-    ScoreRow,
-    markdown_table,
-)
+from instant_avatar.evaluation.frame_scoring import SHOWN_FRAMES, score_picture
 from preprocess.capture_session import CaptureInputs
 from preprocess.open_capture import open_capture
 from tests.instant_avatar.conftest import Outcome
@@ -192,23 +185,6 @@ def test_each_background_has_its_own_scores_of_one_rendering(film, monkeypatch):
     assert white.overlap == black.overlap
 
 
-def test_a_table_is_markdown_and_its_means_are_means():
-    def avatar(name, psnr):
-        score = FrameScore(
-            frame=0, psnr=psnr, psnr_mask=20.0, psnr_box=25.0, ssim=0.9, cpu_ms=np.inf,
-            blur=0.01, overlap=0.9,
-        )  # fmt: skip
-        row = ScoreRow(renderer="renderer", poses="given", scores=[score])
-        return AvatarEvaluation(name=name, capture="c", size=(8, 8), rows=[row])
-
-    lines = markdown_table([avatar("one", 30.0), avatar("other", 33.0)]).splitlines()
-    assert len({line.count("|") for line in lines}) == 1
-    assert len(set(map(len, lines))) == 1
-    cells = [cell.strip() for cell in lines[-1].split("|")]
-    assert cells[1:7] == ["mean", "2", "renderer", "given", "white", "31.50"]
-    assert lines[2].endswith("| soft  |")
-
-
 def test_a_page_holds_conditions_scores_and_pictures(run, film, call_evaluate, tmp_path):
     words = ("--no-fitted", "--background", "white", "black", "--dance", film / "poses.npz")
     out = ("--card", tmp_path / "card.html", "--json", tmp_path / "t.json")
@@ -272,10 +248,3 @@ def test_what_cannot_be_scored_is_refused_with_the_reason(
     assert ended.code == 2
     assert told in ended.complaint("ia-evaluate")
     assert ended.out == ""
-
-
-def test_an_installation_within_another_checkout_has_no_commit(monkeypatch, tmp_path):
-    subprocess.run(["git", "init", "-q", tmp_path], check=True)
-    (tmp_path / "site-packages").mkdir()
-    monkeypatch.setattr(hardware, "ROOT", tmp_path / "site-packages")
-    assert hardware._commit() == "unknown"

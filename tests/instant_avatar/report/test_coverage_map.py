@@ -73,12 +73,3 @@ def test_in_front_view_the_persons_left_is_on_the_right(body_map, coverage):
         reach = sign * (found["well"][:, 0] - middle)
         here = np.abs(reach) < 50.0
         assert np.all(reach[here] > 0.0)
-
-
-def test_dots_lie_inside_the_picture(body_map, coverage):
-    low_x, low_y, width, height = map(
-        float, ElementTree.fromstring(body_map.svg()).get("viewBox").split()
-    )
-    every = np.concatenate(list(dots(body_map.svg()).values()))
-    assert np.all(every > [low_x, low_y])
-    assert np.all(every < [low_x + width, low_y + height])

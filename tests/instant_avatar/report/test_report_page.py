@@ -26,8 +26,6 @@ from instant_avatar.report.report_schema import (
     Report,
     StreamStats,
     TrainingStats,
-    finite_mean,
-    format_psnr,
 )
 from instant_avatar.report.report_writer import diagnose_failure, play_command
 from preprocess.observation import DroppedFrame
@@ -92,12 +90,6 @@ def scores(*values):
         HeldOutScore(frame=9 + 10 * i, psnr=psnr, psnr_mask=mask, ssim=0.9)
         for i, (psnr, mask) in enumerate(values)
     )
-
-
-def test_the_mean_leaves_out_what_is_no_number():
-    assert finite_mean([1.0, float("nan"), 3.0, float("inf")]) == 2.0
-    assert finite_mean([float("nan")]) is None
-    assert finite_mean([]) is None
 
 
 def test_a_frame_without_a_person_has_no_masked_score():
@@ -237,14 +229,6 @@ def test_a_failure_names_what_was_seen_and_what_to_do():
     assert diagnose_failure(report()) is None
 
 
-def test_nothing_has_failed_during_training():
-    assert format_psnr(13.3, "failed", digits=1) == "13.3 dB (failed)"
-    assert format_psnr(13.3, "failed", provisional=True) == "13.30 dB (not converged yet)"
-    assert format_psnr(30.0, "soft", provisional=True) == "30.00 dB (soft)"
-    assert format_psnr(30.0, None) == "30.00 dB"
-    assert format_psnr(None, None) == "n/a"
-
-
 def test_an_avatar_of_one_side_is_not_called_sharp():
     one_sided = AllRoundVerdict.of(
         "sharp", seen=0.45, half_transparent=0.11, player_psnr=40.0, film_advice="Turn round."
@@ -262,21 +246,6 @@ SOLVED = {
     "verdict": "solved", "focal_px": 434.2, "scale": {"cues": ["ground"]},
     "frames": {"key": 60, "placed": 28, "interpolated": 2, "missing": 0},
 }  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("found", "said"),
-    [
-        (None, None),
-        ({"verdict": "still"}, "did not move"),
-        (SOLVED, "434 px; metric scale from: ground"),
-    ],
-)  # fmt: skip
-def test_the_page_describes_solved_cameras(found, said):
-    page = report_page(replace(report(), cameras=found), name="clip")
-    assert Tags(page).addresses == []
-    assert ("<h2>Cameras" in page) == (said is not None)
-    assert said is None or said in page
 
 
 def test_the_page_names_no_file_that_is_not_there():

@@ -15,7 +15,6 @@ from instant_avatar import ingest
 from instant_avatar.cli.command_line import CommandExit
 from instant_avatar.cli.console import Console
 from instant_avatar.cli.shared_options import (
-    check_disjoint_from_inputs,
     check_output_file,
     check_writable,
     unused_path,
@@ -41,35 +40,6 @@ def test_a_place_that_cannot_be_written_to_is_named_before_any_work(tmp_path):
         with pytest.raises(InputError, match="is not writable"):
             check_output_file(Path("/proc/a.json"), "--json")
     assert os.listdir(tmp_path) == ["report.json"]
-
-
-@pytest.mark.parametrize(
-    ("out", "clash"),
-    [
-        ("capture", "is"), ("link", "is"), ("link/deep/run", "lies in"),
-        ("capture/masks", "lies in"), (".", "contains"), ("", "contains"),
-    ],
-)  # fmt: skip
-def test_an_output_folder_is_no_input_and_none_lies_in_the_other(tmp_path, out, clash):
-    capture = tmp_path / "capture"
-    (capture / "masks").mkdir(parents=True)
-    (tmp_path / "link").symlink_to(capture)
-    with pytest.raises(InputError, match=f" {clash} an input "):
-        check_disjoint_from_inputs(tmp_path / out, "--out", [capture])
-    check_disjoint_from_inputs(tmp_path / "run", "--out", [capture])
-
-
-def test_a_file_is_never_an_input_nor_read_as_a_part_of_one(tmp_path):
-    capture = tmp_path / "capture"
-    (capture / "runs").mkdir(parents=True)
-    (capture / "poses.npz").write_bytes(b"poses")
-    os.link(capture / "poses.npz", tmp_path / "hard.npz")
-    (tmp_path / "soft.npz").symlink_to(capture / "poses.npz")
-    inputs = [capture, capture / "poses.npz"]
-    for name in ("capture/poses.npz", "hard.npz", "soft.npz", "capture/transforms.json"):
-        with pytest.raises(InputError, match="input of this command"):
-            check_output_file(tmp_path / name, "--json", inputs, overwrite=True)
-    check_output_file(capture / "runs" / "sheet.png", "--sheet", inputs)
 
 
 def test_an_existing_file_is_replaced_only_on_request(tmp_path):

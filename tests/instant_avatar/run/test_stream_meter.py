@@ -114,10 +114,3 @@ def test_of_very_many_lost_frames_only_the_number_is_kept():
     assert len(list(meter.count_observations(lost))) == MAX_DROPPED_LISTED + 500
     assert meter.dropped_count == MAX_DROPPED_LISTED + 500
     assert [note.index for note in meter.dropped] == list(range(MAX_DROPPED_LISTED))
-
-
-def test_drops_of_the_source_and_of_the_inbox_are_summed():
-    source = Recorded()
-    meter = StreamMeter(threading.Event(), source)
-    source.dropped, meter.inbox_dropped = 3, 4
-    assert meter.stats(ready_at=None).inbox_dropped == 7

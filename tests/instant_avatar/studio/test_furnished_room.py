@@ -1,6 +1,5 @@
 """The room and the phone that is carried around in it."""
 
-import cv2
 import numpy as np
 import pytest
 
@@ -8,8 +7,7 @@ from capture.atomic_files import LIST_NAME as LIST
 from capture.input_error import InputError
 from instant_avatar.studio import staging
 from instant_avatar.studio.actor import Actor
-from instant_avatar.studio.furnished_room import SENSOR_NOISE, FurnishedRoom
-from instant_avatar.studio.painted_surfaces import dead_leaves, repeat_motif
+from instant_avatar.studio.furnished_room import FurnishedRoom
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.cameras.camera_file import read_cameras
 from preprocess.capture_session import CaptureInputs
@@ -74,65 +72,6 @@ def test_every_pixel_shows_the_nearest_face_of_the_room(room, cameras):
                 assert not inside.all(axis=-1).any()
 
 
-def test_the_corners_of_the_furniture_are_where_the_cameras_project_them(room, cameras):
-    """Around the projection of a free upper corner lie three faces or two and what is behind."""
-    solids, met = room.solids, 0
-    for camera in cameras:
-        seen = room.view_from(camera)
-        for solid in (2, 5, 6, 15):
-            low, high = solids.low[solid], solids.high[solid]
-            cosine, sine = solids.yaw_cos_sin[solid]
-            for x, z in (
-                (low[0], low[2]),
-                (low[0], high[2]),
-                (high[0], low[2]),
-                (high[0], high[2]),
-            ):
-                away = np.array([x, z]) - solids.centers_xz[solid]
-                x, z = np.array([[cosine, sine], [-sine, cosine]]) @ away + solids.centers_xz[solid]
-                corner = np.array([x, high[1], z])
-                depth = camera.camera_from_world[2] @ [*corner, 1.0]
-                column, row = camera.project(corner)
-                if not (3 < column < 189 and 3 < row < 105):
-                    continue
-                around = np.s_[int(row) - 2 : int(row) + 3, int(column) - 2 : int(column) + 3]
-                if abs(seen.depth[around] - depth).min() > 0.1:
-                    continue  # something stands before it
-                met += 1
-                faces = np.unique(seen.face[around])
-                assert (faces // 6 == solid).any()
-                assert len(faces) >= 2
-    assert met > 20
-
-
-def test_a_place_of_the_wall_has_one_color_from_everywhere(room):
-    near = staging.handheld_cameras(np.zeros((60, 2)), 1.8, 384, 1)[28:31:2]
-    first, second = (room.view_from(camera) for camera in near)
-    first = type(first)(rgb=first.rgb.copy(), depth=first.depth, face=first.face)
-    points = points_seen(near[0], first.depth)
-    pixels = near[1].project(points).astype(np.float32) - np.float32(0.5)
-    moved = cv2.remap(second.rgb, pixels, None, cv2.INTER_LINEAR)
-    depth = cv2.remap(second.depth, pixels, None, cv2.INTER_NEAREST, borderValue=0.0)
-    there = points @ near[1].camera_from_world[2, :3] + near[1].camera_from_world[2, 3]
-    both = (abs(depth - there) < 0.02) & (abs(pixels - pixels.round()) < 1).all(axis=-1)
-    assert both.mean() > 0.5
-    off = abs(moved - first.rgb)[both]
-    assert np.median(off) < 4.0
-    assert first.rgb[both].std() > 25.0
-
-
-def test_nothing_in_the_room_repeats_and_all_of_the_tiles_do():
-    generator = np.random.default_rng(0)
-    motif = dead_leaves((120, 120, 120))
-    tiled = repeat_motif(motif, 0.3, (0, 0, 0))((200, 100), 0.01, generator)
-    np.testing.assert_array_equal(tiled[:, 30:], tiled[:, :-30])
-    np.testing.assert_array_equal(tiled[30:], tiled[:-30])
-    free = motif((200, 100), 0.01, generator).astype(float)
-    free = (free - free.mean()) / free.std()
-    for shift in range(10, 100):
-        assert (free[:, shift:] * free[:, :-shift]).mean() < 0.6
-
-
 @pytest.mark.parametrize("subject", [1, 2])
 def test_the_phone_walks_an_arc_and_holds_the_person_in_the_picture(subject):
     actor = Actor.of(subject)
@@ -192,42 +131,6 @@ def test_true_cameras_and_none_see_the_same_person(capture):
             for seen, which in ((one, recordings[0]), (other, recordings[1]))
         ]
         np.testing.assert_allclose(*pixels, atol=1e-6)
-
-
-def test_the_person_is_drawn_over_the_room_unchanged(capture):
-    actor = Actor.of(1)
-    truth = read_motion(capture / "truth" / "poses.npz")
-    track = read_cameras(capture / "truth" / "cameras.npz", (128, 72))
-    video = cv2.VideoCapture(str(capture / "video.mp4"))
-    room = FurnishedRoom.furnished("room", 128, 0)
-    for row in range(WALK.frames):
-        frame = video.read()[1][..., ::-1]
-        rgb, alpha = actor.render_over(truth[row], track[row])
-        mask = cv2.imread(str(capture / "masks" / f"{row:04d}.png"), cv2.IMREAD_UNCHANGED)
-        np.testing.assert_array_equal(mask, alpha)
-        np.testing.assert_array_equal(frame[mask == 255], rgb[mask == 255])
-        behind = room.view_from(track[row]).rgb
-        free = (mask == 0) & (room.view_from(track[row]).face != 2)
-        assert abs((frame.astype(float) - behind)[free]).std() < 2.0 * SENSOR_NOISE
-
-
-def test_a_still_camera_sees_the_same_room_under_new_noise(tmp_path):
-    film_capture(tmp_path / "c", ShootConfig(frames=3, size=64, background="room"))
-    assert (tmp_path / "c" / "cameras.npz").exists()
-    video = cv2.VideoCapture(str(tmp_path / "c" / "video.mp4"))
-    frames = np.stack([video.read()[1] for _ in range(3)]).astype(float)
-    upper = frames[:, :20, :16] - frames[:1, :20, :16]  # a wall, away from actor and floor
-    assert 0.7 * SENSOR_NOISE * np.sqrt(2) < upper[1:].std() < 1.4 * SENSOR_NOISE * np.sqrt(2)
-    assert frames[0].std() > 20.0
-
-
-def test_the_same_seed_walks_the_same_and_another_does_not(capture, tmp_path):
-    film_capture(tmp_path / "again", WALK)
-    film_capture(tmp_path / "other", ShootConfig(frames=6, size=128, motion="walkaround", seed=1))
-    for name, same in (("again", True), ("other", False)):
-        for file in ("video.mp4", "truth/cameras.npz"):
-            bytes_ = [(folder / file).read_bytes() for folder in (capture, tmp_path / name)]
-            assert (bytes_[0] == bytes_[1]) == same
 
 
 def test_a_painted_backdrop_is_refused_where_the_camera_moves(tmp_path):

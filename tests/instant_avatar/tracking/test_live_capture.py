@@ -1,6 +1,5 @@
 """Live sources from the command line: a stand-in writes the images while the person is tracked."""
 
-import errno
 import json
 import os
 import shutil
@@ -12,7 +11,6 @@ import pytest
 
 from avatar.training import train
 from avatar.training.train import warm_up
-from capture import live_sources
 from capture.source_opening import open_source
 from instant_avatar import ingest
 
@@ -87,23 +85,6 @@ def test_a_camera_becomes_an_avatar(watch, filmed):
     assert code == 0
     assert report["stream"]["realtime"]
     assert report["frames"]["used"] >= 2
-
-
-def test_a_camera_that_is_not_there(call_ingest, tmp_path):
-    outcome = call_ingest("camera:97", "--out", tmp_path / "run")
-    assert outcome.code == 2
-    assert "camera '97'" in outcome.complaint()
-    assert not (tmp_path / "run").exists()
-
-
-def test_a_camera_that_another_program_uses(call_ingest, tmp_path, monkeypatch):
-    def busy(address):
-        raise OSError(errno.EBUSY, "another program may be using it", "/dev/video0")
-
-    monkeypatch.setattr(live_sources, "_open_device", busy)
-    outcome = call_ingest("camera:0", "--out", tmp_path / "run")
-    assert outcome.code == 3
-    assert "busy" in outcome.complaint()
 
 
 @pytest.mark.parametrize(

@@ -95,12 +95,6 @@ def test_ia_check_grades_tracked_poses(tracked, tmp_path, capsys):
     assert json.loads(told.read_text())["tracking"]["found_share"] == 1.0
 
 
-def test_files_are_replaced_only_if_asked(tracked, capsys):
-    words = [str(tracked / "video.mp4"), "--out", str(tracked / "out" / "poses.npz")]
-    assert track.main(words) == 2
-    assert "--overwrite" in capsys.readouterr().err
-
-
 def test_tracking_beside_the_video_reads_and_repeats(video, capsys):
     words = ["--out", str(video.with_name("poses.npz")), "--frames", ":8", "--overwrite"]
     assert track.main([str(video), *words]) in (0, 1)

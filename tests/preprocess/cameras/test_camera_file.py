@@ -207,9 +207,3 @@ def test_of_photographs_upside_down_colmaps_cameras_are_those_of_the_stored(tmp_
     x, y = read_cameras(tmp_path / "c.npz", STORED_PX)[0].project(POINT)
     wanted = [128 - x, 72 - y] if program == "colmap" else [x, y]
     np.testing.assert_allclose(camera.project(POINT), wanted)
-
-
-def test_cameras_of_another_shape_are_refused_as_the_user_sees_the_pictures(turned, tmp_path):
-    np.savez(tmp_path / "c.npz", intrinsic=LYING, width=100, height=100)
-    with pytest.raises(InputError, match="72x128"):
-        read_upright_cameras(tmp_path / "c.npz", turned)

@@ -9,8 +9,6 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from capture.camera import Camera
@@ -296,38 +294,6 @@ def test_strange_json_is_refused_by_name(content, tmp_path):
     (tmp_path / "transforms.json").write_text(content)
     with pytest.raises(InputError, match=r"transforms\.json"):
         read_named_cameras(tmp_path / "transforms.json")
-
-
-@given(
-    st.recursive(
-        st.none() | st.booleans() | st.floats() | st.text(max_size=5),
-        lambda inner: st.lists(inner, max_size=4)
-        | st.dictionaries(
-            st.sampled_from(["frames", "poses", "K", "w", "h", "fl_x", "file_path",
-                             "transform_matrix", "camera_angle_x", "applied_transform"]),
-            inner, max_size=6,
-        ),
-        max_leaves=12,
-    )
-)  # fmt: skip
-def test_any_json_is_read_or_refused(tmp_path_factory, content):
-    path = tmp_path_factory.mktemp("json") / "transforms.json"
-    path.write_text(json.dumps(content))
-    try:
-        found = read_named_cameras(path)
-    except InputError:
-        return
-    assert found
-    assert all(np.isfinite(each.camera.camera_from_world).all() for each in found)
-
-
-def test_a_damaged_colmap_model_is_refused(colmap, rng):
-    folder, model = colmap()
-    model.write_binary(folder)
-    for size in (0, 7, 100):
-        (folder / "images.bin").write_bytes(rng.bytes(size))
-        with pytest.raises(InputError, match="COLMAP"):
-            read_named_cameras(folder)
 
 
 def test_counts_that_a_damaged_colmap_model_claims_are_not_believed(colmap):

@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from capture.camera import same_aspect_ratio
 from capture.image_folder import silence_opencv
 from capture.input_error import InputError
 from capture.source_opening import open_source
@@ -88,15 +87,6 @@ def test_every_image_mode_gives_the_same_mask(tmp_path, mode):
     np.testing.assert_allclose(open_masks(folder).alpha(0, SIZE), hard / 255.0)
 
 
-def test_a_mask_is_rotated_by_its_exif_tag(tmp_path):
-    upright = np.zeros((12, 8), np.uint8)
-    upright[1:5, 2:4] = 255
-    exif = Image.Exif()
-    exif[0x0112] = 6  # stored lying: to be turned 90° clockwise
-    Image.fromarray(np.ascontiguousarray(np.rot90(upright))).save(tmp_path / "0.png", exif=exif)
-    np.testing.assert_array_equal(open_masks(tmp_path).alpha(0, (8, 12)), upright / 255.0)
-
-
 def test_one_archive_or_array_is_read_like_a_folder(write, tmp_path):
     stack = np.stack([person(), person(4)])
     np.savez(tmp_path / "m.npz", masks=stack, note=np.zeros(3))
@@ -106,11 +96,6 @@ def test_one_archive_or_array_is_read_like_a_folder(write, tmp_path):
         masks = open_masks(tmp_path / name)
         assert masks.count == 2
         np.testing.assert_array_equal(masks.alpha(1, SIZE), expected.alpha(1, SIZE))
-
-
-def test_masks_come_in_natural_order(write):
-    folder = write([person(i - 5) for i in range(12)])
-    np.testing.assert_array_equal(open_masks(folder).alpha(11, SIZE), person(6) / np.float32(255))
 
 
 def test_inverted_masks_are_detected_unless_stated(write):
@@ -169,14 +154,6 @@ def test_a_mask_of_another_shape_is_refused_and_of_another_size_scaled(write):
     by_hand = (person() / np.float32(255)).reshape(20, 2, 15, 2).mean(axis=(1, 3))
     np.testing.assert_allclose(half, by_hand, atol=1e-6)
     assert masks.alpha(0, (60, 80)).shape == (80, 60)
-
-
-@given(st.integers(8, 4000), st.integers(8, 4000), st.integers(8, 512))
-def test_shapes_agree_after_any_shrinking(width, height, longer):
-    scale = min(1.0, longer / max(width, height))
-    small = max(1, round(width * scale)), max(1, round(height * scale))
-    assert same_aspect_ratio((width, height), small)
-    assert not same_aspect_ratio((width, height), (width, 2 * height))
 
 
 @pytest.mark.parametrize(

@@ -174,17 +174,6 @@ def test_what_is_no_motion_is_refused_by_name(write, changes, message):
         read_motion(write(**changes))
 
 
-def test_no_rows_are_no_motion(write):
-    with pytest.raises(InputError):
-        read_motion(
-            write(
-                global_orient=np.zeros((0, 3)),
-                body_pose=np.zeros((0, 69)),
-                transl=np.zeros((0, 3)),
-            )
-        )
-
-
 def test_a_missing_damaged_or_foreign_file_is_refused(tmp_path):
     with pytest.raises(InputError, match="does not exist"):
         read_motion(tmp_path / "poses.npz")

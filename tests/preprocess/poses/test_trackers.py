@@ -518,8 +518,3 @@ def test_what_holds_no_poses_is_refused_and_says_what_it_holds(tmp_path, content
     path.write_bytes(pickle.dumps(content))
     with pytest.raises(InputError, match=message):
         read_poses(path)
-
-
-def test_a_folder_without_poses_is_refused(tmp_path):
-    with pytest.raises(InputError, match="folder without files"):
-        read_poses(tmp_path)

@@ -23,7 +23,6 @@ import torch
 
 from benchmarks.fuzz_mutations import mutate_bytes, random_opcodes
 from capture.input_error import InputError
-from instant_avatar.cli.command_line import install_advice
 from preprocess import file_content
 from preprocess.body.parametric_body import load_body_model
 from preprocess.file_content import read_untrusted_file
@@ -154,26 +153,6 @@ def test_what_is_harmless_is_read_from_any_container(tmp_path, joblib_bytes, kin
     np.testing.assert_array_equal(found["n"], thing["n"])
     assert found["t"] == [1, 2.5, "x", None, True]
     assert found[3] == {"é": ["b"]}
-
-
-@pytest.mark.parametrize("kind", [*TORCH_KINDS, "tensor in an array"])
-def test_without_pytorch_a_file_of_tensors_asks_for_its_installation(tmp_path, monkeypatch, kind):
-    path = tmp_path / "poses.pt"
-    path.write_bytes(containers(1, lambda thing: b"")[kind])
-    monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(ModuleNotFoundError) as caught:
-        read_untrusted_file(path)
-    assert install_advice(caught.value)
-
-
-@pytest.mark.parametrize("protocol", range(6))
-def test_arrays_without_rows_are_read_from_every_protocol(tmp_path, protocol):
-    path = tmp_path / "empty.pkl"
-    path.write_bytes(pickle.dumps({"a": np.zeros((0, 3)), "b": b"", "c": np.ones(2)}, protocol))
-    found = read_untrusted_file(path)
-    assert found["a"].shape == (0, 3)
-    assert found["b"] == ""
-    np.testing.assert_array_equal(found["c"], np.ones(2))
 
 
 def test_tensors_of_every_type_and_stride_are_read(tmp_path):
