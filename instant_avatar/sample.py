@@ -31,9 +31,9 @@ class SampleArguments:
     video it comes without cameras: poses.npz is relative to the camera of each frame, with K; the
     true cameras are in OUT/truth/cameras.npz, for comparison or for --cameras.
 
-    With --like-a-phone everything is a little wrong, as in reality. OUT/truth then holds what is
-    exact of body, poses, cameras and masks; ia-ingest takes it with --body, --poses, --cameras and
-    --masks.
+    With --like-a-phone everything is a little wrong, as in reality. OUT/truth then holds the exact
+    body, poses, cameras and masks; the options --body, --poses, --cameras and --masks of ia-ingest
+    take them.
 
     Exit codes: 0 done, 2 bad input, 3 disk full, 130 Ctrl-C. The folder is written whole or not at
     all.

@@ -27,9 +27,9 @@ class BatchArguments:
 
         ia-batch captures/ --out avatars --ray auto -- --steps 3000
 
-    Captures are folders (a video or images/ with poses or masks), videos with poses beside them
-    (anna.mp4, anna_poses.npz), bare videos, and rows of a table (.csv with a column capture, and
-    options of ia-ingest). Words after -- are options of ia-ingest for all captures.
+    Captures are folders (a video or images/ with poses or masks), bare videos, and rows of a table
+    (.csv with a column capture, and options of ia-ingest). Words after -- are options of ia-ingest
+    for all captures.
 
     The folder then holds a folder per capture, results.jsonl (a line per capture) and summary.html.
     Run the same command again to go on: what is done is left alone, what is new or has changed is

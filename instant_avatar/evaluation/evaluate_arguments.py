@@ -53,7 +53,8 @@ class EvaluateArguments:
         "vgg",
     )
     """LPIPS as published tables compute it: AlexNet fed [0, 1] (PeopleSnapshot), AlexNet fed
-    [-1, 1] (NeuMan), VGG fed [-1, 1] (ZJU-MoCap; five seconds of CPU per image of 540 px)."""
+    [-1, 1] (NeuMan), VGG fed [-1, 1] (ZJU-MoCap; five seconds of CPU per image of 540 px).
+    Default: all three."""
     lpips_weights: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Folder with alexnet-owt-7be5be79.pth and vgg16-397923af.pth (default: torch's cache)."""
     poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
