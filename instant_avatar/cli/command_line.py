@@ -210,7 +210,7 @@ def parse_arguments(
         raise SystemExit(0)
     if {"-h", "--help"} & set(argv):  # tyro would not wrap paragraphs
         about = f"{inspect.getdoc(arguments_type)}\n\n--version prints the version and exits.\n"
-        paragraphs = re.sub(r"(?<=\S)\n(?=\w)", " ", about)
+        paragraphs = re.sub(r"(?<=\S)\n(?=\S)", " ", about)
         RichConsole(highlight=False, markup=False).print(paragraphs)
     return tyro.cli(arguments_type, prog=program, args=argv, description="")
 
