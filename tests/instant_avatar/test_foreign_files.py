@@ -71,17 +71,13 @@ def called(line, **places):
         "ia-ingest {film} --out {hoard}",
         "ia-ingest {film} --out {hoard} --overwrite",
         "ia-ingest {film} --out {hoard}/truth --resume",
-        "ia-ingest {film} --out {hoard}/letter.txt",
         "ia-ingest {film} --out new --json {hoard}/report.json",
         "ia-sample {hoard} --overwrite",
-        "ia-sample {hoard}/masks --overwrite",
-        "ia-sample {hoard}/video.mp4 --overwrite",
         "ia-check {film} --fix {hoard}/masks",
         "ia-check {film} --sheet {hoard}/0000.png",
         "ia-check {film} --json {hoard}/report.json",
         "ia-play {package} --out {hoard}/images",
         "ia-play {package} --out {hoard}/clip.webm",
-        "ia-play {package} --out {hoard}/0000.png",
         "ia-play {hoard}/avatar.iavatar",
         "ia-play {package} --bench --json {hoard}/poses.npz",
         "ia-play {package} --web --out {hoard}/truth",
@@ -89,15 +85,11 @@ def called(line, **places):
         "ia-export {package} --to glb --out {hoard}/mesh.glb",
         "ia-evaluate {run} --json {hoard}/report.json",
         "ia-track {film} --out {hoard}/poses.npz --overwrite",
-        "ia-track {film} --out {hoard}/sub/new.npz --overwrite",
-        "ia-track {film} --out {hoard}/images/0000.png",
         "ia-track {film} --out {hoard}",
         "ia-batch {film} --out {hoard}",
-        "ia-batch {film} --out {hoard}/letter.txt",
         "ia-batch bad.mp4 --out {hoard}/batch0",
         "ia-batch bad.mp4 --out {hoard}/batch1",
         "ia-batch bad.mp4 --out {hoard}/batch2",
-        "ia-batch bad.mp4 --out {hoard}/batch3",
         "ia-batch bad.mp4 --out {hoard}/batch4",
     ],
 )
@@ -118,12 +110,11 @@ def test_a_place_with_other_peoples_files_is_refused(
     [
         "ia-ingest {capture} --out {capture} --overwrite",
         "ia-ingest .",
+        "ia-track .",
         "ia-ingest {capture} --out {capture}/run",
         "ia-ingest {capture} --out {above} --overwrite",
-        "ia-ingest {above}/link --out {capture}",
         "ia-ingest {above}/film.mp4 --poses {capture}/poses.npz --out {capture} --overwrite",
         "ia-ingest {capture} --out new --json {capture}/poses.npz --overwrite",
-        "ia-check {capture} --sheet {capture}/masks/9999.png",
         "ia-check {capture} --json {capture}/cameras.npz --overwrite",
         "ia-check {capture} --fix {capture}/mended",
         "ia-play {package} --background {capture}/masks/0001.png --out {capture}/masks/0001.png"
@@ -132,13 +123,10 @@ def test_a_place_with_other_peoples_files_is_refused(
         "ia-export {package} --to ply --out {package} --overwrite",
         "ia-evaluate {run} --on {capture} --json {capture}/poses.npz --overwrite",
         "ia-track {capture} --out {capture}/sub/new.npz",
-        "ia-track .",
-        "ia-track {capture}/video.mp4 --out {capture}/masks/new.npz",
         "ia-track {above}/film.mp4 --body {above}/body.npz --out {above}/body.npz --overwrite",
         "ia-track {above}/film.mp4 --out {run}/poses.npz",
         "ia-batch {capture} --out {capture}/runs",
         "ia-batch {capture} --out {above}",
-        "ia-batch {above}/rows.csv --out {above}/others",
         "ia-batch {above}/film.mp4 --out {capture}/masks -- --masks {capture}/masks",
     ],
 )
@@ -146,13 +134,8 @@ def test_no_command_writes_over_what_it_reads(
     line, capture, run, package, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(capture)
-    (tmp_path / "link").symlink_to(capture)
     os.link(capture / "video.mp4", tmp_path / "film.mp4")
     (tmp_path / "body.npz").write_text("mine")
-    (tmp_path / "others").mkdir()
-    (tmp_path / "others" / "poses.npz").write_text("mine")
-    rows = "capture,poses\n{0}/capture,\n{0}/film.mp4,{0}/others/poses.npz\n"
-    (tmp_path / "rows.csv").write_text(rows.format(tmp_path))
     before = contents(tmp_path)
     assert called(line, capture=capture, above=tmp_path, run=run, package=package) == 2
     assert contents(tmp_path) == before

@@ -7,25 +7,11 @@ from capture.atomic_files import LIST_NAME as LIST
 from capture.input_error import InputError
 from instant_avatar.studio import staging
 from instant_avatar.studio.actor import Actor
-from instant_avatar.studio.furnished_room import FurnishedRoom
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.cameras.camera_file import read_cameras
-from preprocess.capture_session import CaptureInputs
-from preprocess.observation import Observation
-from preprocess.open_capture import open_capture
 from preprocess.poses.pose_file import read_motion
 
 WALK = ShootConfig(frames=6, size=128, motion="walkaround")
-
-
-@pytest.fixture(scope="module")
-def room():
-    return FurnishedRoom.furnished("room", 192, 0)
-
-
-@pytest.fixture(scope="module")
-def cameras():
-    return staging.handheld_cameras(np.zeros((9, 2)), 1.8, 192, 3)
 
 
 @pytest.fixture(scope="module")
@@ -33,43 +19,6 @@ def capture(tmp_path_factory):
     folder = tmp_path_factory.mktemp("shoot") / "walk"
     film_capture(folder, WALK)
     return folder
-
-
-def points_seen(camera, depth):
-    """The world's point in the middle of each pixel, from its depth."""
-    rays = camera.ray_directions(camera.pixel_centers())
-    along = rays @ camera.camera_from_world[2, :3]
-    return camera.center_world + rays * (depth / along)[..., None]
-
-
-def in_box(solids, solid, points):
-    """Points of the world in the frame of a box, which the test turns by itself."""
-    cosine, sine = solids.yaw_cos_sin[solid]
-    turn = np.array([[cosine, -sine], [sine, cosine]])
-    own = points.copy()
-    middle = solids.centers_xz[solid]
-    own[..., [0, 2]] = (points[..., [0, 2]] - middle) @ turn.T + middle
-    return own
-
-
-def test_every_pixel_shows_the_nearest_face_of_the_room(room, cameras):
-    solids = room.solids
-    for camera in cameras[::4]:
-        seen = room.view_from(camera)
-        points = points_seen(camera, seen.depth)
-        for face in np.unique(seen.face):
-            solid, axis, side = face // 6, face % 6 // 2, face % 2
-            own = in_box(solids, solid, points[seen.face == face])
-            plane = (solids.high if side else solids.low)[solid, axis]
-            np.testing.assert_allclose(own[:, axis], plane, atol=1e-4)
-            assert (own > solids.low[solid] - 1e-4).all()
-            assert (own < solids.high[solid] + 1e-4).all()
-        for share in (0.3, 0.6, 0.9, 0.99):
-            between = camera.center_world + share * (points - camera.center_world)
-            for solid in range(1, len(solids.low)):
-                own = in_box(solids, solid, between)
-                inside = (own > solids.low[solid] + 1e-3) & (own < solids.high[solid] - 1e-3)
-                assert not inside.all(axis=-1).any()
 
 
 @pytest.mark.parametrize("subject", [1, 2])
@@ -111,26 +60,6 @@ def test_the_cameras_are_written_to_the_ground_truth_only(capture):
         world = shaped.with_pose(truth[row]).joints()
         view = camera.camera_from_world
         np.testing.assert_allclose(inside, world @ view[:3, :3].T + view[:3, 3], atol=1e-9)
-
-
-def test_true_cameras_and_none_see_the_same_person(capture):
-    true = capture / "truth" / "cameras.npz"
-    recordings = [
-        open_capture(CaptureInputs(video=capture, cameras=cameras)) for cameras in (str(true), None)
-    ]
-    assert [recording.cameras.is_moving for recording in recordings] == [True, False]
-    truth = read_motion(capture / "truth" / "poses.npz")
-    np.testing.assert_allclose(
-        recordings[0].motion.root_translations, truth.root_translations, atol=1e-9
-    )
-    for one, other in zip(*(each.observations() for each in recordings), strict=True):
-        assert isinstance(one, Observation)
-        assert isinstance(other, Observation)
-        pixels = [
-            seen.camera.project(which.shaped.with_pose(seen.pose).joints())
-            for seen, which in ((one, recordings[0]), (other, recordings[1]))
-        ]
-        np.testing.assert_allclose(*pixels, atol=1e-6)
 
 
 def test_a_painted_backdrop_is_refused_where_the_camera_moves(tmp_path):
