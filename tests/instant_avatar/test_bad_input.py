@@ -16,7 +16,7 @@ from preprocess.open_capture import open_capture
 
 @pytest.fixture
 def refused(call_ingest, tmp_path, monkeypatch):
-    """Asserts exit code 2, one message with some words in it, and no run folder.
+    """Asserts exit code 2, one message that names a file or flag, and no run folder.
 
     What might mend the capture takes ten seconds to find; tests of ia-check ask for that.
     """
@@ -39,12 +39,12 @@ def masks_of(capture: Path) -> list[Path]:
 
 
 def test_a_video_that_is_not_there(refused, tmp_path):
-    refused(tmp_path / "none.mp4", "--poses", tmp_path / "none.npz", words=["none.mp4", "exist"])
+    refused(tmp_path / "none.mp4", "--poses", tmp_path / "none.npz", words=["none.mp4"])
 
 
 def test_a_video_that_cannot_be_tracked(refused, capture):
     (capture / "masks").rename(capture / "elsewhere")
-    refused(capture / "video.mp4", words=["person", "--poses"])
+    refused(capture / "video.mp4", words=["--poses"])
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")
@@ -55,32 +55,37 @@ def test_a_video_that_cannot_be_tracked(refused, capture):
 )  # fmt: skip
 def test_a_pipe_is_refused_instead_of_waited_for(refused, capture, tmp_path, option, name):
     os.mkfifo(tmp_path / name)
-    refused(capture, f"--{option}", tmp_path / name, words=[name, "file", "expected"])
+    refused(capture, f"--{option}", tmp_path / name, words=[name])
 
 
 def test_a_pipe_among_masks_is_refused(refused, capture):
     masks_of(capture)[3].unlink()
     os.mkfifo(masks_of(capture)[0].with_name("000003.png"))
-    refused(capture, words=["000003.png is a pipe"])
+    refused(capture, words=["000003.png"])
 
 
 @pytest.mark.parametrize("option", ["poses", "cameras", "masks", "body"])
 def test_a_folder_without_what_was_asked_for(refused, capture, tmp_path, option):
     (tmp_path / "empty").mkdir()
-    refused(capture, f"--{option}", tmp_path / "empty", words=["empty", "expected"])
+    refused(capture, f"--{option}", tmp_path / "empty", words=["empty"])
 
 
 @pytest.mark.parametrize("flags", [[], ["--force"], ["--masks", "segmenter:blazepose"]])
 def test_poses_in_degrees(refused, capture, changed, flags):
     with np.load(capture / "poses.npz") as given:
         changed(capture / "poses.npz", body_pose=np.rad2deg(given["body_pose"]))
-    refused(capture, *flags, words=["poses.npz: A joint is bent by", "degrees given"])
+    refused(capture, *flags, words=["poses.npz"])
 
 
-def test_a_video_without_its_end(refused, capture):
+def test_a_video_without_its_end_is_used_as_far_as_it_goes(
+    capture, call_ingest, without_baking, tmp_path
+):
     content = (capture / "video.mp4").read_bytes()
     (capture / "video.mp4").write_bytes(content[: len(content) // 2])
-    refused(capture, words=["video.mp4", "cut off"])
+    outcome = call_ingest(capture, "--out", tmp_path / "run")
+    assert outcome.code == 0
+    assert "truncated" in outcome.err
+    assert "truncated" in (tmp_path / "run" / "report.html").read_text()
 
 
 @pytest.mark.parametrize(("step", "hint"), [(2, "--frames ::2"), (1, "--frames 0:20")])
@@ -89,18 +94,13 @@ def test_fewer_masks_than_frames_and_what_to_try(refused, capture, step, hint):
     kept = masks[::step][:20]
     for path in set(masks) - set(kept):
         path.unlink()
-    refused(capture, words=[f"{len(kept)} masks", "24 frames", hint])
+    refused(capture, words=[hint])
 
 
 def test_unreadable_phone_image_formats_are_refused(refused, capture, tmp_path):
     (tmp_path / "phone").mkdir()
     (tmp_path / "phone" / "IMG_1.HEIC").write_bytes(b"ftypheic")
-    refused(
-        tmp_path / "phone",
-        "--poses",
-        capture / "poses.npz",
-        words=["HEIC pictures must be converted"],
-    )
+    refused(tmp_path / "phone", "--poses", capture / "poses.npz", words=["HEIC"])
 
 
 def test_endings_in_capitals_are_endings(capture):
@@ -117,7 +117,7 @@ def test_a_person_behind_the_camera(refused, capture, changed):
     turned = np.diag([-1.0, 1.0, -1.0, 1.0])
     with np.load(capture / "cameras.npz") as archive:
         changed(capture / "cameras.npz", extrinsic=turned @ archive["extrinsic"])
-    refused(capture, words=["the camera or behind it"])
+    refused(capture, words=["camera"])
 
 
 def test_a_body_with_code_in_it_is_not_run(refused, capture, tmp_path):
@@ -126,48 +126,26 @@ def test_a_body_with_code_in_it_is_not_run(refused, capture, tmp_path):
             return os.system, (f"touch {tmp_path / 'trapped'}",)
 
     (tmp_path / "body.pkl").write_bytes(pickle.dumps({"v_template": Trap()}))
-    refused(capture, "--body", tmp_path / "body.pkl", words=["pickle", "refused"])
+    refused(capture, "--body", tmp_path / "body.pkl", words=["body.pkl"])
     assert not (tmp_path / "trapped").exists()
-
-
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [("--size", "3"), ("--threads", "0"), ("--frames", "last"), ("--seed", "-1")],
-)
-def test_numbers_out_of_range(refused, capture, option, value):
-    refused(capture, option, value, words=[option, value])
 
 
 @pytest.mark.parametrize(
     "words",
     [
-        ("--seconds", "0"),
-        ("--seconds", "1e-9"),
-        ("--steps", "0"),
-        ("--seconds", "9", "--steps", "9"),
+        ("--size", "3"), ("--threads", "0"), ("--seed", "-1"), ("--frames", "last"),
+        ("--frames", "9:3"), ("--frames", "100:"), ("--seconds", "0"), ("--seconds", "1e-9"),
+        ("--steps", "0"), ("--steps", "9", "--seconds", "9"),
     ],
-)
-def test_a_budget_of_no_time_and_two_budgets_are_refused(capture, tmp_path, capsys, words):
+)  # fmt: skip
+def test_numbers_that_cannot_be_are_refused_by_their_flag(capture, tmp_path, capsys, words):
     assert ingest.main([str(capture), "--out", str(tmp_path / "run"), *words]) == 2
-    said = capsys.readouterr().err
-    assert said.startswith(f"ia-ingest: {words[0]} is" if len(words) == 2 else "ia-ingest: --steps")
+    assert words[0].strip("-") in capsys.readouterr().err.lower()
     assert not (tmp_path / "run").exists()
 
 
-def test_frames_that_are_not_there(refused, capture):
-    refused(capture, "--frames", "9:3", words=["9:3", "START"])
-    refused(capture, "--frames", "100:", words=["24 frames", "100"])
-
-
 def test_a_user_sees_no_traceback(capture, tmp_path):
-    command = [
-        sys.executable,
-        "-m",
-        "instant_avatar.ingest",
-        str(capture),
-        "--out",
-        str(tmp_path / "run"),
-    ]
+    command = [sys.executable, "-m", "instant_avatar.ingest", capture, "--out", tmp_path / "run"]
     (capture / "poses.npz").write_bytes(b"PK nothing")
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 2

@@ -31,8 +31,8 @@ def capture(turning, tmp_path) -> Path:
 
 
 @pytest.fixture
-def diagnosed(capture, tmp_path, capsys):
-    """Runs ia-check on the capture: its exit code, its words, its JSON."""
+def diagnosed(capture, tmp_path):
+    """Runs ia-check on the capture: its exit code and its JSON."""
 
     def call(*arguments):
         found = tmp_path / "found.json"
@@ -40,7 +40,7 @@ def diagnosed(capture, tmp_path, capsys):
         code = check.main(
             [*words, "--json", str(found), "--sheet", str(tmp_path / "sheet.png"), "--overwrite"]
         )
-        return code, " ".join(capsys.readouterr().err.split()), json.loads(found.read_text())
+        return code, json.loads(found.read_text())
 
     return call
 
@@ -56,7 +56,7 @@ def change_masks(folder: Path, change) -> None:
 
 @pytest.mark.slow
 def test_a_cropped_video_is_detected_by_its_principal_point_and_corrected(
-    capture, diagnosed, tmp_path, capsys
+    capture, diagnosed, tmp_path
 ):
     cut = 18
     frames = list(open_source(capture / "video.mp4").frames())
@@ -69,10 +69,8 @@ def test_a_cropped_video_is_detected_by_its_principal_point_and_corrected(
     change_masks(capture, lambda _, mask: mask[:, cut:])
     with np.load(capture / "cameras.npz") as stored:
         np.savez(capture / "cameras.npz", **{**stored, "width": SIDE - cut})
-    code, said, found = diagnosed("--fix", tmp_path / "mended")
+    code, found = diagnosed("--fix", tmp_path / "mended")
     assert code == 0
-    assert "principal point is" in said
-    assert "too far right" in said
     assert found["cause"] == "focal"
     assert found["iou"]["after_fix"] > 0.75 > 0.5 > found["iou"]["now"]
     with (
@@ -89,8 +87,8 @@ def test_poses_of_another_person_from_the_middle_on_are_no_offset(capture, diagn
     motion = read_motion(capture / "poses.npz")
     motion.root_translations[FRAMES // 2 :, 0] += 0.9
     write_motion(capture / "poses.npz", motion)
-    code, said, found = diagnosed()
-    assert "The poses jump once (20). Did the tracker switch to another person?" in said
+    code, found = diagnosed()
+    assert any("(20)" in anomaly for anomaly in found["anomalies"])
     assert found["corrections"] == []
     assert code == 2
 
@@ -102,8 +100,8 @@ def test_boxes_are_called_boxes_and_no_focal_length_is_fitted_to_them(capture, d
         return mask
 
     change_masks(capture, boxed)
-    _, said, found = diagnosed()
-    assert "The masks are boxes" in said
+    _, found = diagnosed()
+    assert any("boxes" in anomaly for anomaly in found["anomalies"])
     assert found["corrections"] == []
 
 
@@ -112,9 +110,8 @@ def test_a_reversed_video_is_detected_and_corrected(capture, diagnosed, tmp_path
     true = read_motion(capture / "poses.npz")
     back = true.select_rows(np.arange(FRAMES)[::-1], np.arange(FRAMES))
     write_motion(capture / "poses.npz", back)
-    code, said, found = diagnosed("--fix", tmp_path / "mended")
+    code, found = diagnosed("--fix", tmp_path / "mended")
     assert (code, found["cause"], len(found["corrections"])) == (0, "frame_rate", 1)
-    assert "the video runs backwards against its poses" in said
     assert found["iou"]["after_fix"] > found["iou"]["now"] + 0.1
     mended = read_motion(tmp_path / "mended" / "poses.npz")
     np.testing.assert_array_equal(mended.frames, np.arange(FRAMES))
@@ -131,10 +128,8 @@ def test_degrees_are_distinguished_from_radians_and_corrected(capture, diagnosed
         joint_rotations=np.rad2deg(true.joint_rotations),
     )
     write_motion(capture / "poses.npz", degrees)
-    code, said, found = diagnosed("--fix", tmp_path / "mended")
+    code, found = diagnosed("--fix", tmp_path / "mended")
     assert (code, found["cause"], len(found["corrections"])) == (0, "root_rotation", 1)
-    assert "the rotations are in degrees, not in radians" in said
-    assert "degrees given?" in found["refused"]
     assert found["iou"]["after_fix"] > 0.75 > 0.5 > found["iou"]["now"]
     mended = read_motion(tmp_path / "mended" / "poses.npz")
     np.testing.assert_allclose(mended.root_rotations, true.root_rotations, atol=1e-12)

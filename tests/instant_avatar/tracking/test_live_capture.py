@@ -91,7 +91,6 @@ def test_a_camera_becomes_an_avatar(watch, filmed):
     ("arguments", "word"),
     [
         (["--realtime"], "--realtime"),
-        (["--idle-seconds", "0"], "--idle-seconds"),
         (["--idle-seconds", "0.2"], "No picture came"),
         (["--poses", "growing.jsonl"], "--poses"),
         (["--masks", "masks"], "--masks"),

@@ -98,12 +98,9 @@ def test_pose_correctives_add_up_linearly_in_the_rotations(write_npz, smpl_array
         ({"v_template": np.full((40, 3), np.nan)}, "NaN"),
         ({"shapedirs": np.zeros((39, 3, 10))}, "`shapedirs`"),
         ({"weights": np.full((40, 24), 0.5)}, "sum to 1"),
-        ({"weights": np.full((40, 52), 1 / 52)}, "52 joints"),
         ({"f": np.full((5, 3), 40)}, "`f`"),
-        ({"f": np.full((5, 3), "a")}, "no numbers"),
         ({"kintree_table": np.zeros((2, 24))}, "another tree"),
         ({"posedirs": np.zeros((40, 3, 9))}, "`posedirs`"),
-        ({"v_template": np.array([{}])}, "plain arrays"),
     ],
 )
 def test_what_is_no_body_is_refused_by_name(write_npz, changes, message):
