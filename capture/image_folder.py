@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from capture.input_error import InputError
-from capture.source import Frame, FrameSelection, Recording
+from capture.source import ASSUMED_FPS, Frame, FrameSelection, Recording
 
 LOG_LEVEL_SILENT = 0
 """OpenCV's log level that prints nothing: our messages explain what is wrong with a file."""
@@ -58,9 +58,6 @@ ALPHA_SUFFIXES = frozenset({".png", ".webp", ".bmp", ".tif", ".tiff"})
 
 MIN_TRANSPARENT_FRACTION = 0.01
 """Fraction of transparent pixels from which an alpha channel is a mask (not rounded corners)."""
-
-ASSUMED_FPS = 30.0
-"""Frame rate of a folder, whose images have no timestamps; 1/s."""
 
 
 def natural_sort_key(path: Path) -> list[tuple[int, str]]:

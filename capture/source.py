@@ -12,6 +12,9 @@ from jaxtyping import UInt8
 
 from capture.input_error import InputError
 
+ASSUMED_FPS = 30.0
+"""Frames or poses per second where no file says: folders of images, poses without times."""
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Frame:

@@ -18,7 +18,13 @@ from export.gltf import SkeletonAnimation, encode_glb
 from export.package.manifest import Manifest
 from export.package.package_file import read_package
 from export.skinned_mesh import SkinnedMesh, extract_mesh
-from instant_avatar.animation.driving_motion import demo_motion, load_driving_motion, pose_rate
+from instant_avatar.animation.driving_motion import (
+    DISTANCE_HEIGHTS,
+    PERSON_HEIGHT_SHARE,
+    demo_motion,
+    load_driving_motion,
+    pose_rate,
+)
 from instant_avatar.cli.command_line import (
     DONE,
     NO_AVATAR,
@@ -40,10 +46,6 @@ VIEW_PX = 256
 """Width and height of a synthetic view."""
 MIN_TRIANGLES = 500
 """Least --triangles; below it a hand is a lump."""
-DISTANCE_HEIGHTS = 3.5
-"""Distance of the camera, in heights of the person."""
-PERSON_HEIGHT_SHARE = 0.8
-"""Height of the person as a fraction of the image height."""
 
 
 @dataclass(frozen=True, kw_only=True)

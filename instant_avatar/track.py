@@ -38,6 +38,7 @@ from instant_avatar.cli.shared_options import (
     parse_frame_range,
     unused_path,
 )
+from instant_avatar.contact_sheet import BODY_COLOR, MASK_COLOR
 from instant_avatar.run.person_tracking import masks_to_use, print_grade, track_person
 from instant_avatar.run.run_folder import RunFolder, claim_folder
 from preprocess.body.body_surface import SkinPoints, splat_silhouette
@@ -223,12 +224,10 @@ SILHOUETTE_PX = 256
 """Longer side of the images in which the body's outline is found, px."""
 LEFT_COLOR, RIGHT_COLOR, MIDDLE_COLOR = (255, 150, 40), (60, 190, 255), (240, 240, 240)
 """RGB colors of the person's left and right limbs, and of trunk and head."""
-MASK_COLOR, BODY_COLOR, DOUBT_COLOR = (255, 255, 255), (255, 120, 0), (255, 60, 60)
-"""RGB colors of the mask's outline, the body's outline, and of doubts."""
+DOUBT_COLOR = (255, 60, 60)
+"""RGB color of doubts."""
 LEFT_JOINTS = frozenset({1, 4, 7, 10, 13, 16, 18, 20, 22})
-"""Joints of SMPL's tree on the person's left."""
-RIGHT_JOINTS = frozenset({2, 5, 8, 11, 14, 17, 19, 21, 23})
-"""Joints of SMPL's tree on the person's right."""
+"""Joints of SMPL's tree on the person's left; the next one is that on the right."""
 
 Rgb = UInt8[np.ndarray, "height width 3"]
 
@@ -277,7 +276,7 @@ def _film_size_px(size_px: tuple[int, int]) -> tuple[int, int]:
 def _joint_color(joint: int) -> tuple[int, int, int]:
     if joint in LEFT_JOINTS:
         return LEFT_COLOR
-    return RIGHT_COLOR if joint in RIGHT_JOINTS else MIDDLE_COLOR
+    return RIGHT_COLOR if joint - 1 in LEFT_JOINTS else MIDDLE_COLOR
 
 
 def _draw_bone(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
+from jaxtyping import UInt8
 
 from avatar.config import TrainConfig
 from avatar.correspondence_grid import CorrespondenceGrid
@@ -20,6 +21,7 @@ from capture.camera import Camera
 from capture.source import Frame
 from instant_avatar.studio import staging
 from instant_avatar.studio.actor import Actor
+from instant_avatar.studio.lighting import composite_over
 from instant_avatar.studio.staging import static_camera
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.parametric_body import ShapedBody, load_body_model
@@ -116,13 +118,21 @@ class Clip:
     novel: Observation
 
 
+def render_on_white(
+    actor: Actor, pose: BodyPose, camera: Camera
+) -> tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"]]:
+    """The person in front of white, and the soft mask."""
+    rgb, alpha = actor.render_rgb_alpha(pose, camera)
+    return composite_over(rgb, alpha), (alpha * 255.0 + 0.5).astype(np.uint8)
+
+
 @pytest.fixture(scope="session")
 def clip() -> Clip:
     actor = Actor.of(1, 0)
     camera = static_camera(actor, 72)
 
     def observed(index: int, pose: BodyPose) -> Observation:
-        rgb, alpha = actor.render_over(pose, camera)
+        rgb, alpha = render_on_white(actor, pose, camera)
         frame = Frame(index=index, time_s=index / 30.0, rgb=rgb)
         return Observation(
             frame=frame, alpha=alpha.astype(np.float32) / 255.0, pose=pose, camera=camera

@@ -7,6 +7,7 @@ import numpy as np
 
 from capture.camera import Camera
 from capture.input_error import InputError
+from capture.source import ASSUMED_FPS
 from export.player import Player
 from instant_avatar.animation.driving_motion import (
     FollowingCamera,
@@ -17,10 +18,6 @@ from instant_avatar.animation.driving_motion import (
 from instant_avatar.animation.play_arguments import DEFAULT_SIZE_PX, PlayArguments
 from instant_avatar.cli.console import Console
 from preprocess.body.body_pose import BodyPose
-
-TURNTABLE_FPS = 30.0
-"""Frames per second of a turntable around a still pose."""
-
 
 Shot = tuple[BodyPose, Camera]
 """Pose and camera of one image."""
@@ -49,7 +46,7 @@ def plan_render(
                 "valid."
             )
         motion = replace(motion, valid=np.arange(len(motion)) == row)  # the camera faces this pose
-        fps, count = min(arguments.fps or TURNTABLE_FPS, max_fps), 1
+        fps, count = min(arguments.fps or ASSUMED_FPS, max_fps), 1
         if arguments.turntable is not None and not is_image:
             count = max(1, round(abs(arguments.turntable) * fps))
         poses, rows = [motion[row]] * count, [row] * count

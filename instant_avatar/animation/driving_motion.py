@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 
 from capture.camera import Camera
 from capture.input_error import InputError
+from capture.source import ASSUMED_FPS
 from export.player import Player
 from instant_avatar.animation.play_arguments import CLOSE_UP_ZOOM, Viewpoint
 from instant_avatar.cli.console import Console
@@ -27,9 +28,9 @@ from preprocess.poses.pose_format_registry import read_poses
 def pose_rate(motion: Motion) -> float:
     """Return the poses per second of a motion, by its times; 30 without plausible times."""
     if motion.times_s is None or len(motion) < 2:
-        return 30.0
+        return ASSUMED_FPS
     step = float(np.median(np.diff(motion.times_s)))
-    return round(1.0 / step, 3) if 1.0 / 240.0 <= step <= 10.0 else 30.0
+    return round(1.0 / step, 3) if 1.0 / 240.0 <= step <= 10.0 else ASSUMED_FPS
 
 
 # limbs that the built-in motion moves, and their SMPL joints

@@ -19,7 +19,9 @@ from jaxtyping import Float, UInt8
 
 from avatar.rig import canonical_rotations
 from capture.camera import Camera
+from capture.source import ASSUMED_FPS
 from instant_avatar.animation.driving_motion import demo_motion
+from instant_avatar.animation.web_server import HOST
 from instant_avatar.report.report_schema import CurvePoint
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.kinematics import rotation_matrices
@@ -30,8 +32,6 @@ NEWEST, STANDING, FILMED, DANCE = "Newest", "Standing", "Filmed", "Dance"
 """Labels of the buttons."""
 POSE_CHOICES = (NEWEST, STANDING, FILMED, DANCE)
 """Buttons in order."""
-DEFAULT_FPS = 30.0
-"""Frame rate of a motion without times."""
 
 
 @final
@@ -90,7 +90,7 @@ def _row_at(motion: Motion, seconds: float) -> int:
     """Return the row of a motion that is shown after `seconds`."""
     times = motion.times_s
     if times is None or len(times) < 2 or not np.isfinite(times).all() or times[-1] <= times[0]:
-        return int(seconds * DEFAULT_FPS) % len(motion)
+        return int(seconds * ASSUMED_FPS) % len(motion)
     # n poses span n - 1 intervals; the loop lasts n, so that the last pose is shown, too
     length = (times[-1] - times[0]) * len(times) / (len(times) - 1)
     return int(np.searchsorted(times - times[0], seconds % length, side="right")) - 1
@@ -106,8 +106,6 @@ def _axis_angle(rotation: np.ndarray) -> np.ndarray:
 if TYPE_CHECKING:  # an optional extra, loaded when the page is opened
     import viser  # pyright: ignore[reportMissingImports]
 
-HOST = "127.0.0.1"
-"""Loopback address: only browsers of this machine reach the page."""
 PANEL_PX = 380
 """Width of the panel."""
 FRAME_PX = (720, 440)

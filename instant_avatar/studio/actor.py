@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import final
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
+from jaxtyping import Bool, Float, Float32, Int, Int32
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, KDTree
@@ -18,7 +18,6 @@ from capture.camera import Camera
 from instant_avatar.studio.lighting import (
     LAMP_STRENGTH,
     bake_light,
-    composite_over,
     rasterize,
     shade_pixels,
 )
@@ -371,16 +370,6 @@ class Actor:
             measures=cut,
             checked=self.outfit.checked,
         )
-
-    def render_over(
-        self,
-        pose: BodyPose,
-        camera: Camera,
-        background: UInt8[np.ndarray, "height width 3"] | None = None,
-    ) -> tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"]]:
-        """Return the person in front of a background (white if None), and the soft mask."""
-        rgb, alpha = self.render_rgb_alpha(pose, camera)
-        return composite_over(rgb, alpha, background), (alpha * 255.0 + 0.5).astype(np.uint8)
 
     def with_baked_light(self, lamp_strength: float = LAMP_STRENGTH) -> "Actor":
         """Paint on the light of the A-pose; without the lamp the sky's light remains."""

@@ -201,16 +201,6 @@ def _set_on_floor(actor: Actor, pose: BodyPose, hop: float) -> BodyPose:
     return replace(pose, root_translation=pose.root_translation + lifted)
 
 
-def nearest_pose_angles(novel: Motion, filmed: Motion) -> Float[np.ndarray, "poses"]:
-    """Return each pose's distance to the nearest filmed one: the largest joint angle, radians."""
-    gaps = []
-    for pose in novel.joint_rotations:
-        difference = Rotation.from_rotvec(filmed.joint_rotations.reshape(-1, 3)).inv()
-        angle = (difference * Rotation.from_rotvec(np.tile(pose, (len(filmed), 1)))).magnitude()
-        gaps.append(angle.reshape(len(filmed), 23).max(axis=1).min())
-    return np.array(gaps)
-
-
 STATIC_DISTANCE_M = 3.2
 STATIC_HEIGHT_M = 1.2
 

@@ -216,12 +216,18 @@ def sanity_warnings(geometry: CaptureGeometry, frames: list[int]) -> Iterator[st
 
 
 def view_coverage(geometry: CaptureGeometry) -> float:
-    """Fraction of the `VIEW_SECTORS` around the body from which a camera sees it."""
+    """Fraction of the directions around the body from which a camera sees it."""
     valid = geometry.motion.valid
     roots = Rotation.from_rotvec(geometry.motion.root_rotations[valid])
     eyes = geometry.camera_centers()[geometry.camera_rows()[valid]]
     seen = roots.inv().apply(eyes - geometry.motion.root_translations[valid])
-    sector = np.floor((np.arctan2(seen[:, 0], seen[:, 2]) / (2.0 * np.pi) + 0.5) * VIEW_SECTORS)
+    return view_sector_share(seen)
+
+
+def view_sector_share(to_cameras: Float[np.ndarray, "views 3"]) -> float:
+    """Fraction of the `VIEW_SECTORS` around the body that directions in its axes point to."""
+    angle = np.arctan2(to_cameras[:, 0], to_cameras[:, 2]) / (2.0 * np.pi)
+    sector = np.floor((angle + 0.5) * VIEW_SECTORS)
     return len(np.unique(sector.clip(0, VIEW_SECTORS - 1))) / VIEW_SECTORS
 
 

@@ -25,7 +25,6 @@ from preprocess.fitting.clip_poses import ClipPoses
 from preprocess.fitting.keypoint_rows import KEYPOINT_JOINTS, KEYPOINT_OFFSETS_M, PIXEL_WEIGHTS
 from preprocess.masks.color_models import DarkFilmBrightener
 from preprocess.observation import alpha_channel_mask
-from preprocess.tracking.blazepose import MIN_PRESENCE
 from preprocess.tracking.blazepose_networks import (
     BlazePoseDetector,
     BlazePoseLandmarks,

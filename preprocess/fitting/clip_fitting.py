@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from capture.camera import Camera
+from capture.source import ASSUMED_FPS
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.fitting.clip_poses import POSE_SIGMA, ClipPoses, GivenPosePrior, HumanPosePrior
@@ -37,8 +38,6 @@ MAX_PLACE_STEP_M = 0.5
 """Largest change of the root's place in one iteration, metres."""
 MAX_LOG_FOCAL_STEP = 0.1
 """Largest change of the logarithm of the focal length in one iteration."""
-USUAL_FPS = 30.0
-"""Frames per second of a video that does not say."""
 HELD_PRECISION = 1e9
 """Precision that holds a parameter that is not fitted."""
 
@@ -250,5 +249,5 @@ def _times_s(
 ) -> Float[np.ndarray, "frames"]:
     """Times of frames, of which each may lie between those of the key points."""
     if track.times_s is None:
-        return numbers / USUAL_FPS
+        return numbers / ASSUMED_FPS
     return np.interp(numbers, track.frames, track.times_s)

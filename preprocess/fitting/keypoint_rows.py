@@ -16,7 +16,7 @@ from capture.camera import Camera
 from preprocess.body.kinematics import descendant_matrix
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.fitting.clip_poses import ClipPoses, PosedJoints
-from preprocess.tracking.keypoints import KeypointTrack
+from preprocess.tracking.keypoints import HIPS, MIN_PRESENCE, KeypointTrack
 
 KEYPOINT_JOINTS = np.array(
     [15, 15, 15, 15, 15, 15, 15, 15, 15, 15, 15, 16, 17, 18, 19, 20, 21, 20, 21, 20, 21, 20, 21,
@@ -53,8 +53,6 @@ NEARER_M = ((11, 12, 0.06), (13, 14, 0.10), *((hand, hand + 1, 0.135) for hand i
 by how much, metres: shoulders, elbows, wrists, hands. Means of five videos, all of one sign."""
 ROBUST_DEPTH = 3.0
 """Standard deviations at which a difference in depth counts a quarter."""
-MIN_PRESENCE = 0.5
-"""Probability of a person below which a frame's key points are not used."""
 RATIO_BONES = ((11, 13, 16, 18), (12, 14, 17, 19), (13, 15, 18, 20), (14, 16, 19, 21),
                (23, 25, 1, 4), (24, 26, 2, 5), (25, 27, 4, 7), (26, 28, 5, 8))  # fmt: skip
 """Two key points and the joints next to them, whose distances tell the points' scale."""
@@ -127,7 +125,7 @@ class ClipKeypoints:
         center = np.array([each.center_px for each in cameras])
         focal = np.array([each.focal_px for each in cameras])
         view = np.concatenate(
-            [(pixels[:, [23, 24]].mean(axis=1) - center) / focal, np.ones((len(rows), 1))], axis=1
+            [(pixels[:, HIPS].mean(axis=1) - center) / focal, np.ones((len(rows), 1))], axis=1
         )
         view /= np.linalg.norm(view, axis=1, keepdims=True) * (-1.0, -1.0, 1.0)
         # the points' own z axis is the view of the person's middle

@@ -29,10 +29,8 @@ OUTLINE_SKIN_POINTS = 7000
 """Points on the skin: about one per pixel of a person `OUTLINE_PERSON_PX` high."""
 SPLAT_GROWTH_PX = 0.5
 """Reach of a splatted silhouette beyond the outline: it has every pixel that is touched."""
-MASK_BORDER_POINTS = 160
-"""Points of a mask's border that are compared."""
-SKIN_BORDER_POINTS = 160
-"""Points of the skin's outline that are compared."""
+BORDER_POINTS = 160
+"""Points of the borders of mask and skin that are compared."""
 MAX_RIM_COSINE = 0.2
 """Cosine between normal and view up to which a skin point is on the rim."""
 MAX_RIM_DEPTH_PX = 2.0
@@ -69,7 +67,7 @@ class OutlineDistances:
         height, width = alpha.shape
         away = np.minimum(border, (width, height) - border).min(axis=1)
         border = border[away > IMAGE_BORDER_PX]
-        border = border[np.linspace(0, len(border), MASK_BORDER_POINTS, endpoint=False).astype(int)]
+        border = border[np.linspace(0, len(border), BORDER_POINTS, endpoint=False).astype(int)]
         value, slope = _sample(distance, border)
         return cls(
             camera=camera, distance=distance, border=border - value[:, None] * slope, normals=slope
@@ -170,7 +168,7 @@ class OutlineModel:
         within = depth_px[outer] + SPLAT_GROWTH_PX  # rim points lie a little inside the outline
         if len(chosen) < 16:
             return chosen, _Matches.none()
-        some = np.linspace(0, len(chosen), min(SKIN_BORDER_POINTS, len(chosen)), endpoint=False)
+        some = np.linspace(0, len(chosen), min(BORDER_POINTS, len(chosen)), endpoint=False)
         some = some.astype(int)
         value, slope = _sample(mask.distance, pixels[some])
         height, width = mask.distance.shape

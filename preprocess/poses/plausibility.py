@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from capture.input_error import InputError
+from capture.source import ASSUMED_FPS
 from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import rotation_matrices
 
@@ -34,8 +35,6 @@ MAX_DETOUR_RAD = 0.25
 """Largest deviation of the root from its usual speed between the poses around a flip."""
 MAX_FLIP_SHARE = 0.1
 """Largest share of flipped poses; if there are more, these are no frames of a video."""
-ASSUMED_FPS = 30.0
-"""Rate that is assumed where poses have times but no frame numbers."""
 
 
 def require_plausible(motion: Motion, path: Path | str) -> Motion:

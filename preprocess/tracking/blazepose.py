@@ -31,9 +31,9 @@ from preprocess.tracking.blazepose_networks import (
     PersonDetection,
     PersonSquare,
 )
-from preprocess.tracking.keypoints import CroppedMask, PersonKeypoints
+from preprocess.tracking.keypoints import HIPS, MIN_PRESENCE, CroppedMask, PersonKeypoints
 
-SHOULDERS, HIPS, KNEES = (11, 12), (23, 24), (25, 26)
+SHOULDERS, KNEES = (11, 12), (25, 26)
 """Numbers of key points, left and right."""
 ACROSS = np.linspace(0.2, 0.8, 8)
 ALONG = np.linspace(0.1, 0.9, 12)
@@ -95,8 +95,6 @@ def colors_of(
     return np.concatenate(colors).astype(np.float64)
 
 
-MIN_PRESENCE = 0.5
-"""Least probability of a person in the square; below it the person is lost."""
 MAX_STEP = 0.2
 """Farthest that a person moves in one frame, in sides of the square; farther is someone else."""
 MAX_GROWTH = 1.4

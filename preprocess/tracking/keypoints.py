@@ -16,6 +16,10 @@ from capture.input_error import InputError
 
 KEYPOINT_COUNT = 33
 """Number of key points of a person."""
+HIPS = (23, 24)
+"""Key points of the left and the right hip."""
+MIN_PRESENCE = 0.5
+"""Probability of a person below which a frame's key points are not used."""
 KEYPOINT_SHAPES = {
     "keypoint_frames": (-1,), "keypoints_px": (-1, 33, 2), "keypoints_m": (-1, 33, 3),
     "keypoint_visibility": (-1, 33), "keypoint_presence": (-1,), "keypoint_image_size": (2,),

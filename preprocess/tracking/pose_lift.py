@@ -18,7 +18,7 @@ from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.poses.motion_builder import fill_gaps, place_by_pixels
-from preprocess.tracking.keypoints import KeypointTrack
+from preprocess.tracking.keypoints import HIPS, MIN_PRESENCE, KeypointTrack
 
 LEFT_POINTS = (1, 2, 3, *range(7, 33, 2))
 """The person's left key points."""
@@ -32,9 +32,7 @@ MAX_STRETCH_FRAMES = 15
 """Longest stretch that is repaired, frames."""
 MAX_GAP_FRAMES = 3
 """Frames between two rows beyond which they are not compared."""
-MIN_PRESENCE = 0.5
-"""Probability of a person below which a frame's key points are not used."""
-TRUNK_POINTS = (11, 12, 23, 24)
+TRUNK_POINTS = (11, 12, *HIPS)
 """Shoulders and hips."""
 TRUNK_JOINTS = (16, 17, 1, 2)
 """The joints next to them."""
@@ -52,20 +50,19 @@ PLACED_POINTS = (23, 24, 25, 26, 27, 28, 11, 12, 13, 14, 15, 16)
 """Their key points."""
 
 
-def repair_swaps(track: KeypointTrack) -> tuple[KeypointTrack, Bool[np.ndarray, "rows"]]:
-    """Exchange left and right in short stretches that both sides contradict; and those rows."""
+def repair_swaps(track: KeypointTrack) -> KeypointTrack:
+    """Exchange left and right in short stretches that both sides contradict."""
     swapped = find_swaps(track)
     mirrored = np.arange(33)
     mirrored[list(LEFT_POINTS)], mirrored[list(RIGHT_POINTS)] = RIGHT_POINTS, LEFT_POINTS
     order = np.where(swapped[:, None], mirrored, np.arange(33))
     rows = np.arange(len(track))[:, None]
-    repaired = replace(
+    return replace(
         track,
         image_px=track.image_px[rows, order],
         world_m=track.world_m[rows, order],
         visibility=track.visibility[rows, order],
     )
-    return repaired, swapped
 
 
 def find_swaps(track: KeypointTrack) -> Bool[np.ndarray, "rows"]:
@@ -75,15 +72,15 @@ def find_swaps(track: KeypointTrack) -> Bool[np.ndarray, "rows"]:
     flat = across.reshape(len(track), -1)
     near = np.diff(track.frames) <= MAX_GAP_FRAMES
     turns = np.flatnonzero(near & (_cosines(flat) < MAX_COSINE)) + 1
-    found = np.zeros(len(track), dtype=bool)
+    swapped = np.zeros(len(track), dtype=bool)
     bounds = [0, *turns.tolist(), len(track)]
     for index in range(1, len(bounds) - 2):
         start, stop = bounds[index], bounds[index + 1]
         length = stop - start
         beside = min(start - bounds[index - 1], bounds[index + 2] - stop)
-        if length <= min(MAX_STRETCH_FRAMES, beside) and not found[start - 1]:
-            found[start:stop] = True
-    return found
+        if length <= min(MAX_STRETCH_FRAMES, beside) and not swapped[start - 1]:
+            swapped[start:stop] = True
+    return swapped
 
 
 def _cosines(rows: Float[np.ndarray, "rows n"]) -> Float[np.ndarray, "gaps"]:
@@ -98,7 +95,7 @@ def lift_keypoints(track: KeypointTrack, shaped: ShapedBody, camera: Camera) -> 
     The camera is that of all frames, of their size, at the world's origin. The motion has a row for
     each frame with a person or in a short gap, and holds the key points and the camera's K.
     """
-    track, _ = repair_swaps(track)
+    track = repair_swaps(track)
     poses = [
         _lift(track.image_px[row], track.world_m[row], shaped, camera) for row in range(len(track))
     ]

@@ -11,10 +11,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from capture.camera import Camera
+from preprocess.alignment.capture_geometry import MIN_VIEW_COVERAGE, view_sector_share
 from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import rotation_matrices
 from preprocess.body.parametric_body import ShapedBody
-from preprocess.tracking.keypoints import KeypointTrack
+from preprocess.tracking.keypoints import HIPS, KeypointTrack
 from preprocess.tracking.video_tracking import PROBLEM_BITS, TrackingProblem
 
 MIN_IOU = 0.7
@@ -39,10 +40,6 @@ MIN_STRETCH_FRAMES = 3
 """Fewest frames of a doubtful stretch that is reported."""
 MIN_FRAMES = 4
 """Fewest frames with the person of poses that are good enough for an avatar."""
-FEW_DIRECTIONS = 0.5
-"""Share of the directions below which the verdict says that the avatar will be one-sided."""
-DIRECTIONS = 12
-"""Directions, 30 degrees each, from which the camera may see the person."""
 BREADTHS = (0.78, 1.17)
 """Least and largest breadth of shoulders and hips to the height, relative to the mean body's: in 40
 videos 0.82 to 1.10, in videos stretched by a third 1.3."""
@@ -106,29 +103,29 @@ class TrackingGrade:
     @property
     def objections(self) -> tuple[str, ...]:
         """Reasons why the poses are not good enough for an avatar; empty if they are."""
-        found = []
+        objections = []
         if self.found_share < MIN_FOUND_SHARE:
-            found.append(f"the person was found in only {self.found_share:.0%} of the frames")
+            objections.append(f"the person was found in only {self.found_share:.0%} of the frames")
         count = round(self.found_share * self.frames)
         if count < MIN_FRAMES:
-            found.append(f"too few frames show the person: {count} (expected {MIN_FRAMES})")
+            objections.append(f"too few frames show the person: {count} (expected {MIN_FRAMES})")
         if self.iou_mean < MIN_IOU:
-            found.append(
+            objections.append(
                 f"body and masks agree by an IoU of only {self.iou_mean:.2f} (expected {MIN_IOU})"
             )
         if self.doubtful_share > MAX_DOUBTFUL_SHARE:
-            found.append(f"{self.doubtful_share:.0%} of the frames are doubtful")
+            objections.append(f"{self.doubtful_share:.0%} of the frames are doubtful")
         if self.person_px < MIN_PERSON_PX:
-            found.append(
+            objections.append(
                 f"the person is only {self.person_px:.0f} px tall (expected {MIN_PERSON_PX:.0f})"
             )
         if not BREADTHS[0] <= self.breadth <= BREADTHS[1]:
             which = "broad" if self.breadth > 1.0 else "narrow"
-            found.append(
+            objections.append(
                 f"the body is too {which}, {self.breadth:.2f} times the usual (the pictures may be "
                 "stretched: convert the video to its right width and height)"
             )
-        return tuple(found)
+        return tuple(objections)
 
     @property
     def is_good_enough(self) -> bool:
@@ -150,15 +147,15 @@ class TrackingGrade:
         if not self.is_good_enough:
             why = "; and ".join(self.objections)
             return f"Good enough for an avatar: no, because {why}. The person was {scores}."
-        told = f"Good enough for an avatar: yes, because the person was {scores}."
-        if self.directions_seen < FEW_DIRECTIONS:
-            told += " The sides that the camera never saw will be guesses: let the person turn."
+        verdict = f"Good enough for an avatar: yes, because the person was {scores}."
+        if self.directions_seen < MIN_VIEW_COVERAGE:
+            verdict += " The sides that the camera never saw will be guesses: let the person turn."
         if self.left_out:
-            told += (
+            verdict += (
                 f" {len(self.left_out)} frames in which another person is near, or body and mask "
                 "disagree, are left out."
             )
-        return told
+        return verdict
 
     def as_json(self) -> dict[str, Any]:
         """Figures for a report; NaN becomes null."""
@@ -229,12 +226,12 @@ def _reasons_by_frame(
         for number in keypoints.frames[rows].tolist():
             reasons.setdefault(int(number), []).append(reason)
 
-    found = set(keypoints.frames.tolist())
+    tracked = set(keypoints.frames.tolist())
     for number in frame_times_s:
-        if number not in found:
+        if number not in tracked:
             reasons[number] = ["the person was not found"]
     for number, iou in iou_of_frame.items():
-        if iou < DOUBTFUL_IOU and number in found:
+        if iou < DOUBTFUL_IOU and number in tracked:
             reasons.setdefault(number, []).append("body and mask disagree")
     for problem, bit in PROBLEM_BITS.items():
         if keypoints.problems is not None:
@@ -253,10 +250,10 @@ def _frames_to_leave_out(
 ) -> tuple[int, ...]:
     """Frames in which another person is near, or body and mask disagree; none if most are such."""
     numbers = keypoints.frames
-    found = np.array([iou_of_frame.get(int(each), 1.0) < DOUBTFUL_IOU for each in numbers], bool)
+    doubtful = np.array([iou_of_frame.get(int(each), 1.0) < DOUBTFUL_IOU for each in numbers], bool)
     if keypoints.problems is not None:
-        found |= (keypoints.problems & PROBLEM_BITS[TrackingProblem.CROWDED]) > 0
-    return tuple(numbers[found].tolist()) if found.sum() <= 0.5 * len(found) else ()
+        doubtful |= (keypoints.problems & PROBLEM_BITS[TrackingProblem.CROWDED]) > 0
+    return tuple(numbers[doubtful].tolist()) if doubtful.sum() <= 0.5 * len(doubtful) else ()
 
 
 def _jumps(keypoints: KeypointTrack) -> Bool[np.ndarray, "rows"]:
@@ -264,7 +261,7 @@ def _jumps(keypoints: KeypointTrack) -> Bool[np.ndarray, "rows"]:
     jumps = np.zeros(len(keypoints), dtype=bool)
     if len(keypoints) < MIN_SPEED_FRAMES:
         return jumps
-    hips = keypoints.image_px[:, [23, 24]].mean(axis=1)
+    hips = keypoints.image_px[:, HIPS].mean(axis=1)
     tall = max(1.0, float(np.median(np.ptp(keypoints.image_px[:, :, 1], axis=1))))
     way = np.linalg.norm(np.diff(hips, axis=0), axis=1) / tall / np.diff(keypoints.frames)
     cut = way > max(JUMP_HEIGHTS, JUMP_STEPS * float(np.median(way)))
@@ -286,7 +283,7 @@ def _speed(
     """Speed of a key point relative to the hips, median body heights per second."""
     if len(keypoints) < 2:
         return np.zeros(len(keypoints))
-    hips = keypoints.image_px[:, [23, 24]].mean(axis=1)
+    hips = keypoints.image_px[:, HIPS].mean(axis=1)
     place = keypoints.image_px[:, point] - hips
     times = np.array([frame_times_s[int(number)] for number in keypoints.frames])
     span = np.maximum(np.diff(times), 1e-3)
@@ -314,24 +311,21 @@ def _jitter_mm(motion: Motion, shaped: ShapedBody) -> float:
 def _directions_seen(motion: Motion, camera: Camera) -> float:
     """Share of the horizontal directions around the person from which the camera saw it."""
     turned = camera.camera_from_world[:3, :3] @ rotation_matrices(motion.root_rotations)
-    to_camera = -turned[:, 2]  # the view's axis, in the axes of the body
-    angle = np.arctan2(to_camera[:, 0], to_camera[:, 2])[motion.valid]
-    bins = np.floor((angle / (2.0 * np.pi)) % 1.0 * DIRECTIONS).astype(int)
-    return len(np.unique(bins)) / DIRECTIONS
+    return view_sector_share(-turned[motion.valid, 2])  # the view's axis, in the body's axes
 
 
 def _stretches(
     numbers: list[int], frame_times_s: Mapping[int, float], reasons: Mapping[int, list[str]]
 ) -> Iterator[DoubtfulStretch]:
     """Doubtful frames joined to stretches with one reason each, by their start."""
-    found: list[DoubtfulStretch] = []
+    stretches: list[DoubtfulStretch] = []
     for reason in dict.fromkeys(each for number in numbers for each in reasons.get(number, [])):
         rows = [number for number in numbers if reason in reasons.get(number, [])]
         groups: list[list[int]] = []
         for number in rows:
             near = groups and frame_times_s[number] - frame_times_s[groups[-1][-1]] <= BRIDGED_S
             groups[-1].append(number) if near else groups.append([number])
-        found += [
+        stretches += [
             DoubtfulStretch(
                 start_s=round(frame_times_s[group[0]], 2),
                 end_s=round(frame_times_s[group[-1]], 2),
@@ -343,4 +337,4 @@ def _stretches(
             or len(numbers) < 4 * MIN_STRETCH_FRAMES
             or reason == JUMPED
         ]
-    return iter(sorted(found, key=lambda each: (each.start_s, each.reason)))
+    return iter(sorted(stretches, key=lambda each: (each.start_s, each.reason)))

@@ -37,6 +37,7 @@ from instant_avatar.studio import staging
 from instant_avatar.studio.actor import Actor
 from instant_avatar.studio.staging import static_camera
 from preprocess.observation import Observation
+from tests.avatar_fixtures import render_on_white
 
 # --- a plane that is grazed -------------------------------------------------------------------
 
@@ -167,7 +168,7 @@ def filmed(size: int) -> Filmed:
     poses = staging.turning_motion(actor, frames=20, fps=30.0, turns=1.0, seed=0)
     observations = []
     for index in range(len(poses)):
-        rgb, alpha = actor.render_over(poses[index], camera)
+        rgb, alpha = render_on_white(actor, poses[index], camera)
         frame = Frame(index=index, time_s=index / 30.0, rgb=rgb)
         mask = alpha.astype(np.float32) / 255.0
         observations.append(Observation(frame=frame, alpha=mask, pose=poses[index], camera=camera))

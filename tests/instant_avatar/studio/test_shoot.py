@@ -16,6 +16,7 @@ from instant_avatar.studio.shoot import ShootConfig, film_capture
 from instant_avatar.studio.staging import static_camera
 from preprocess.body.body_pose import Motion
 from preprocess.poses.pose_file import read_motion, write_motion
+from tests.avatar_fixtures import render_on_white
 
 SMALL = ShootConfig(frames=5, size=64, turns=1.0)
 
@@ -172,7 +173,7 @@ def test_the_video_is_exact_and_masks_fit_it(capture):
     frames = list(frames_of(capture / "video.mp4"))
     assert len(frames) == SMALL.frames
     for row, frame in enumerate(frames):
-        rgb, alpha = actor.render_over(truth[row], camera)
+        rgb, alpha = render_on_white(actor, truth[row], camera)
         mask = png(capture / "masks" / f"{row:04d}.png")
         np.testing.assert_array_equal(mask, alpha)
         np.testing.assert_array_equal(frame[mask == 255], rgb[mask == 255])

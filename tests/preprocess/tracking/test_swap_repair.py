@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from preprocess.tracking.keypoints import KeypointTrack
-from preprocess.tracking.pose_lift import LEFT_POINTS, RIGHT_POINTS, repair_swaps
+from preprocess.tracking.pose_lift import LEFT_POINTS, RIGHT_POINTS, find_swaps, repair_swaps
 
 LEFT, RIGHT = list(LEFT_POINTS), list(RIGHT_POINTS)
 
@@ -46,15 +46,16 @@ def _mirrored() -> np.ndarray:
 @pytest.mark.parametrize("stretch", [slice(20, 21), slice(20, 30), slice(52, 56)])
 def test_a_short_stretch_is_exchanged_back(stretch):
     whole = turning_track(80, 4.0)
-    repaired, rows = repair_swaps(swap(whole, stretch))
-    assert np.flatnonzero(rows).tolist() == list(range(stretch.start, stretch.stop))
+    swapped = swap(whole, stretch)
+    repaired = repair_swaps(swapped)
+    assert np.flatnonzero(find_swaps(swapped)).tolist() == list(range(stretch.start, stretch.stop))
     np.testing.assert_allclose(repaired.image_px, whole.image_px)
     np.testing.assert_allclose(repaired.world_m, whole.world_m)
 
 
 def test_two_stretches_are_exchanged_back():
     whole = turning_track(80, 4.0)
-    repaired, _ = repair_swaps(swap(swap(whole, slice(10, 12)), slice(40, 49)))
+    repaired = repair_swaps(swap(swap(whole, slice(10, 12)), slice(40, 49)))
     np.testing.assert_allclose(repaired.world_m, whole.world_m)
 
 
@@ -68,6 +69,5 @@ def test_two_stretches_are_exchanged_back():
     ],
 )
 def test_nothing_else_is_touched(track):
-    repaired, rows = repair_swaps(track)
-    assert not rows.any()
-    np.testing.assert_array_equal(repaired.world_m, track.world_m)
+    assert not find_swaps(track).any()
+    np.testing.assert_array_equal(repair_swaps(track).world_m, track.world_m)
