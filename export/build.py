@@ -63,10 +63,6 @@ GRAPH_CHECK_PICTURES = {"hq": 2, "lite": 1}
 the arithmetic of this machine's onnxruntime; further poses would test the same."""
 MAX_GOLDEN_FRAMES = 4
 """Golden frames of a package."""
-BAKING_PROGRESS = 0.25
-"""Fraction of an export's time after which baking is done."""
-FINE_TUNING_PROGRESS = 0.55
-"""Fraction of an export's time that fine-tuning takes; the rest are the checks."""
 INTERRUPTED_WARNING = (
     "Fine-tuning was interrupted: the package holds the bricks as they were baked, and looks about "
     "half a decibel less like the avatar. ia-export does it all again."
@@ -176,7 +172,7 @@ def export_field(
                 renderer=renderer, views=views, executor=executor,
             ),
             bake_again, config.fine_tuning_pictures,
-            lambda done: progress(BAKING_PROGRESS + FINE_TUNING_PROGRESS * done),
+            lambda done: progress(0.25 + 0.55 * done),  # after baking; the checks follow
         )  # fmt: skip
         compressed = executor.submit(writer.add_tables, tuned.tables)
         interrupted = config.fine_tuning_pictures > 0 and tuned.psnr is None

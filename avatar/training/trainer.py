@@ -100,8 +100,6 @@ INITIAL_OCCUPANCY_STEPS = 300
 """Initial steps in which fog clears: the occupancy is probed more often and decays faster."""
 SOURCE_INTERVAL = 64
 """Steps after which new frames change the sources of unseen skin."""
-CORRECTIONS_PER_STEP = 2
-"""Pose corrections that one training step may make."""
 
 
 @final
@@ -273,7 +271,7 @@ class Trainer:
             self.pose_corrections = {i: c for i, c in self.pose_corrections.items() if i in kept}
 
     def _correct_poses(self, rate: float) -> None:
-        for _ in range(CORRECTIONS_PER_STEP):
+        for _ in range(2):
             slot = correct_one_pose(self.replay, self.poses, rate=rate)
             if slot is not None:
                 correction = self.poses.corrections[slot].copy()

@@ -18,9 +18,6 @@ from avatar.events import HeldOutScore
 from capture.process_metrics import ReservoirSample
 from preprocess.observation import DroppedFrame
 
-REPORT_FORMAT = 1
-"""Version of the format of report.json."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class MachineInfo:
@@ -285,7 +282,7 @@ class Report:
     earlier_videos: ForgettingStats | None = None
     cameras: dict[str, Any] | None = None
     tracking: dict[str, Any] | None = None
-    format: int = REPORT_FORMAT
+    format: int = 1
 
     @property
     def verdict(self) -> SharpnessVerdict | None:

@@ -60,8 +60,6 @@ MIN_WHOLE_IMAGES = 3
 """Frames that are scored as whole images, whatever it takes."""
 MAX_WHOLE_IMAGES = 12
 """Frames that are scored as whole images, at most."""
-UNFILMED_REDUCTION = 2
-"""Factor by which pictures of views that were not filmed are reduced."""
 FRAMES_PER_FIT = 6
 """Frames whose poses are fitted together; no more are fitted once the time is up."""
 KEPT_RENDERINGS = 6
@@ -177,9 +175,7 @@ def score_finally(
         sampled=tuple(scored[i].sampled for i in order),
         fitted=tuple(sorted(fitted, key=lambda score: score.frame)),
         renderings={one.given.frame: one.rendering for one in shown if one.rendering is not None},
-        half_transparent=half_transparent_share(
-            render_unfilmed_views(trainer.avatar, reduction=UNFILMED_REDUCTION)
-        ),
+        half_transparent=half_transparent_share(render_unfilmed_views(trainer.avatar, reduction=2)),
     )
 
 

@@ -50,10 +50,6 @@ def add_mask_noise(
     return np.clip(moved + 0.5, 0.0, 1.0).astype(np.float32)
 
 
-NOISE_FRAMES = 3.0
-"""A tracker wanders rather than flickers: its error is smooth over about this many frames."""
-
-
 def add_pose_noise(motion: Motion, *, degrees: float, centimetres: float, seed: int) -> Motion:
     """Add smooth noise to rotations and place, as a tracker would.
 
@@ -85,9 +81,12 @@ def to_camera_space(
 
 
 def smooth_noise(
-    generator: np.random.Generator, shape: tuple[int, ...], over: float = NOISE_FRAMES
+    generator: np.random.Generator, shape: tuple[int, ...], over: float = 3.0
 ) -> Float[np.ndarray, "frames *rest"]:
-    """Return Gaussian noise of unit variance, smoothed by a Gaussian of width `over`, in frames."""
+    """Return Gaussian noise of unit variance, smoothed by a Gaussian of width `over`, in frames.
+
+    A tracker wanders rather than flickers.
+    """
     margin = max(1, int(4 * over))
     white = generator.standard_normal((shape[0] + 2 * margin, *shape[1:]))
     smooth = gaussian_filter1d(white, over, axis=0)[margin : margin + shape[0]]
@@ -99,11 +98,8 @@ BORDER_SHARE = 0.0028
 """Standard deviation of the border, as a share of the picture's width: 1.5 of 540 pixels."""
 HALO_SHARE = 0.0022
 """Swing of the whole mask's growth, as a share of the image's width; its mean is 0.4 of that."""
-SOFT_PX = 2.5
-"""Width of the ramp from 0 to 1 at the border."""
 HOLE_FRAMES, HAND_GAPS_PER_S = 0.12, 0.35
 """Share of frames with holes; lost hands a second."""
-HAND_RADIUS_M = 0.11
 
 
 @final
@@ -136,11 +132,11 @@ class SegmenterErrors:
             BORDER_SHARE * width,
             self._generator,
             grown_px=HALO_SHARE * width * (0.4 + float(self._halo[row])),
-            soft_px=SOFT_PX,
+            soft_px=2.5,
         )
         for side in (0, 1):
             if self._lost[row, side]:
-                wrong *= 1.0 - _disc(alpha.shape, hands_px[side], HAND_RADIUS_M * px_per_m)
+                wrong *= 1.0 - _disc(alpha.shape, hands_px[side], 0.11 * px_per_m)
         inside = np.argwhere(alpha > 0.99)
         if self._generator.random() < HOLE_FRAMES and len(inside):
             for _ in range(int(self._generator.integers(1, 4))):
@@ -171,10 +167,6 @@ LEAN_DEG, LEAN_WANDER_DEG, FACING_DEG = 2.5, 1.2, 2.0
 DEPTH_M, DEPTH_WANDER_M = 0.04, 0.03
 SLOW_S = 1.2
 """Standard deviation of the smoothing of lean and depth: correlated over seconds."""
-PLACE_SHARE = 0.004
-"""Error of the place in the picture, as a share of its height."""
-FOCAL_ERROR = (0.08, 0.12)
-"""Least and largest error of the focal length, as a share, in either direction."""
 FACING_FLIPS, WRIST_FLIPS = 1, 2
 """Short mistakes of a film: front taken for back, and a hand turned over."""
 
@@ -187,7 +179,7 @@ def mistake_focal_length(camera: Camera, amount: float, seed: int) -> Camera:
     """Return the camera with the focal length that a user would guess; 0 for `amount` is exact."""
     generator = np.random.default_rng([seed, 23])
     sign = 1.0 if generator.random() < 0.5 else -1.0
-    factor = 1.0 + amount * sign * generator.uniform(*FOCAL_ERROR)
+    factor = 1.0 + amount * sign * generator.uniform(0.08, 0.12)
     fx, fy = camera.focal_px
     return replace(camera, focal_px=(fx * factor, fy * factor))
 
@@ -310,7 +302,7 @@ def _place_in_picture(
     true_camera, assumed = cameras
     view = assumed.camera_from_world
     wander = smooth_noise(generator, (len(motion), 2), over=10.0)
-    wander *= PLACE_SHARE * true_camera.size_px[1]
+    wander *= 0.004 * true_camera.size_px[1]
     places = []
     for row in range(len(motion)):
         pixels = true_camera.project(true_body.with_pose(truth[row]).joints()) + wander[row]

@@ -65,7 +65,6 @@ WINDOW_FROM = np.array([-0.75, 0.50, 0.45]) / np.linalg.norm([-0.75, 0.50, 0.45]
 """Direction of the window, from the actor, in the world (the camera is on +z)."""
 WINDOW_STRENGTH = 0.40
 """As a factor of color. An avatar whose light turns with it comes to 31 dB of the film at best."""
-AMBIENT_STRENGTH = 0.92
 WRAP = 0.4
 """A window is wide: it still lights surfaces this far (cosine) beyond the right angle."""
 
@@ -76,7 +75,7 @@ class RoomLight:
 
     def __init__(self, actor: Actor) -> None:
         """Bake the walls' light in the A-pose: it is the only part that turns with the actor."""
-        self._ambient = AMBIENT_STRENGTH * actor.with_baked_light(lamp_strength=0.0).baked_light
+        self._ambient = 0.92 * actor.with_baked_light(lamp_strength=0.0).baked_light
 
     def on(self, actor: Actor, pose: BodyPose) -> Float32[np.ndarray, "vertices 3"]:
         """Light on each vertex of an actor in a pose, as a factor of its color."""
@@ -95,8 +94,6 @@ class RoomLight:
         return (self._ambient + window).astype(np.float32)
 
 
-SHUTTER_FRAMES = 0.5
-"""Exposure time of an image, in frames."""
 SUBFRAMES = 3
 """Moments that are averaged into one picture."""
 SUPERSAMPLING = 2
@@ -150,7 +147,8 @@ class PhoneScene:
         total = np.zeros((height, width, 3), dtype=np.float32)
         alphas = np.zeros((height, width), dtype=np.float32)
         for share in (np.arange(SUBFRAMES) + 0.5) / SUBFRAMES - 0.5:
-            at = float(np.clip(row + SHUTTER_FRAMES * share, 0.0, len(motion) - 1.0))
+            # the shutter is open for half a frame
+            at = float(np.clip(row + 0.5 * share, 0.0, len(motion) - 1.0))
             rgb, alpha = self._draw_moment(_pose_between(motion, at), at / self.fps, SUPERSAMPLING)
             total, alphas = total + rgb * alpha[..., None], alphas + alpha
         mean = (alphas / SUBFRAMES).astype(np.float32)

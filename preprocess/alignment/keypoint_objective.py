@@ -46,8 +46,6 @@ MIRRORED_POINTS = np.array(
     [0, 4, 5, 6, 1, 2, 3, 8, 7, 10, 9, *(i + 1 if i % 2 else i - 1 for i in range(11, 33))]
 )
 """The key point of the other side, for each of the 33."""
-ROBUST_STEPS = 8
-"""Steps of a robust linear fit."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -212,7 +210,7 @@ class KeypointObjective:
         weights = np.broadcast_to(self.confidence[..., None], rows.shape)[rows]
         design, target, robust = design[rows], target[rows], np.float64(1.0)
         numbers = np.zeros(design.shape[-1])
-        for _ in range(ROBUST_STEPS if len(target) else 0):
+        for _ in range(8 if len(target) else 0):
             scaled = np.sqrt(weights * robust)
             numbers = np.linalg.lstsq(scaled[:, None] * design, scaled * target, rcond=None)[0]
             off = np.abs(design @ numbers - target)

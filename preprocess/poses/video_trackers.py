@@ -27,18 +27,6 @@ PROMPTHMR_VIEWS = ("smplx_cam", "smplx_world")
 TRAM_KEYS = {"pred_rotmat", "pred_trans", "frame"}
 """Keys by which a file of TRAM is recognised."""
 
-PHALP_FOCAL = RelativeFocalLength(ratio=5000.0 / 256.0)
-"""PHALP's focal length: 5,000 px on a square of 256 px."""
-
-ROMP_PERSPECTIVE_FOCAL = RelativeFocalLength(ratio=443.4 / 512.0)
-"""The camera of ROMP's and BEV's perspective fit: 60 degrees over the padded square."""
-
-ROMP_WEAK_PERSPECTIVE_FOCAL = RelativeFocalLength(ratio=1.0)
-"""The camera in which z = 2 / s puts a point where weak perspective with the scale s does."""
-
-ROMP_VIDEO_RESULTS = "video_results.npz"
-"""Name of ROMP's file for a whole video."""
-
 MAX_LINK_STEP_M = 1.0
 """Largest step of one person between frames, metres; it separates people without track numbers."""
 
@@ -232,7 +220,7 @@ def _phalp_person(rows: list[tuple[int, Any, Any]]) -> Motion:
         stack_rows([np.reshape(camera, 3) for _, _, camera in rows]),
         betas=stack_rows([np.reshape(pose["betas"], -1) for pose in poses]),
         frames=[number for number, _, _ in rows],
-        lens=PHALP_FOCAL,
+        lens=RelativeFocalLength(ratio=5000.0 / 256.0),  # 5,000 px on a square of 256 px
     )
 
 
@@ -246,7 +234,7 @@ def parse_romp(content: Any, prefer_world: bool = False) -> MotionByPerson | Non
     """
     if not isinstance(content, dict):
         return None
-    content = content.get(ROMP_VIDEO_RESULTS, content)  # a folder with everything in it
+    content = content.get("video_results.npz", content)  # a folder with everything in it
     sequence = content.get("sequence_results")
     if isinstance(sequence, dict) and sequence:
         return {
@@ -274,11 +262,11 @@ def _romp_person(rows: dict[str, Any], frames: Any) -> Motion:
     thetas, places = stack_rows(list(rows["smpl_thetas"])), stack_rows(list(rows["cam_trans"]))
     betas = stack_rows(list(rows["smpl_betas"]))
     is_bev = betas.shape[-1] == 11
-    lens = ROMP_PERSPECTIVE_FOCAL
+    lens = RelativeFocalLength(ratio=443.4 / 512.0)  # 60 degrees over the padded square
     if not is_bev and "cam" in rows:
         scales = stack_rows(list(rows["cam"]))[:, 0]
         if np.allclose(places[:, 2] * scales, 2.0, rtol=1e-3):
-            lens = ROMP_WEAK_PERSPECTIVE_FOCAL
+            lens = RelativeFocalLength(ratio=1.0)  # so that z = 2 / s suits the scale s
     return build_motion(
         [thetas], places, betas=betas[:, :10], frames=frames, lens=lens,
         lost=places[:, 2] <= 0.0,  # (-1, -1, -1) where their perspective fit has failed

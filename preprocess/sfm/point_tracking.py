@@ -20,9 +20,6 @@ from preprocess.body.kinematics import rigid_transform
 from preprocess.sfm.camera_solution import SparseModel
 from preprocess.sfm.colmap_mapping import SfmKeyframe, to_grayscale
 
-WINDOW = (17, 17)
-"""Size of the patch around a point, pixels."""
-
 LEVELS = 4
 """Levels of the pyramid without a guess."""
 
@@ -77,14 +74,11 @@ def _optical_flow(
     """OpenCV's, whose first pixel's centre is at (0, 0)."""
     there, status, _ = cv2.calcOpticalFlowPyrLK(
         start, picture, (pixels - 0.5).astype(np.float32)[:, None],
-        (guess - 0.5).astype(np.float32)[:, None].copy(), winSize=WINDOW, maxLevel=levels,
+        (guess - 0.5).astype(np.float32)[:, None].copy(), winSize=(17, 17), maxLevel=levels,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )  # fmt: skip
     return there[:, 0].astype(np.float64) + 0.5, status[:, 0] > 0
 
-
-MAX_CORNERS = 400
-"""Most points of the background that are tracked."""
 
 MIN_TRACKED_FRACTION = 0.3
 """Fraction of the points that must be tracked for a static camera."""
@@ -94,9 +88,6 @@ MAX_STATIC_SHIFT = 0.005
 
 MIN_TRACKED_POINTS = 12
 """Fewest points that must be tracked for a static camera."""
-
-COMPARED_KEYFRAMES = 12
-"""Number of key frames that are compared with the first."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,11 +105,11 @@ class StaticCameraTest:
 def detect_static_camera(keys: list[SfmKeyframe]) -> StaticCameraTest:
     """Track points of the first key frame's background into others."""
     first = keys[0]
-    pixels = detect_corners(first.gray, ~first.person_mask, MAX_CORNERS)
+    pixels = detect_corners(first.gray, ~first.person_mask, 400)
     longer, moved = max(first.gray.shape), 0.0
     if len(pixels) < MIN_TRACKED_POINTS:
         return StaticCameraTest(is_static=False, background_motion=float("nan"))
-    rows = np.unique(np.linspace(1, len(keys) - 1, COMPARED_KEYFRAMES).round().astype(int))
+    rows = np.unique(np.linspace(1, len(keys) - 1, 12).round().astype(int))
     for key in (keys[int(row)] for row in rows):
         there, found = track_points(first.gray, key.gray, pixels)
         x, y = np.clip(pixels.astype(int).T, 0, np.array(key.gray.shape[::-1])[:, None] - 1)
@@ -135,9 +126,6 @@ def detect_static_camera(keys: list[SfmKeyframe]) -> StaticCameraTest:
 
 MIN_PNP_POINTS = 20
 """Fewest tracked points that a camera is placed by."""
-
-MAX_PNP_POINTS = 600
-"""Most points that are tracked from a key frame."""
 
 INLIER_PX = 2.0
 """Largest reprojection error of an inlier, pixels."""
@@ -242,9 +230,7 @@ class _KeyframePoints:
     def of(cls, model: SparseModel, row: int, key: SfmKeyframe) -> "_KeyframePoints":
         seen = model.observations_of_camera(row)
         lengths = np.bincount(model.observation_point, minlength=len(model.points))
-        longest = np.argsort(-lengths[model.observation_point[seen]], kind="stable")[
-            :MAX_PNP_POINTS
-        ]
+        longest = np.argsort(-lengths[model.observation_point[seen]], kind="stable")[:600]
         seen = seen[longest]
         return cls(
             frame=key.index,

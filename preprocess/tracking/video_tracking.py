@@ -23,8 +23,6 @@ from preprocess.tracking.keypoints import CroppedMask, KeypointTrack, PersonKeyp
 
 BORDER_SAMPLES = 128
 """Places along each border of a frame at which the mask is read."""
-MIN_TOUCHING = 2
-"""Places with the person in them that make a touch."""
 BODY_POINTS = (0, 7, 8, *range(11, 17), *range(23, 29))
 """Key points of the body, without fingers, heels and toes."""
 CUT_MARGIN = 0.05
@@ -36,8 +34,6 @@ MIN_FOUND = 8
 """Fewest frames in which the person must be found; 4 of fewer than 16 frames."""
 FRAMES_REFINED_AGAIN = 60
 """First frames whose masks are made again in the end, when the background behind them is known."""
-QUEUED_MASKS = 8
-"""Most masks that wait to be written."""
 
 
 class TrackingProblem(Enum):
@@ -109,7 +105,7 @@ def touched_borders(found: PersonKeypoints, size_px: tuple[int, int]) -> set[Tra
             continue
         column, row = np.floor(crop_from_image @ np.array([x, y, high])).astype(int)
         inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-        if (found.mask.values[row[inside], column[inside]] > 127).sum() >= MIN_TOUCHING:
+        if (found.mask.values[row[inside], column[inside]] > 127).sum() >= 2:
             touched.add(problem)
     return touched
 
@@ -192,7 +188,7 @@ def track_video(
             if mask_folder is not None:
                 path = _mask_path(mask_folder, frame.index)
                 waiting.append(pool.submit(_write_mask, path, frame.rgb, person, refine))
-            while len(waiting) > QUEUED_MASKS or (waiting and waiting[0].done()):
+            while len(waiting) > 8 or (waiting and waiting[0].done()):
                 waiting.pop(0).result()
             advance(len(times))
         for each in waiting:
