@@ -31,6 +31,7 @@ from preprocess.tracking.blazepose_networks import (
     FoundLandmarks,
     PersonSquare,
 )
+from preprocess.tracking.keypoints import MIN_PRESENCE, MIRRORED_POINTS
 
 TRACKED_IMAGES = 16
 """Images in which the person is tracked."""
@@ -42,10 +43,6 @@ THUMBNAIL_PX = 300
 """Height of the images that are kept to be shown."""
 HALF_SCORE_HEIGHTS = 0.04
 """Distance of a key point at which it counts half, in the person's height."""
-MIRRORED_POINTS = np.array(
-    [0, 4, 5, 6, 1, 2, 3, 8, 7, 10, 9, *(i + 1 if i % 2 else i - 1 for i in range(11, 33))]
-)
-"""The key point of the other side, for each of the 33."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

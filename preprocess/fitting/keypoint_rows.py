@@ -16,7 +16,7 @@ from capture.camera import Camera
 from preprocess.body.kinematics import descendant_matrix
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.fitting.clip_poses import ClipPoses, PosedJoints
-from preprocess.tracking.keypoints import HIPS, MIN_PRESENCE, KeypointTrack
+from preprocess.tracking.keypoints import HIPS, MIN_PRESENCE, MIRRORED_POINTS, KeypointTrack
 
 KEYPOINT_JOINTS = np.array(
     [15, 15, 15, 15, 15, 15, 15, 15, 15, 15, 15, 16, 17, 18, 19, 20, 21, 20, 21, 20, 21, 20, 21,
@@ -33,8 +33,6 @@ LEFT_OFFSETS_CM = {
 }  # fmt: skip
 """Places of the person's left key points in their joints' rest frames, centimetres; the right ones
 are mirrored. Measured on synthetic actors; a centimetre apart between them."""
-RIGHT_OF = {1: 4, 2: 5, 3: 6, **{left: left + 1 for left in range(7, 33, 2)}}
-"""The right key point of each left one."""
 PIXEL_WEIGHTS = np.array([0.4] + [0.15] * 6 + [0.4] * 2 + [0.15] * 2 + [1.0] * 6 + [0.3] * 6
                          + [1.0] * 6 + [0.6] * 4)  # fmt: skip
 """Weight of each key point in the image; those of the face and of a hand err alike."""
@@ -64,7 +62,7 @@ def _offsets_m() -> Float[np.ndarray, "33 3"]:
         offsets[middle] = 0.0, up, front
     for left, place in LEFT_OFFSETS_CM.items():
         offsets[left] = place
-        offsets[RIGHT_OF[left]] = np.array(place) * (-1.0, 1.0, 1.0)
+        offsets[MIRRORED_POINTS[left]] = np.array(place) * (-1.0, 1.0, 1.0)
     return offsets / 100.0
 
 

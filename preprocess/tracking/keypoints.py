@@ -18,6 +18,10 @@ KEYPOINT_COUNT = 33
 """Number of key points of a person."""
 HIPS = (23, 24)
 """Key points of the left and the right hip."""
+MIRRORED_POINTS = np.array(
+    [0, 4, 5, 6, 1, 2, 3, 8, 7, 10, 9, *(i + 1 if i % 2 else i - 1 for i in range(11, 33))]
+)
+"""The key point of the other side, for each of the 33."""
 MIN_PRESENCE = 0.5
 """Probability of a person below which a frame's key points are not used."""
 KEYPOINT_SHAPES = {

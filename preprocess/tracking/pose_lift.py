@@ -18,12 +18,8 @@ from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.poses.motion_builder import fill_gaps, place_by_pixels
-from preprocess.tracking.keypoints import HIPS, MIN_PRESENCE, KeypointTrack
+from preprocess.tracking.keypoints import HIPS, MIN_PRESENCE, MIRRORED_POINTS, KeypointTrack
 
-LEFT_POINTS = (1, 2, 3, *range(7, 33, 2))
-"""The person's left key points."""
-RIGHT_POINTS = (4, 5, 6, *range(8, 33, 2))
-"""The right ones, in the same order."""
 COMPARED_POINTS = (11, 13, 23, 25, 27)
 """Left shoulder, elbow, hip, knee and ankle."""
 MAX_COSINE = -0.4
@@ -53,9 +49,7 @@ PLACED_POINTS = (23, 24, 25, 26, 27, 28, 11, 12, 13, 14, 15, 16)
 def repair_swaps(track: KeypointTrack) -> KeypointTrack:
     """Exchange left and right in short stretches that both sides contradict."""
     swapped = find_swaps(track)
-    mirrored = np.arange(33)
-    mirrored[list(LEFT_POINTS)], mirrored[list(RIGHT_POINTS)] = RIGHT_POINTS, LEFT_POINTS
-    order = np.where(swapped[:, None], mirrored, np.arange(33))
+    order = np.where(swapped[:, None], MIRRORED_POINTS, np.arange(33))
     rows = np.arange(len(track))[:, None]
     return replace(
         track,

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from preprocess.tracking.keypoints import KeypointTrack
-from preprocess.tracking.pose_lift import LEFT_POINTS, RIGHT_POINTS, find_swaps, repair_swaps
+from preprocess.tracking.pose_lift import find_swaps, repair_swaps
 
-LEFT, RIGHT = list(LEFT_POINTS), list(RIGHT_POINTS)
+LEFT, RIGHT = [1, 2, 3, *range(7, 33, 2)], [4, 5, 6, *range(8, 33, 2)]
 
 
 def turning_track(count: int, degrees_per_frame: float, frame_step: int = 1) -> KeypointTrack:
