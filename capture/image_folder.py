@@ -52,9 +52,6 @@ TIFF_MAGIC = (b"II*\x00", b"MM\x00*")
 ALPHA_SUFFIXES = frozenset({".png", ".webp", ".bmp", ".tif", ".tiff"})
 """File endings of images that can have an alpha channel."""
 
-MIN_TRANSPARENT_FRACTION = 0.01
-"""Fraction of transparent pixels from which an alpha channel is a mask (not rounded corners)."""
-
 
 def natural_sort_key(path: Path) -> list[tuple[int, str]]:
     """Sort `image_9` before `image_10`."""
@@ -124,7 +121,7 @@ def write_png(path: Path, picture: UInt8[np.ndarray, "..."]) -> None:
 
 def has_cutout_alpha(alpha: UInt8[np.ndarray, "height width"] | None) -> bool:
     """Return whether an alpha channel cuts the person out: an opaque one does not."""
-    return alpha is not None and float((alpha < 128).mean()) >= MIN_TRANSPARENT_FRACTION
+    return alpha is not None and float((alpha < 128).mean()) >= 0.01  # more than rounded corners
 
 
 def any_has_cutout_alpha(images: Sequence[Path]) -> bool:

@@ -61,8 +61,6 @@ from preprocess.body.body_pose import BodyPose
 GRAPH_CHECK_PICTURES = {"hq": 2, "lite": 1}
 """Golden frames on which each tier's graph is compared with its reference, 0.2 s each. They test
 the arithmetic of this machine's onnxruntime; further poses would test the same."""
-MAX_GOLDEN_FRAMES = 4
-"""Golden frames of a package."""
 INTERRUPTED_WARNING = (
     "Fine-tuning was interrupted: the package holds the bricks as they were baked, and looks about "
     "half a decibel less like the avatar. ia-export does it all again."
@@ -259,7 +257,7 @@ def _unchecked_package(
     }
     golden = [
         GoldenFrame(pose=pose, camera=fit_camera(camera, MAX_GOLDEN_PX))
-        for pose, camera in views[:MAX_GOLDEN_FRAMES]
+        for pose, camera in views[:4]
     ]
     return AvatarPackage(
         manifest=Manifest(

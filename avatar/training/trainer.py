@@ -96,10 +96,6 @@ def step_optimizer(optimizer: UncompiledAdam) -> None:
 
 NETWORK_RATE_FACTOR = 0.3
 """The network's learning rate as a share of the table's."""
-INITIAL_OCCUPANCY_STEPS = 300
-"""Initial steps in which fog clears: the occupancy is probed more often and decays faster."""
-SOURCE_INTERVAL = 64
-"""Steps after which new frames change the sources of unseen skin."""
 
 
 @final
@@ -223,7 +219,7 @@ class Trainer:
             detail_share: Progress from coarse samples along rays to fine ones, in [0, 1].
         """
         config, field = self._config_at(detail_share), self.field
-        if self.steps % SOURCE_INTERVAL == 0:
+        if self.steps % 64 == 0:  # new frames change the sources
             self.unseen.update()
         falling = rate if pose_rate is None else pose_rate
         batch = self.replay.sample_rays(config.rays, self.generator)
@@ -278,7 +274,7 @@ class Trainer:
                 self.pose_corrections[self.replay.frame_indices[slot]] = correction
 
     def _update_occupancy(self, surface_share: float) -> None:
-        clearing = self.steps < INITIAL_OCCUPANCY_STEPS
+        clearing = self.steps < 300  # fog: probed more often, and decaying faster
         self.avatar.occupancy.update(
             lambda points: self.field.raw_outputs_at(points)[:, 3],
             share=0.5 if clearing else 0.25,

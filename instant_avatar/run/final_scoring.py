@@ -54,8 +54,6 @@ from instant_avatar.run.stream_meter import StreamMeter
 
 SCORING_LIMIT_S = 12.0
 """Wall time that final scoring and pose fitting aim for."""
-WHOLE_IMAGES_SHARE = 0.2
-"""Share of that time after which frames in given poses are no longer scored as whole images."""
 MIN_WHOLE_IMAGES = 3
 """Frames that are scored as whole images, whatever it takes."""
 MAX_WHOLE_IMAGES = 12
@@ -160,7 +158,7 @@ def score_finally(
     limit_s = math.inf if trainer.config.steps else SCORING_LIMIT_S
     began, scored = time.perf_counter(), list[_ScoredFrame]()
     with console.progress(f"scoring {len(held_out)} held-out frames", float(len(held_out))) as bar:
-        whole_until = began + WHOLE_IMAGES_SHARE * limit_s
+        whole_until = began + 0.2 * limit_s
         for one in _score_in_given_poses(trainer.avatar, held_out, whole_until):
             scored.append(one)
             bar.set_count(len(scored))

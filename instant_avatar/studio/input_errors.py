@@ -157,8 +157,6 @@ def _disc(
 
 TRUNK_DEG, LIMBS_DEG, ENDS_DEG = 1.3, 2.5, 3.5
 """Errors of direction: standard deviation of the wandering part and, each, of the constant one."""
-WANDER_S = 0.3
-"""Standard deviation of the smoothing of directions: correlated over about 0.7 s."""
 JITTER_DEG = 0.5
 ACROSS_VIEW, ALONG_VIEW = 1.0, 0.35
 """Factors of errors that turn a limb towards the camera, and of those within the picture."""
@@ -233,7 +231,8 @@ def _sizes_deg() -> Float[np.ndarray, "24"]:
 def _direction_errors(
     generator: np.random.Generator, count: int, fps: float, amount: float
 ) -> Float[np.ndarray, "poses 24 3"]:
-    slow = smooth_noise(generator, (count, 24, 3), over=max(WANDER_S * fps, 0.5))
+    # correlated over about 0.7 s
+    slow = smooth_noise(generator, (count, 24, 3), over=max(0.3 * fps, 0.5))
     parts = np.array([ACROSS_VIEW, ACROSS_VIEW, ALONG_VIEW]) / np.hypot(1.0, 1.0)
     slow *= _sizes_deg()[:, None] * parts
     jitter = JITTER_DEG * generator.standard_normal((count, 24, 3)) / np.sqrt(3.0)

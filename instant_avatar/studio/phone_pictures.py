@@ -100,8 +100,6 @@ SUPERSAMPLING = 2
 """Subsamples along each side of a pixel, at each of these moments."""
 GAIN_DRIFT, WARMTH_DRIFT = 0.15, 0.05
 """Largest drift of the exposure, and of red against blue."""
-DRIFT_S = 0.9
-"""Standard deviation of their smoothing: correlated over about two seconds."""
 SENSOR_NOISE = 2.0
 """Standard deviation of the noise of each pixel and channel, of 255."""
 JPEG_QUALITY = 82
@@ -112,7 +110,8 @@ same on every machine, unlike an H.264 encoder."""
 def drifting_exposure(frames: int, fps: float, seed: int) -> Float[np.ndarray, "frames 3"]:
     """Gain of red, green and blue in each frame, about 1."""
     generator = np.random.default_rng([seed, 25])
-    slow = np.tanh(smooth_noise(generator, (frames, 2), over=max(DRIFT_S * fps, 0.5)))
+    # correlated over about two seconds
+    slow = np.tanh(smooth_noise(generator, (frames, 2), over=max(0.9 * fps, 0.5)))
     gain, warmth = 1.0 + GAIN_DRIFT * slow[:, 0], WARMTH_DRIFT * slow[:, 1]
     return np.stack([gain * (1.0 + warmth), gain, gain * (1.0 - warmth)], axis=1)
 

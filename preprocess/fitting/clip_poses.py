@@ -155,8 +155,6 @@ POSE_SIGMA = _pose_sigma()
 """Prior standard deviation of a frame's correction: root and joint rotations, root position. These
 are the units of a frame's parameters in the equations."""
 
-MIRRORED_AXES = (1.0, -1.0, -1.0)
-"""An axis-angle of a left joint times this is that of the right one."""
 LEFT_PRIORS = {
     1: ((0.0, 0.0, 0.0), (0.70, 0.35, 0.30)), 4: ((0.25, 0.0, 0.0), (0.70, 0.12, 0.08)),
     7: ((0.0, 0.0, 0.0), (0.20, 0.13, 0.10)), 10: ((0.0, 0.0, 0.0), (0.10, 0.03, 0.03)),
@@ -299,7 +297,7 @@ def _add_human(
 def _human_priors() -> tuple[Float[np.ndarray, "24 3"], Float[np.ndarray, "24 3"]]:
     mean, sigma = np.zeros((24, 3)), np.full((24, 3), SIGMA_FREE)
     for left, (middle, spread) in LEFT_PRIORS.items():
-        mean[left], mean[left + 1] = middle, np.array(middle) * MIRRORED_AXES
+        mean[left], mean[left + 1] = middle, np.array(middle) * (1.0, -1.0, -1.0)  # mirrored
         sigma[left] = sigma[left + 1] = spread
     for joint, spread in MIDDLE_PRIORS.items():
         sigma[joint] = spread

@@ -14,9 +14,6 @@ from preprocess.body.body_pose import Motion, RelativeFocalLength
 from preprocess.frame_association import frame_numbers_from_names
 from preprocess.poses.motion_builder import MotionByPerson, build_motion, stack_rows
 
-WHAM_FOCAL = RelativeFocalLength(ratio=1.0, reference="diagonal")
-"""WHAM's focal length where none was given."""
-
 VIBE_FOCAL = RelativeFocalLength(ratio=0.85)
 """Any would do: weak perspective has none, and the depth follows from it. A phone's is taken."""
 
@@ -62,7 +59,7 @@ def parse_wham(content: Any, prefer_world: bool = False) -> MotionByPerson | Non
             betas=rows.get("betas"),
             frames=rows["frame_ids"],
             space="world" if in_world else "camera",
-            lens=None if in_world else WHAM_FOCAL,
+            lens=None if in_world else RelativeFocalLength(ratio=1.0, reference="diagonal"),
         )
     return people
 

@@ -17,9 +17,6 @@ from jaxtyping import Bool, Float
 
 from preprocess.sfm.camera_solution import SparseModel
 
-MAX_TILT_DEG = 20.0
-"""Largest angle between the floor's normal and the first guess of up, degrees."""
-
 PLANE_TOLERANCE = 0.01
 """Distance within which points belong to a plane; a fraction of their median camera distance."""
 
@@ -96,7 +93,7 @@ def _plane_through(
     if length < 1e-12:
         return None
     normal = normal / length * (1.0 if normal @ up > 0.0 else -1.0)
-    if normal @ up < np.cos(np.radians(MAX_TILT_DEG)):
+    if normal @ up < np.cos(np.radians(20.0)):
         return None
     return normal, -float(normal @ three[0])
 

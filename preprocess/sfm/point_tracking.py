@@ -26,8 +26,6 @@ LEVELS = 4
 LEVELS_WITH_GUESS = 3
 """Levels of the pyramid with a guess of where a point is."""
 
-MAX_ROUND_TRIP_PX = 0.7
-"""Largest distance of a point that was tracked there and back, pixels; beyond it is lost."""
 
 GrayImage = UInt8[np.ndarray, "height width"]
 
@@ -49,7 +47,7 @@ def track_points(
     back, again = _optical_flow(picture, start, there, pixels, levels)
     height, width = picture.shape
     inside = ((there > 0.0) & (there < (width, height))).all(axis=1)
-    same = np.linalg.norm(back - pixels, axis=1) < MAX_ROUND_TRIP_PX
+    same = np.linalg.norm(back - pixels, axis=1) < 0.7
     return there, found & again & same & inside
 
 

@@ -30,8 +30,6 @@ CUT_MARGIN = 0.05
 heights. Shoes and fingertips that touch a border are farther: they cut nothing off."""
 ELSEWHERE = 0.6
 """Distance from the last place, in sides of the square around the person, that is worth a word."""
-MIN_FOUND = 8
-"""Fewest frames in which the person must be found; 4 of fewer than 16 frames."""
 FRAMES_REFINED_AGAIN = 60
 """First frames whose masks are made again in the end, when the background behind them is known."""
 
@@ -240,7 +238,7 @@ def _write_mask(
 
 def _require_person(source: FrameSource, found: int, total: int) -> None:
     """Raise InputError if the person was found in too few of the frames."""
-    if found and found >= min(MIN_FOUND, max(1, total // 4)):
+    if found and found >= min(8, max(1, total // 4)):
         return
     where = "none" if not found else f"only {found}"
     raise InputError(
