@@ -150,7 +150,6 @@ def test_view_without_viser_says_how_to_get_it(film, tmp_path, monkeypatch, caps
         (["v.mp4", "--view"], VIEW_PORT),
         (["--view", "v.mp4"], VIEW_PORT),
         (["v.mp4", "--view", "9000"], 9000),
-        (["v.mp4", "--view", "--seconds", "5"], VIEW_PORT),
         (["v.mp4"], None),
     ],
 )
