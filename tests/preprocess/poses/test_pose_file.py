@@ -152,33 +152,31 @@ def test_a_camera_matrix_per_row_becomes_their_median(write):
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    "changes",
     [
-        ({"transl": None}, "expected global_orient and body_pose and transl"),
-        ({"body_pose": np.zeros((6, 60))}, r"\(N, 72\)"),
-        ({"global_orient": np.zeros((5, 3))}, "5 rows of `global_orient` but 6"),
-        ({"betas": np.full((1, 10), np.nan)}, "`betas`"),
-        ({"frame": np.arange(5)}, "5 numbers in `frame` for 6 poses"),
-        ({"frame": np.zeros(6)}, "twice"),
-        ({"frame": np.arange(6) + 0.5}, "no frame numbers"),
-        ({"time": np.arange(7.0)}, "`time`"),
-        ({"K": np.zeros((3, 3))}, "`K`"),
+        {"transl": None},
+        {"body_pose": np.zeros((6, 60))},
+        {"global_orient": np.zeros((5, 3))},
+        {"betas": np.full((1, 10), np.nan)},
+        {"frame": np.arange(5)},
+        {"frame": np.zeros(6)},
+        {"frame": np.arange(6) + 0.5},
+        {"time": np.arange(7.0)},
+        {"K": np.zeros((3, 3))},
     ],
 )
-def test_what_is_no_motion_is_refused_by_name(write, changes, message):
-    with pytest.raises(InputError, match=message):
+def test_what_is_no_motion_is_refused_by_name(write, changes):
+    with pytest.raises(InputError, match=r"poses\.npz"):
         read_motion(write(**changes))
 
 
 def test_a_missing_damaged_or_foreign_file_is_refused(tmp_path):
-    with pytest.raises(InputError, match="does not exist"):
+    with pytest.raises(InputError, match=r"poses\.npz"):
         read_motion(tmp_path / "poses.npz")
-    (tmp_path / "poses.npz").write_bytes(b"PK\x03\x04 and no more")
-    with pytest.raises(InputError, match="readable"):
-        read_motion(tmp_path / "poses.npz")
-    (tmp_path / "poses.pkl").write_bytes(b"")
-    with pytest.raises(InputError, match=r"\.npz"):
-        read_motion(tmp_path / "poses.pkl")
+    for name, content in (("poses.npz", b"PK\x03\x04 and no more"), ("poses.pkl", b"")):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError, match=name):
+            read_motion(tmp_path / name)
 
 
 def test_a_capture_folder_stands_for_the_poses_in_it(tmp_path, motion):
