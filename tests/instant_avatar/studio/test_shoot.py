@@ -10,7 +10,6 @@ from capture.input_error import InputError
 from capture.source_opening import open_source
 from instant_avatar.studio import staging
 from instant_avatar.studio.actor import Actor
-from instant_avatar.studio.input_errors import add_mask_noise, add_pose_noise
 from instant_avatar.studio.outfit import SKIN
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 from instant_avatar.studio.staging import static_camera
@@ -107,34 +106,6 @@ def test_novel_poses_are_far_from_all_that_is_filmed(actor):
         filmed = act(actor, frames=60, fps=30.0, turns=2.0, seed=0)
         assert nearest_pose_angles(novel, filmed).min() > 0.35
     assert (nearest_pose_angles(novel, novel) < 1e-6).all()
-
-
-def test_pose_noise_has_the_deviation_asked_for_and_is_smooth():
-    truth = Motion(
-        root_rotations=np.zeros((400, 3)),
-        root_translations=np.ones((400, 3)),
-        joint_rotations=np.full((400, 23, 3), 0.1),
-        valid=np.ones(400, dtype=bool),
-        betas=np.zeros(10),
-        body_model="body24",
-    )
-    given = add_pose_noise(truth, degrees=2.0, centimetres=1.0, seed=4)
-    turned = np.rad2deg(given.joint_rotations - truth.joint_rotations)
-    moved = 100 * (given.root_translations - truth.root_translations)
-    assert abs(turned.std() - 2.0) < 0.15
-    assert abs(moved.std() - 1.0) < 0.2
-    assert (turned[1:] * turned[:-1]).mean() / (turned**2).mean() > 0.9
-    assert add_pose_noise(truth, degrees=0.0, centimetres=0.0, seed=4) is truth
-
-
-def test_mask_noise_moves_the_border_by_the_given_distance():
-    alpha = np.zeros((200, 400), dtype=np.float32)
-    alpha[100:] = 1.0
-    rough = add_mask_noise(alpha, 3.0, np.random.default_rng(0))
-    heights = rough.sum(axis=0)
-    assert abs(heights.mean() - 100) < 1.5
-    assert 2.0 < heights.std() < 4.0
-    assert add_mask_noise(alpha, 0.0, np.random.default_rng(0)) is alpha
 
 
 def test_the_folder_is_a_native_capture(capture):
