@@ -72,6 +72,10 @@ class CorrespondenceGrid:
         return cls(low=low, cell_m=CORRESPONDENCE_CELL_M, packed_cells=packed_cells, roots=roots)
 
 
+MIN_DEPTH_M = 0.05
+"""Depth below which a corner of the box cannot be projected, metres."""
+
+
 def cull_cells(cells: CorrespondenceGrid, grid: DensityGrid) -> CorrespondenceGrid:
     """Empties the cells that lead to unoccupied space; no sample of another cell is lost.
 
@@ -105,7 +109,7 @@ def screen_bounds(
     corners = np.array(list(itertools.product(*sides.T)))
     in_world = corners @ world_from_body[:3, :3].T + world_from_body[:3, 3]
     depth = in_world @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
-    if camera.distortion or depth.min() < 0.05:  # the projected corners bound no box
+    if camera.distortion or depth.min() < MIN_DEPTH_M:  # the projected corners bound no box
         return whole
     pixels = camera.project(in_world)
     left, top = np.floor(pixels.min(axis=0)).clip(0).astype(int).tolist()

@@ -23,6 +23,8 @@ INITIAL_OCCUPANCY_DECAY = 0.7
 """The factor while the initial fog clears and each update probes half of the band."""
 MIN_STEP_OPACITY = 0.02
 """Opacity of one step through a cell below which the cell is empty."""
+INITIAL_DENSITY = 1e-3
+"""Cached density of the band before the first probe, 1/m."""
 SOLID_DENSITY = 20.0
 """Density from which a cell is solid when connected components are found, 1/m."""
 NEAR_SKIN_M = 0.03
@@ -49,7 +51,7 @@ class OccupancyGrid:
         band = torch.from_numpy(rig.skin_distance <= CLOTHING_BAND_M)
         self.density_grid = DensityGrid(
             occupied=band.to(torch.uint8),
-            density=torch.where(band, 1e-3, 0.0),  # 1/m, before the first probe
+            density=torch.where(band, INITIAL_DENSITY, 0.0),
             low=torch.from_numpy(rig.box_low),
             cells_per_m=torch.from_numpy(rig.cells_per_m),
         )

@@ -19,6 +19,8 @@ from avatar.kernels import operations
 from avatar.kernels.operands import FEATURES_PER_LEVEL, MAX_LOG_DENSITY, HashLevels
 
 HIDDEN_WIDTH = 64
+INITIAL_LOG_DENSITY = 0.0
+"""Raw density of an untrained field: 1 per metre, a fog thin enough to be cleared quickly."""
 POINTS_PER_CHUNK = 1 << 13
 """Points per chunk, whose features and hidden layer fit into a cache."""
 
@@ -88,7 +90,7 @@ class RadianceField:
         ) * 1e-2
         first = normal(levels.feature_width, HIDDEN_WIDTH, math.sqrt(2.0 / levels.feature_width))
         second = normal(HIDDEN_WIDTH, 4, math.sqrt(1.0 / HIDDEN_WIDTH))
-        bias = torch.zeros(4)  # 1 per metre: a fog thin enough to be cleared quickly
+        bias = torch.tensor([0.0, 0.0, 0.0, INITIAL_LOG_DENSITY])
         self.table, *self.layers = (
             torch.nn.Parameter(values)
             for values in (table, first, torch.zeros(HIDDEN_WIDTH), second, bias)
@@ -166,6 +168,8 @@ OPACITY_LENGTH_M = 0.01
 """Length over which opacity is measured, metres."""
 TV_PAIR_SIGMA_M = 0.01
 """Standard deviation of the offset within a total-variation pair, metres per axis."""
+MIN_OPACITY = 1e-6
+"""Opacity below which the interior loss's logarithm is clamped."""
 SMOOTHNESS_PAIR_SIGMA_CELLS = 0.5
 """Standard deviation of the offset within a smoothness pair, in finest cells per axis."""
 MAX_USEFUL_LOG_DENSITY = 6.0
@@ -204,7 +208,7 @@ def interior_gradient(
 ) -> Float32[Tensor, "points 4"]:
     """Gradient of the mean -log α in the interior; cross-entropy acts at zero opacity as well."""
     opacity = OpacityWithSlope.of(raw)
-    slope = opacity.slope / opacity.value.clamp(min=1e-6)
+    slope = opacity.slope / opacity.value.clamp(min=MIN_OPACITY)
     return _log_density_only(raw, -weight / max(len(raw), 1) * slope)
 
 

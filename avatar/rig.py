@@ -192,6 +192,7 @@ MIN_VERTEX_DISTANCE_M = 2e-3
 """Smallest vertex distance in the blend, metres, so that one vertex cannot dominate a node."""
 SMOOTHED_BEYOND_M = 0.03
 """Distance from the skin beyond which weights are smoothed, metres; clothes hang nearer."""
+SMOOTHING_PASSES = 2
 
 
 def volume_shape(
@@ -241,7 +242,7 @@ def skinning_weight_volume(
 def _smooth_far_weights(
     weights: Float32[np.ndarray, "x y z 24"], far: Bool[np.ndarray, "x y z 1"]
 ) -> Float32[np.ndarray, "x y z 24"]:
-    for _ in range(2):
+    for _ in range(SMOOTHING_PASSES):
         mean = uniform_filter(weights, 3, axes=(0, 1, 2))
         weights = np.where(far, mean, weights)
     weights[weights < 1e-4] = 0.0

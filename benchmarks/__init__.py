@@ -2,4 +2,4 @@
 
 # Importing instant_avatar sets the commands' environment before numpy and torch are there:
 # threads of BLAS that spin while they wait cost five times as much as the work, on a busy machine.
-import instant_avatar as instant_avatar
+import instant_avatar  # noqa: F401

@@ -15,14 +15,16 @@ from PIL import Image
 from capture.input_error import InputError
 from capture.source import ASSUMED_FPS, Frame, FrameSelection, Recording
 
+LOG_LEVEL_SILENT = 0
+"""OpenCV's log level that prints nothing: our messages explain what is wrong with a file."""
+
 
 @cache
 def silence_opencv() -> None:
     """Silence OpenCV and its FFmpeg; to be called before a file is opened."""
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read when FFmpeg is first used
     set_level = getattr(cv2, "setLogLevel", None)  # OpenCV 4 has it here, OpenCV 5 there
-    # silent: our messages explain what is wrong with a file
-    (set_level or cv2.utils.logging.setLogLevel)(0)
+    (set_level or cv2.utils.logging.setLogLevel)(LOG_LEVEL_SILENT)
 
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"})
@@ -48,9 +50,14 @@ EXIF_TRANSPOSE = {
 TIFF_MAGIC = (b"II*\x00", b"MM\x00*")
 """First bytes of TIFF files: their tags are EXIF's, and OpenCV turns their pixels in any mode."""
 
+ALPHA_SAMPLES = 5
+"""Number of images, evenly spread, whose alpha channel is examined."""
 
 ALPHA_SUFFIXES = frozenset({".png", ".webp", ".bmp", ".tif", ".tiff"})
 """File endings of images that can have an alpha channel."""
+
+MIN_TRANSPARENT_FRACTION = 0.01
+"""Fraction of transparent pixels from which an alpha channel is a mask (not rounded corners)."""
 
 
 def natural_sort_key(path: Path) -> list[tuple[int, str]]:
@@ -121,7 +128,7 @@ def write_png(path: Path, picture: UInt8[np.ndarray, "..."]) -> None:
 
 def has_cutout_alpha(alpha: UInt8[np.ndarray, "height width"] | None) -> bool:
     """Return whether an alpha channel cuts the person out: an opaque one does not."""
-    return alpha is not None and float((alpha < 128).mean()) >= 0.01  # more than rounded corners
+    return alpha is not None and float((alpha < 128).mean()) >= MIN_TRANSPARENT_FRACTION
 
 
 def any_has_cutout_alpha(images: Sequence[Path]) -> bool:
@@ -130,7 +137,7 @@ def any_has_cutout_alpha(images: Sequence[Path]) -> bool:
     One image proves nothing: matting tools write opaque ones at first, or where nothing is found.
     """
     able = [path for path in images if path.suffix.lower() in ALPHA_SUFFIXES]
-    places = np.linspace(0, len(able) - 1, min(5, len(able))).round().astype(int)
+    places = np.linspace(0, len(able) - 1, min(ALPHA_SAMPLES, len(able))).round().astype(int)
     for path in (able[place] for place in places):
         try:
             alpha = read_image(path)[1]

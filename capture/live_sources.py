@@ -196,6 +196,9 @@ def _open_device(address: str) -> cv2.VideoCapture:
     )
 
 
+DONE_FILE_NAME = "DONE"
+"""Name of the file whose presence means that no more images will come."""
+
 IDLE_TIMEOUT_S = 10.0
 """Time without a new image after which the source ends, seconds."""
 
@@ -368,7 +371,7 @@ class WatchedImageFolder:
 
     def _is_done(self) -> bool:
         places = [self.path, self.path.parent] if self.path.name == "images" else [self.path]
-        return any((place / "DONE").exists() for place in places)
+        return any((place / DONE_FILE_NAME).exists() for place in places)
 
     def _warn(self, message: str) -> None:
         if message not in self.warnings and len(self.warnings) < 100:

@@ -8,6 +8,9 @@ from typing import final
 
 import numpy as np
 
+PROC_STATUS = Path("/proc/self/status")
+"""Linux's figures about this process."""
+
 
 def peak_memory_mb() -> float:
     """The most that this process has held at a time, MiB.
@@ -16,11 +19,15 @@ def peak_memory_mb() -> float:
     (fs/exec.c sets maxrss of the memory that is left behind); /proc does not.
     """
     try:
-        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+        lines = PROC_STATUS.read_text(encoding="ascii").splitlines()
         return next(float(line.split()[1]) / 1024.0 for line in lines if line.startswith("VmHWM:"))
     except (OSError, ValueError, StopIteration):  # another system
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)
+
+
+RESERVOIR_SIZE = 4096
+"""Numbers that are kept; the percentiles of a shorter stream are exact."""
 
 
 @final
@@ -30,7 +37,7 @@ class ReservoirSample:
     `largest` is the largest of them all; 0 of none.
     """
 
-    def __init__(self, kept: int = 4096) -> None:
+    def __init__(self, kept: int = RESERVOIR_SIZE) -> None:
         """Start an empty sample of at most `kept` numbers."""
         self._most = kept
         self._kept: list[float] = []

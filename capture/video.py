@@ -23,6 +23,8 @@ VIDEO_SUFFIXES = frozenset(
 CONTAINERS_WITH_FRAME_COUNT = frozenset({".mp4", ".mov", ".m4v", ".avi", ".3gp"})
 """Containers that count their frames; of others the count is an estimate from the duration."""
 
+MAX_PIXEL_STRETCH = 0.02
+"""Relative difference of a pixel's width and height from which it is worth a word."""
 
 MAX_DECODE_FAILURES = 16
 """Decoding failures in a row that end a video; one damaged packet does not."""
@@ -164,7 +166,7 @@ class VideoFile(Recording):
 
     def _warn_of_wide_pixels(self, aspect: float) -> None:
         """Warn of pixels that players stretch: images are taken as they are stored."""
-        if abs(aspect - 1.0) > 0.02:
+        if abs(aspect - 1.0) > MAX_PIXEL_STRETCH:
             kind = "narrow" if aspect > 1.0 else "broad"
             self._warn(
                 f"{self.path.name} has pixels that are not square ({aspect:.2f}:1): the person is "

@@ -61,6 +61,12 @@ from preprocess.body.body_pose import BodyPose
 GRAPH_CHECK_PICTURES = {"hq": 2, "lite": 1}
 """Golden frames on which each tier's graph is compared with its reference, 0.2 s each. They test
 the arithmetic of this machine's onnxruntime; further poses would test the same."""
+MAX_GOLDEN_FRAMES = 4
+"""Golden frames of a package."""
+BAKING_PROGRESS = 0.25
+"""Fraction of an export's time after which baking is done."""
+FINE_TUNING_PROGRESS = 0.55
+"""Fraction of an export's time that fine-tuning takes; the rest are the checks."""
 INTERRUPTED_WARNING = (
     "Fine-tuning was interrupted: the package holds the bricks as they were baked, and looks about "
     "half a decibel less like the avatar. ia-export does it all again."
@@ -170,7 +176,7 @@ def export_field(
                 renderer=renderer, views=views, executor=executor,
             ),
             bake_again, config.fine_tuning_pictures,
-            lambda done: progress(0.25 + 0.55 * done),  # after baking; the checks follow
+            lambda done: progress(BAKING_PROGRESS + FINE_TUNING_PROGRESS * done),
         )  # fmt: skip
         compressed = executor.submit(writer.add_tables, tuned.tables)
         interrupted = config.fine_tuning_pictures > 0 and tuned.psnr is None
@@ -257,7 +263,7 @@ def _unchecked_package(
     }
     golden = [
         GoldenFrame(pose=pose, camera=fit_camera(camera, MAX_GOLDEN_PX))
-        for pose, camera in views[:4]
+        for pose, camera in views[:MAX_GOLDEN_FRAMES]
     ]
     return AvatarPackage(
         manifest=Manifest(

@@ -29,12 +29,18 @@ HAZE_DENSITY = 15.0
 """Density of the faint cover that closes regions which no camera saw, 1/m."""
 BORDER_VOXELS = 4
 """Empty voxels around the bricks, so that closing and blurring stay clear of the border."""
+CLOSING_VOXELS = 2
+"""Iterations of closing: holes of twice as many voxels in the cover are closed."""
+SOLID_DEPTH_VOXELS = 3
+"""Depth under the cover from which everything is solid, voxels: bricks hold only visible ones."""
 BLUR_VOXELS = 0.75
 """Standard deviation of the blur before the level set is extracted, voxels."""
 CODE_CONTRAST = 40.0
 """Density codes above and below the level to which densities are clipped."""
 MIN_VOLUME_FRACTION = 0.002
 """Least volume of a part as a fraction of the largest one's; smaller ones are floaters."""
+NORMAL_SMOOTHINGS = 6
+"""Averagings of normals over adjacent vertices, as a trained field is not quite smooth."""
 COLOR_STEP_M = 0.002
 """Step of the rays that give vertices their colors, metres."""
 COLOR_DEPTH_M = 0.03
@@ -43,6 +49,8 @@ COLOR_LEAD_M = 0.004
 """Distance outside the surface at which these rays begin, metres."""
 MIN_COLOR_ALPHA = 0.2
 """Alpha below which a vertex takes the color of the nearest other one."""
+JOINTS_PER_VERTEX = 4
+"""Joints that move a vertex: all importers read this many."""
 TEXEL_M = 0.002
 """Edge of a texel on the surface, about, metres: as fine as the bricks' voxels."""
 MIN_CELL_PX, MAX_SIDE_PX = 6, 4096
@@ -169,10 +177,9 @@ def _level_function(density: UInt8[np.ndarray, "x y z"]) -> Float32[np.ndarray, 
 
 def _solid_interior(cover: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
     """Mark what lies well below a cover with holes."""
-    closed = ndimage.binary_closing(cover, iterations=2)  # holes of four voxels are closed
+    closed = ndimage.binary_closing(cover, iterations=CLOSING_VOXELS)
     filled = ndimage.binary_fill_holes(closed)
-    # bricks hold only visible voxels: all is solid below
-    return np.asarray(ndimage.binary_erosion(filled, iterations=3))
+    return np.asarray(ndimage.binary_erosion(filled, iterations=SOLID_DEPTH_VOXELS))
 
 
 def skinning_weights(
@@ -227,7 +234,7 @@ def _smooth_normals(
     ).tocsr()
     adjacent = touches @ touches.T
     normals = _normalize(touches @ areas)
-    for _ in range(6):  # a trained field is not quite smooth
+    for _ in range(NORMAL_SMOOTHINGS):
         normals = _normalize(adjacent @ normals)
     return normals.astype(np.float32)
 
@@ -268,7 +275,7 @@ def _strongest_joints(
     weights: Float32[np.ndarray, "vertices 24"],
 ) -> tuple[UInt8[np.ndarray, "vertices 4"], UInt8[np.ndarray, "vertices 4"]]:
     """Return the strongest joints of each vertex and their weights as integers that sum to 255."""
-    joints = np.argsort(-weights, axis=1, kind="stable")[:, :4]  # as many as all importers read
+    joints = np.argsort(-weights, axis=1, kind="stable")[:, :JOINTS_PER_VERTEX]
     strongest = np.take_along_axis(weights, joints, axis=1).astype(np.float64)
     scaled = strongest / strongest.sum(axis=1, keepdims=True) * 255.0
     codes = np.floor(scaled).astype(np.int64)

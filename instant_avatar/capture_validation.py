@@ -47,6 +47,8 @@ from preprocess.observation import associate_cameras, associate_masks
 from preprocess.open_capture import open_capture
 from preprocess.poses.plausibility import implausibility_reason
 
+QUICK_FRAMES = 8
+"""Frames checked before a run starts."""
 GOOD_KEYPOINT_SCORE = 0.5
 """Score of the key points from which poses without masks match the images: half of them are within
 4 % of the person's height."""
@@ -59,8 +61,10 @@ MIN_EXCESS = 1.3
 """Area of masks by the body's from which they hold more than the person."""
 MIN_COVERED = 0.85
 """Share of the body that such masks cover."""
+QUICK_OFFSETS = (1, -1, 2, -2)
+"""Delays of the poses, in frames, that are tested even if poses and masks match."""
 QUICK_GAIN = 0.75 * MIN_GAIN
-"""Gain in mean IoU of a delay that is looked into: inexact poses gain 0.01 by chance."""
+"""Gain in mean IoU of such a delay that is looked into: inexact poses gain 0.01 by chance."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -230,14 +234,14 @@ def passes_quick_check(recording: Capture) -> bool:
     if recording.live is not None or not (recording.masks or recording.source.has_alpha):
         return True  # nothing to compare with
     try:
-        masks = _sample_masks(recording, 8)
+        masks = _sample_masks(recording, QUICK_FRAMES)
     except InputError:  # these masks are empty; reading all of them reports that
         return True
     hypothesis = replace(_stored_hypothesis(recording), masks_inverted=False)
     now = mean_score(masks.frame_scores(hypothesis))
     shifts = [
         mean_score(masks.frame_scores(undo_pose_delay(offset).apply(hypothesis)))
-        for offset in (1, -1, 2, -2)
+        for offset in QUICK_OFFSETS
     ]
     return now >= GOOD_IOU and now >= max(shifts) - QUICK_GAIN
 

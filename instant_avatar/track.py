@@ -220,6 +220,8 @@ SHORTER_SIDE_PX = 320
 """Least shorter side of the film, px: smaller frames are enlarged, so that text can be read."""
 LETTER_PX, LINE_PX = 7, 16
 """Width of a letter and height of a line of text, px."""
+SILHOUETTE_PX = 256
+"""Longer side of the images in which the body's outline is found, px."""
 LEFT_COLOR, RIGHT_COLOR, MIDDLE_COLOR = (255, 150, 40), (60, 190, 255), (240, 240, 240)
 """RGB colors of the person's left and right limbs, and of trunk and head."""
 DOUBT_COLOR = (255, 60, 60)
@@ -250,7 +252,7 @@ def _draw_frames(capture: Capture, doubts: Mapping[int, str]) -> Iterator[Rgb]:
         size_px = _film_size_px(item.frame.size_px)
         picture = cv2.resize(item.frame.rgb, size_px, interpolation=cv2.INTER_AREA)
         camera = item.camera.resize(size_px)
-        small = item.camera.resize(shrink_to_longer_side(item.camera.size_px, 256))
+        small = item.camera.resize(shrink_to_longer_side(item.camera.size_px, SILHOUETTE_PX))
         drawn = splat_silhouette(skin.posed(item.pose), small).astype(np.float32)
         _draw_outline(picture, cv2.resize(item.alpha, size_px) > 0.5, MASK_COLOR)
         _draw_outline(picture, cv2.resize(drawn, size_px) > 0.5, BODY_COLOR)

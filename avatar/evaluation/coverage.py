@@ -17,6 +17,8 @@ from preprocess.body.body_pose import BodyPose
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.observation import Observation
 
+EXPECTED_PX = 64
+"""Longer side of the images in which the coverage of poses is found, pixels."""
 MIN_SEEN_COSINE = 0.3
 """Cosine between normal and view direction below which a patch is not seen (72°)."""
 MIN_WELL_SEEN_COSINE = 0.6
@@ -125,7 +127,7 @@ def expected_coverage(shaped: ShapedBody, views: Iterable[tuple[BodyPose, Camera
     """Coverage that frames in these poses will reach, before any frame is read."""
     coverage = Coverage(shaped)
     for pose, camera in views:
-        small = camera.resize_longer_side(64)
+        small = camera.resize_longer_side(EXPECTED_PX)
         width, height = small.size_px
         blank = Frame(index=0, time_s=0.0, rgb=np.zeros((height, width, 3), dtype=np.uint8))
         alpha = np.ones((height, width), dtype=np.float32)

@@ -37,6 +37,8 @@ from preprocess.observation import Observation
 
 Item = TypeVar("Item")
 
+MAX_HELD_OUT = 100
+"""Held-out frames that are kept; bounds the memory of a long video."""
 FRAMES_PER_EVALUATION = 12
 """Held-out frames scored at each point of the learning curve; the end scores them all."""
 
@@ -107,7 +109,9 @@ def score_rendering(
     )
 
 
-def add_held_out(frames: list[HeldOutFrame], frame: HeldOutFrame, *, max_frames: int = 100) -> None:
+def add_held_out(
+    frames: list[HeldOutFrame], frame: HeldOutFrame, *, max_frames: int = MAX_HELD_OUT
+) -> None:
     """Adds a held-out frame, in place; above `max_frames` every second frame is dropped.
 
     The frames that stay are spread evenly over the stream: later frames are added only at the

@@ -20,6 +20,7 @@ SIDE_NAMES = ("front", "back", "left", "right", "top", "under")
 """Directions of the patches in the T-pose; `under` is the underside."""
 ARM_PARTS, FOOT_PARTS = slice(8, 14), slice(5, 7)
 PATCH_M = 0.022
+OCCLUSION_TOLERANCE_M = 0.01
 MAX_SOLE_NORMAL_Y = -0.5
 """Upward component of a foot's normal below which it is a sole and left out."""
 
@@ -108,7 +109,9 @@ def _visible_from_anywhere(
         right = np.cross(to_eye, [0.0, 1.0, 0.0] if abs(to_eye[1]) < 0.9 else [1.0, 0.0, 0.0])
         plane = points @ np.column_stack([right, np.cross(right, to_eye)])
         cosine = normals @ to_eye
-        found = visible_points(plane, -points @ to_eye, cosine, cell_m=PATCH_M, tolerance_m=0.01)
+        found = visible_points(
+            plane, -points @ to_eye, cosine, cell_m=PATCH_M, tolerance_m=OCCLUSION_TOLERANCE_M
+        )
         shown |= found & (cosine > 0.3)
     return shown
 

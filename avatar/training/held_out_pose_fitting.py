@@ -24,6 +24,8 @@ CORRECTIONS_PER_FRAME = 12
 """Corrections of each frame's pose."""
 RAYS_PER_CORRECTION = 4096
 """Rays per correction of a pose: few corrections by many rays end nearer than many by few."""
+PRIOR_PRECISION = 0.25
+"""Precision of the given poses relative to that in training; the avatar is frozen."""
 COARSE_SHARE = 0.5
 """Share of the corrections that follow the coarse levels of the hash grid alone; then poses are so
 near that the finer ones, which do not change any more, point to the right place, too."""
@@ -110,7 +112,7 @@ def _with_neighboring_corrections(
         len(frames),
         poses_may_be_exact=False,
         rays_per_frame=RAYS_PER_CORRECTION,
-        prior_precision=0.25,  # relative to that in training: the avatar is frozen
+        prior_precision=PRIOR_PRECISION,
         equation_decay=0.0,
     )
     for frame in frames:

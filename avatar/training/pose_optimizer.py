@@ -32,8 +32,10 @@ from avatar.training.pose_correction import (
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import body_from_rest, rotation_matrices
 
+MAX_RAYS_PER_FRAME = 512
+"""Rays per frame that are accumulated until its pose is corrected."""
 MIN_RAYS_SHARE = 0.5
-"""Share of a frame's accumulated rays from which its pose may be corrected."""
+"""Share of these rays from which its pose may be corrected."""
 EQUATION_DECAY = 0.85
 """Factor of an estimated pose's earlier normal equations at each of its corrections: about seven
 corrections count. The noise of 512 rays alone is as large as the error that is left."""
@@ -103,7 +105,7 @@ class PoseOptimizer:
         capacity: int,
         *,
         poses_may_be_exact: bool = True,
-        rays_per_frame: int = 512,
+        rays_per_frame: int = MAX_RAYS_PER_FRAME,
         prior_precision: float = 1.0,
         equation_decay: float = EQUATION_DECAY,
     ) -> None:

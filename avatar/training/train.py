@@ -44,6 +44,8 @@ from capture.inbox import Inbox
 from preprocess.body.body_pose import BodyPose
 from preprocess.observation import DroppedFrame
 
+READING_FIRST_AFTER_SHARE = 0.5
+"""Share of the time budget after which reading the video takes precedence over training."""
 MIN_STEPS_AFTER_LAST_FRAME = 20
 """Fewest steps after the last frame, whose rays are drawn first."""
 STREAMING_RATE_FACTOR = 0.5
@@ -229,7 +231,7 @@ class _FrameIntake:
         if self._one_frame_per_step:
             return False
         began, end = self._began, self._trainer.config.seconds
-        late = now > began + 0.5 * (end - began)
+        late = now > began + READING_FIRST_AFTER_SHARE * (end - began)
         return late and not (self.ended or self._inbox.paced)
 
     def is_done(self, now: float) -> bool:

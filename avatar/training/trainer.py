@@ -96,6 +96,12 @@ def step_optimizer(optimizer: UncompiledAdam) -> None:
 
 NETWORK_RATE_FACTOR = 0.3
 """The network's learning rate as a share of the table's."""
+INITIAL_OCCUPANCY_STEPS = 300
+"""Initial steps in which fog clears: the occupancy is probed more often and decays faster."""
+SOURCE_INTERVAL = 64
+"""Steps after which new frames change the sources of unseen skin."""
+CORRECTIONS_PER_STEP = 2
+"""Pose corrections that one training step may make."""
 
 
 @final
@@ -219,7 +225,7 @@ class Trainer:
             detail_share: Progress from coarse samples along rays to fine ones, in [0, 1].
         """
         config, field = self._config_at(detail_share), self.field
-        if self.steps % 64 == 0:  # new frames change the sources
+        if self.steps % SOURCE_INTERVAL == 0:
             self.unseen.update()
         falling = rate if pose_rate is None else pose_rate
         batch = self.replay.sample_rays(config.rays, self.generator)
@@ -267,14 +273,14 @@ class Trainer:
             self.pose_corrections = {i: c for i, c in self.pose_corrections.items() if i in kept}
 
     def _correct_poses(self, rate: float) -> None:
-        for _ in range(2):
+        for _ in range(CORRECTIONS_PER_STEP):
             slot = correct_one_pose(self.replay, self.poses, rate=rate)
             if slot is not None:
                 correction = self.poses.corrections[slot].copy()
                 self.pose_corrections[self.replay.frame_indices[slot]] = correction
 
     def _update_occupancy(self, surface_share: float) -> None:
-        clearing = self.steps < 300  # fog: probed more often, and decaying faster
+        clearing = self.steps < INITIAL_OCCUPANCY_STEPS
         self.avatar.occupancy.update(
             lambda points: self.field.raw_outputs_at(points)[:, 3],
             share=0.5 if clearing else 0.25,

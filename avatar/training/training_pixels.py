@@ -10,6 +10,8 @@ from capture.camera import Camera
 
 NEAR_MASK_SHARE = 0.035
 """Distance from the mask within which pixels are near the person, in image heights."""
+BOX_MARGIN_SHARE = 0.04
+"""Margin of the training pixels around the near ones, in image heights."""
 
 
 class RayView(NamedTuple):
@@ -103,7 +105,7 @@ def near_person_mask(
 def around_person(near: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
     """The pixels in a box around those near the person."""
     rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
-    margin = int(0.04 * len(near))
+    margin = int(BOX_MARGIN_SHARE * len(near))
     box = np.zeros_like(near)
     box[
         max(0, rows[0] - margin) : rows[-1] + margin + 1,

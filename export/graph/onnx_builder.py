@@ -8,6 +8,10 @@ import onnx
 from jaxtyping import Shaped
 from onnx import TensorProto, helper, numpy_helper
 
+ONNX_OPSET = 18
+"""Operator set, which onnxruntime 1.24 and onnxruntime-web run."""
+ONNX_IR_VERSION = 9
+"""Version of the file format of that operator set."""
 ONNX_TYPES = {
     np.dtype(np.float32): TensorProto.FLOAT,
     np.dtype(np.int32): TensorProto.INT32,
@@ -279,9 +283,8 @@ class GraphBuilder:
             helper.make_graph(
                 self._nodes, "avatar", self._inputs, self._outputs, self._initializers
             ),
-            # run by onnxruntime 1.24 and onnxruntime-web
-            opset_imports=[helper.make_opsetid("", 18)],
-            ir_version=9,
+            opset_imports=[helper.make_opsetid("", ONNX_OPSET)],
+            ir_version=ONNX_IR_VERSION,
         )
 
 

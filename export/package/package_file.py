@@ -30,6 +30,10 @@ MAX_FILE_BYTES = 256 << 20
 """Largest package that is opened."""
 MAX_DIRECTORY_BYTES = 1 << 17
 """Largest central directory; `zipfile` reads it whole before entries can be counted."""
+ALLOWED_COMPRESSION = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+"""Compression methods of entries."""
+ENTRY_TIMESTAMP = (1980, 1, 1, 0, 0, 0)
+"""Time stamp of every entry, so that equal avatars give equal bytes."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -139,8 +143,7 @@ class PackageWriter:
 
     def _add(self, name: str, content: bytes) -> None:
         self._sums[name] = hashlib.sha256(content).hexdigest()
-        # so that equal avatars give equal bytes
-        info = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
+        info = zipfile.ZipInfo(name, ENTRY_TIMESTAMP)
         self._archive.writestr(info, content, zipfile.ZIP_DEFLATED, 6)
 
 
@@ -212,10 +215,7 @@ class _UntrustedArchive:
             if name.startswith("/") or ".." in parts or "\\" in name or ":" in name:
                 raise InputError(f"{path} holds {name!r}, a path outside of the package. Refused.")
         for info in infos:
-            if info.flag_bits & 1 or info.compress_type not in (
-                zipfile.ZIP_STORED,
-                zipfile.ZIP_DEFLATED,
-            ):
+            if info.flag_bits & 1 or info.compress_type not in ALLOWED_COMPRESSION:
                 raise InputError(
                     f"{path}: {info.filename} is encrypted or compressed in a way that packages "
                     "are not. Refused."

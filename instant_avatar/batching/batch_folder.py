@@ -31,6 +31,8 @@ RESULTS_NAME = "results.jsonl"
 """A line for each capture that has ended, the newest last."""
 FAILED_NAME = "_failed"
 """Folder with the logs of captures without an avatar."""
+SAVE_INTERVAL_S = 30.0
+"""Interval at which the results are sent to a URL, where nothing can be appended, seconds."""
 
 
 def folder_of(name: str, status: str) -> str:
@@ -113,7 +115,7 @@ class BatchFolder:
         if self.path is not None:
             with (self.path / RESULTS_NAME).open("a", encoding="utf-8") as results:
                 results.write(_line(record))
-        elif time.monotonic() - self._saved_at > 30.0:
+        elif time.monotonic() - self._saved_at > SAVE_INTERVAL_S:
             with suppress(RemoteFileError):  # the next time sends it
                 self._save()
         return record

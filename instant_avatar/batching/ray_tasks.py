@@ -22,6 +22,8 @@ from instant_avatar.cli.hardware import usable_cores
 
 MAX_SUBMITTED = 1000
 """Tasks that Ray holds at a time, running or waiting."""
+OBJECT_STORE_BYTES = 200_000_000
+"""Memory for what attempts bring back (about 5 MB each), where this machine alone is used."""
 
 
 def run_attempts(
@@ -61,8 +63,7 @@ def _connect(ray: Any, address: str) -> None:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent anywhere
     own: dict[str, Any] = {}
     if address == RAY_LOCAL:
-        # attempts bring back about 5 MB each
-        own = {"num_cpus": usable_cores(), "object_store_memory": 200_000_000}
+        own = {"num_cpus": usable_cores(), "object_store_memory": OBJECT_STORE_BYTES}
         own["include_dashboard"] = False
     on_sigterm = signal.getsignal(signal.SIGTERM)
     try:

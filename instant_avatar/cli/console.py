@@ -18,6 +18,12 @@ MAX_KEPT_WARNINGS = 500
 """Warnings that are kept, so that memory stays bounded for any length of video."""
 LOG_INTERVAL_S = 10.0
 """Seconds between two progress lines in a log."""
+MIN_BAR_WIDTH = 8
+"""Least width of a bar next to a long note, characters."""
+MIN_ELAPSED_FOR_ESTIMATE_S = 2.0
+"""Elapsed time before which the remaining time is not estimated, seconds."""
+MIN_SHARE_FOR_ESTIMATE = 0.15
+"""Fraction done before which the remaining time is not estimated."""
 
 
 def format_duration(seconds: float) -> str:
@@ -121,7 +127,7 @@ class ProgressBar:
                 TextColumn(
                     "[bold]{task.description}", table_column=_min_width_column(len(self._label))
                 ),
-                BarColumn(bar_width=28, table_column=_min_width_column(8)),
+                BarColumn(bar_width=28, table_column=_min_width_column(MIN_BAR_WIDTH)),
                 TextColumn("{task.fields[note]}"),
                 console=self._console,
                 transient=True,
@@ -152,7 +158,7 @@ class ProgressBar:
 
     def _remaining_text(self, done: float) -> str:
         took = time.perf_counter() - self._started_at
-        early = done < 0.15 * self._total or took < 2.0
+        early = done < MIN_SHARE_FOR_ESTIMATE * self._total or took < MIN_ELAPSED_FOR_ESTIMATE_S
         if early or done >= self._total:
             return ""
         return f", about {format_duration(took * (self._total - done) / done)} left"

@@ -36,6 +36,10 @@ from instant_avatar.report.report_writer import motion_animation
 from instant_avatar.run.run_folder import RunFolder
 from preprocess.observation import Observation
 
+BEST_TIER = "hq"
+"""Tier that every package has."""
+FIT_BATCH_FRAMES = 25
+"""Number of frames whose poses are fitted together."""
 VOLUME_RENDERER = "renderer"
 """Name of the volume renderer in the table."""
 
@@ -101,7 +105,7 @@ class EvaluationSession:
         )
         with self.console.progress(f"scoring {name}", float(frames.count or 0)) as bar:
             done, rest = 0, iter(frames)
-            while group := list(islice(rest, 25)):
+            while group := list(islice(rest, FIT_BATCH_FRAMES)):
                 for observation in group:
                     if self.stop.is_set():
                         break
@@ -138,7 +142,7 @@ class EvaluationSession:
                 "The player renders pinhole images; this lens has distortion, so it is not scored."
             )
             return renderers
-        for tier in ("hq", *Player.load(package).manifest.tiers):  # every package has it
+        for tier in (BEST_TIER, *Player.load(package).manifest.tiers):
             if f"player {tier}" not in renderers:
                 renderers[f"player {tier}"] = partial(_play, Player.load(package, tier=tier))
         return renderers

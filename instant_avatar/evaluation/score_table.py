@@ -101,6 +101,9 @@ COLUMNS = {
     "ssim": ("SSIM", ".4f"),
 }
 """Heading and format of each metric in the table, but those of LPIPS and time."""
+PAPER_ROW_NAME = "InstantAvatar (paper)"
+"""Renderer of the rows with the paper's scores."""
+NOT_MEASURED = "n/a"
 
 
 def table_cells(evaluations: Sequence[AvatarEvaluation]) -> list[list[str]]:
@@ -129,7 +132,7 @@ def table_cells(evaluations: Sequence[AvatarEvaluation]) -> list[list[str]]:
             add(each.name, str(len(row.scores)), row.way, means_of(row))
             lines[-1].append(row.verdict or "")
         if each.paper is not None:
-            add(each.name, "", ("InstantAvatar (paper)", "fitted", "white"), each.paper)
+            add(each.name, "", (PAPER_ROW_NAME, "fitted", "white"), each.paper)
             lines[-1].append("")
     for first in evaluations[0].rows if len(evaluations) > 1 else ():
         alike = [row for row in rows if row.way == first.way]
@@ -167,4 +170,4 @@ def markdown_table(evaluations: Sequence[AvatarEvaluation]) -> str:
 def _format_cell(metric: str, value: float | None, form: str) -> str:
     if value is not None:
         return format(value, form)
-    return "n/a" if metric.startswith("lpips") else ""
+    return NOT_MEASURED if metric.startswith("lpips") else ""

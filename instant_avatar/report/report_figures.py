@@ -86,6 +86,12 @@ VIEW_AXES = {"front": (0, 1.0), "left": (2, -1.0), "back": (0, -1.0), "right": (
 """Axis of the body, and its sign, that points right in each view."""
 DOT_SPACING_CM = 2.7
 """Distance of neighboring dots, centimeters."""
+MAX_PATCH_DISTANCE_CM = 3.2
+"""Distance to the nearest visible patch beyond which a dot lies off the body, centimeters."""
+GAP_CM = 14.0
+"""Gap between two views, centimeters."""
+MARGIN_CM = 4.0
+"""Margin around the map, centimeters."""
 LEVELS = ("never", "slant", "well")
 """CSS classes of a dot: unseen, seen at a grazing angle, seen frontally."""
 
@@ -118,11 +124,11 @@ class CoverageMap:
             places = 100.0 * (plane[shown] - top_left) * [1.0, -1.0]
             dots = _hexagonal_grid(places.max(axis=0))
             distance_cm, nearest = map(np.asarray, KDTree(places).query(dots))
-            on_body = distance_cm < 3.2
+            on_body = distance_cm < MAX_PATCH_DISTANCE_CM
             self._views[name] = _MapView(
                 positions_cm=(dots[on_body] + [left, 0.0]).round(1), patches=shown[nearest[on_body]]
             )
-            left += float(places[:, 0].max()) + 14.0  # centimeters, as are margin and places
+            left += float(places[:, 0].max()) + GAP_CM
 
     def svg(self) -> Markup:
         """Draw the coverage in its current state; the CSS classes in `LEVELS` give the colors."""
@@ -140,7 +146,9 @@ class CoverageMap:
             )
             for name, view in self._views.items()
         ]
-        return render_template("body_map.svg", views=views, width=width, height=height, margin=4.0)
+        return render_template(
+            "body_map.svg", views=views, width=width, height=height, margin=MARGIN_CM
+        )
 
 
 def _hexagonal_grid(size_cm: Float[np.ndarray, "2"]) -> Float[np.ndarray, "grid 2"]:

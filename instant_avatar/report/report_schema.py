@@ -18,6 +18,9 @@ from avatar.events import HeldOutScore
 from capture.process_metrics import ReservoirSample
 from preprocess.observation import DroppedFrame
 
+REPORT_FORMAT = 1
+"""Version of the format of report.json."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class MachineInfo:
@@ -282,7 +285,7 @@ class Report:
     earlier_videos: ForgettingStats | None = None
     cameras: dict[str, Any] | None = None
     tracking: dict[str, Any] | None = None
-    format: int = 1
+    format: int = REPORT_FORMAT
 
     @property
     def verdict(self) -> SharpnessVerdict | None:

@@ -54,10 +54,14 @@ from instant_avatar.run.stream_meter import StreamMeter
 
 SCORING_LIMIT_S = 12.0
 """Wall time that final scoring and pose fitting aim for."""
+WHOLE_IMAGES_SHARE = 0.2
+"""Share of that time after which frames in given poses are no longer scored as whole images."""
 MIN_WHOLE_IMAGES = 3
 """Frames that are scored as whole images, whatever it takes."""
 MAX_WHOLE_IMAGES = 12
 """Frames that are scored as whole images, at most."""
+UNFILMED_REDUCTION = 2
+"""Factor by which pictures of views that were not filmed are reduced."""
 FRAMES_PER_FIT = 6
 """Frames whose poses are fitted together; no more are fitted once the time is up."""
 KEPT_RENDERINGS = 6
@@ -158,7 +162,7 @@ def score_finally(
     limit_s = math.inf if trainer.config.steps else SCORING_LIMIT_S
     began, scored = time.perf_counter(), list[_ScoredFrame]()
     with console.progress(f"scoring {len(held_out)} held-out frames", float(len(held_out))) as bar:
-        whole_until = began + 0.2 * limit_s
+        whole_until = began + WHOLE_IMAGES_SHARE * limit_s
         for one in _score_in_given_poses(trainer.avatar, held_out, whole_until):
             scored.append(one)
             bar.set_count(len(scored))
@@ -173,7 +177,9 @@ def score_finally(
         sampled=tuple(scored[i].sampled for i in order),
         fitted=tuple(sorted(fitted, key=lambda score: score.frame)),
         renderings={one.given.frame: one.rendering for one in shown if one.rendering is not None},
-        half_transparent=half_transparent_share(render_unfilmed_views(trainer.avatar, reduction=2)),
+        half_transparent=half_transparent_share(
+            render_unfilmed_views(trainer.avatar, reduction=UNFILMED_REDUCTION)
+        ),
     )
 
 

@@ -34,8 +34,22 @@ from preprocess.body.body_pose import BodyPose
 from preprocess.capture_session import Capture
 from preprocess.observation import Observation
 
+RENDER_TIME_SHARE = 0.1
+"""Fraction of the time that the page may take during training."""
+IDLE_RENDER_TIME_SHARE = 0.9
+"""Fraction of the time that the page may take while training is paused or done."""
+MOVING_HEIGHT_PX = 160
+"""Height of the image while camera or pose move."""
+RESTING_HEIGHT_PX = 360
+"""Height of the image at rest, during training."""
+IDLE_HEIGHT_PX = 720
+"""Height of the image at rest while training is paused or done."""
 REST_DELAY_S = 0.4
 """Time without motion after which the image counts as at rest, seconds."""
+PANEL_INTERVAL_S = 0.25
+"""Interval of updates of the panel, seconds."""
+MAP_INTERVAL_S = 1.0
+"""Interval of updates of the coverage map, seconds."""
 
 
 @final
@@ -136,16 +150,16 @@ class LiveViewer:
         """Update the parts of the page that are due."""
         now = time.perf_counter()
         if now >= self._next_panel:
-            self._next_panel = now + 0.25
+            self._next_panel = now + PANEL_INTERVAL_S
             self._fill_panel(session, status)
         if now >= self._next_map:
-            self._next_map = now + 1.0
+            self._next_map = now + MAP_INTERVAL_S
             self._fill_map(session)
         if session.trainer.steps and now >= self._next_picture:
             began = time.perf_counter()
             if self._render_next_view(session, idle=idle):
                 took = time.perf_counter() - began
-                share = 0.9 if idle else 0.1  # of the time: training comes first
+                share = IDLE_RENDER_TIME_SHARE if idle else RENDER_TIME_SHARE
                 self._next_picture = began + took / share
 
     def _fill_panel(self, session: TrainingSession, status: str) -> None:
@@ -210,10 +224,9 @@ class LiveViewer:
         return False
 
     def _render_height_px(self, look: BrowserCamera, now: float, *, plays: bool, idle: bool) -> int:
-        """Height of the image: least while camera or pose move, most while training rests."""
         if plays or now - look.moved_at < REST_DELAY_S:
-            return 160
-        return 720 if idle else 360
+            return MOVING_HEIGHT_PX
+        return IDLE_HEIGHT_PX if idle else RESTING_HEIGHT_PX
 
     def _correspondence_grid(
         self, session: TrainingSession, pose: BodyPose, now: float

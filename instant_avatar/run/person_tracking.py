@@ -36,6 +36,8 @@ from preprocess.tracking.pose_lift import lift_keypoints
 from preprocess.tracking.tracking_grade import TrackingGrade, grade_tracking
 from preprocess.tracking.video_tracking import TrackedVideo, track_video
 
+GRADED_FRAMES = 60
+"""Frames, evenly spread, whose masks are compared with the body."""
 MAX_PRINTED_STRETCHES = 8
 """Doubtful stretches that are printed; reports hold all of them."""
 MAX_FRAMES = 600
@@ -296,7 +298,7 @@ def _grade(capture: Capture, frame_times_s: Mapping[int, float]) -> TrackingGrad
         associate_masks(capture.masks, source),
         associate_cameras(capture.cameras, source),
         SkinPoints.of(capture.shaped),
-        count=60,
+        count=GRADED_FRAMES,
         excluded_frames=capture.cameras.frames_without_camera,
     )
     scores = sampled.frame_scores(CaptureGeometry.of(capture.motion, capture.cameras, source))

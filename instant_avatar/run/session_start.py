@@ -42,6 +42,11 @@ def set_threads(requested: int | None) -> int:
 if TYPE_CHECKING:  # viser is an optional extra
     from instant_avatar.run.live_viewer import LiveViewer
 
+EXPECTED_POSES = 60
+"""Poses, evenly spread, that tell what a film will show of the person."""
+JOINT_TOLERANCE_M = 1e-3
+"""Largest difference of rest joints within one body, meters; more is another body."""
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PreparedTrainer:
@@ -228,7 +233,7 @@ def _extend_budget(
 def _check_same_body(trainer: Trainer, capture: Capture, run: RunFolder) -> None:
     """Refuse poses of another body than the checkpoint's."""
     difference_m = abs(trainer.avatar.rig.rest_joints - capture.shaped.joints).max()
-    if difference_m > 1e-3:
+    if difference_m > JOINT_TOLERANCE_M:
         raise InputError(
             f"The poses use a different body than the avatar in {run.path} (rest joints differ by "
             f"up to {100.0 * difference_m:.1f} cm), and {run.body_file.name} is missing. Retrain "
@@ -243,7 +248,7 @@ def _announce_coverage(capture: Capture, console: Console) -> None:
     wanted = [row for row in rows if selection.contains(round(frames[row]))]
     if capture.live is not None or not wanted:
         return
-    some = wanted[:: -(-len(wanted) // 60)]
+    some = wanted[:: -(-len(wanted) // EXPECTED_POSES)]
     views = ((capture.motion[row], capture.camera_of_pose(row)) for row in some)
     expected = expected_coverage(capture.shaped, views)
     if expected.seen_share < SEEN.sharp:

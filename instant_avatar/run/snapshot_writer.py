@@ -107,6 +107,8 @@ class CheckpointWriter:
 
 VALIDATION_VIEWS = 4
 """Views that a package is validated with."""
+QUICK_VALIDATION_VIEWS = 2
+"""Views that a quick package is validated with."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,7 +154,7 @@ def write_package_snapshot(
         exported = export_avatar(
             trainer.avatar,
             path,
-            views=views[:2] if quick else views,
+            views=views[:QUICK_VALIDATION_VIEWS] if quick else views,
             metrics=metrics,
             quick=quick,
             fine_tune_bricks=fine_tune,

@@ -16,6 +16,8 @@ Item = TypeVar("Item")
 
 MAX_DROPPED_LISTED = 1000
 """Dropped frames that are listed with their reasons; the rest are only counted."""
+LATENESS_WARNING_S = 0.5
+"""Lateness of playback, 95th percentile in seconds, from which the user is warned."""
 
 
 @final
@@ -114,7 +116,7 @@ class StreamMeter:
                 "--size."
             )
         playback = self._source.paced and not self._source.live
-        if playback and not dropped and late.percentile(95.0) > 0.5:  # seconds
+        if playback and not dropped and late.percentile(95.0) > LATENESS_WARNING_S:
             yield (
                 f"Playback lagged by up to {late.largest:.1f} s (median "
                 f"{late.percentile(50.0):.1f} s): preprocessing is slower than the frame rate. No "

@@ -45,6 +45,9 @@ from preprocess.body.body_pose import BodyPose
 from preprocess.capture_session import Capture
 from preprocess.observation import Observation
 
+REVISED_PER_STEP = 2
+"""Frames whose poses are replaced between two steps; each solves its correspondences again."""
+
 
 @runtime_checkable
 class TrainingObserver(Protocol):
@@ -273,7 +276,7 @@ class TrainingSession:
                     frame, observation=replace(frame.observation, pose=pose)
                 )
         self._revised_poses |= found
-        for _ in range(min(2, len(self._revised_poses))):  # each solves its correspondences again
+        for _ in range(min(REVISED_PER_STEP, len(self._revised_poses))):
             number = next(iter(self._revised_poses))
             self.trainer.revise_pose(number, self._revised_poses.pop(number))
 

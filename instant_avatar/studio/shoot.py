@@ -76,6 +76,8 @@ def _write_track(path: Path, *cameras: Camera) -> None:
     write_cameras(path, CameraTrack(cameras=cameras, source="studio"))
 
 
+PHONE_ARM_LIFT_DEG = -64.0
+"""Arms near the body: they fit into a portrait."""
 PHONE_TURNS, WALK_TURNS, TURNS = 1.25, -0.75, 2.0
 """Turns of the actor before a phone, a phone that is carried around, or the studio's camera, if the
 user names none."""
@@ -132,8 +134,7 @@ def _choose_motion(actor: Actor, config: ShootConfig) -> Motion:
     }
     if config.like_a_phone:
         turns = PHONE_TURNS
-        # arms near the body fit into a portrait
-        acts["turn"] = partial(acts["turn"], arm_lift_deg=-64.0)
+        acts["turn"] = partial(acts["turn"], arm_lift_deg=PHONE_ARM_LIFT_DEG)
     return acts[config.motion](
         actor,
         frames=config.frames,

@@ -26,6 +26,9 @@ from instant_avatar.studio.gestures import (
 )
 from preprocess.body.body_pose import BodyPose, Motion
 
+ARM_LIFT_DEG = -44.0
+"""Upper arms above the horizontal, while the actor turns before a wide camera."""
+
 
 def turning_motion(
     actor: Actor,
@@ -34,7 +37,7 @@ def turning_motion(
     fps: float,
     turns: float,
     seed: int,
-    arm_lift_deg: float = -44.0,
+    arm_lift_deg: float = ARM_LIFT_DEG,
 ) -> Motion:
     """Turning round on the spot, arms off the body, swaying a little (PeopleSnapshot's way)."""
     phases = np.random.default_rng([seed, 1]).uniform(0.0, 2.0 * np.pi, 8)
@@ -199,6 +202,7 @@ def _set_on_floor(actor: Actor, pose: BodyPose, hop: float) -> BodyPose:
 
 
 STATIC_DISTANCE_M = 3.2
+STATIC_HEIGHT_M = 1.2
 
 PERSON_HEIGHT_SHARE = 0.825
 """Height of the standing person as a share of the picture's."""
@@ -256,7 +260,7 @@ def _standing_vertices(actor: Actor) -> Float[np.ndarray, "vertices 3"]:
 
 def _aim_camera(size_px: tuple[int, int], focal: float, target: float) -> Camera:
     """A camera in front of the actor that looks at the height `target` above the origin."""
-    eye = np.array([0.0, 1.2, STATIC_DISTANCE_M])
+    eye = np.array([0.0, STATIC_HEIGHT_M, STATIC_DISTANCE_M])
     forward = np.array([0.0, target, 0.0]) - eye
     forward /= np.linalg.norm(forward)
     right = np.array([1.0, 0.0, 0.0])
@@ -278,12 +282,16 @@ ARC_DEG = 120.0
 WALK_DISTANCE_HEIGHTS = 1.52
 """Distance to the actor, in heights of the actor: the whole body is in the image."""
 HANDHELD_HEIGHT_M = 1.4
+STANDING_DISTANCE_M = 3.4
+"""Distance from which the camera that stands still sees raised arms, too."""
 
 NEAR_FOOT_OFFSET_M = 0.2
 """Distance by which the nearer foot is closer to the camera than the body center, metres."""
 
 SHAKE_M, SHAKE_DEG = 0.012, 0.6
 """Standard deviation of the hand's trembling, for each axis."""
+SHAKE_FRAMES = 2.5
+"""Standard deviation of its smoothing, frames."""
 
 
 def handheld_cameras(
@@ -295,7 +303,7 @@ def handheld_cameras(
     """
     frames = len(actor_xz_m)
     generator = np.random.default_rng([seed, 7])
-    shake = _smooth_gaussian_noise(generator, frames, 6, 2.5)
+    shake = _smooth_gaussian_noise(generator, frames, 6, SHAKE_FRAMES)
     slow = _smooth_gaussian_noise(generator, frames, 3, max(frames / 6.0, 1.0))
     share = np.linspace(0.0, 1.0, frames) + 0.02 * np.sin(2.0 * np.pi * np.linspace(0, 1, frames))
     angles = np.deg2rad(ARC_DEG) * (share - 0.5)
@@ -316,7 +324,7 @@ def handheld_cameras(
 
 def standing_camera(height_m: float, size: int) -> Camera:
     """A camera that stands still in the middle of the arc, a step behind it."""
-    eye = np.array([0.0, HANDHELD_HEIGHT_M, 3.4])  # raised arms are in the image, too
+    eye = np.array([0.0, HANDHELD_HEIGHT_M, STANDING_DISTANCE_M])
     return _aim_handheld_camera(eye, np.zeros(2), height_m, size, np.zeros(3))
 
 

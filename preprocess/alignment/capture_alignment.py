@@ -36,6 +36,8 @@ FOCAL_SAMPLES = 6
 """Frames to whose masks a focal length is fitted."""
 MIN_FOCAL_IOU = 0.6
 """Mean IoU of body and masks from which a fitted focal length is taken."""
+HEIGHT_TOLERANCE_CM = 1.5
+"""Largest difference between a stated height and the avatar's own, centimetres."""
 
 
 def estimate_focal_length(
@@ -72,8 +74,12 @@ def estimate_focal_length(
 
 MIN_OWN_SHAPE_GAIN = 0.02
 """Gain in mean IoU by which the body's own proportions must beat SMPL's."""
+SAME_SHAPE_M = 5e-4
+"""Largest distance between the resting surfaces of bodies that are the same, metres."""
 REPORTED_DIFFERENCE_M = 0.01
 """Least difference in height, or of a joint relative to the pelvis, that is reported, metres."""
+MAX_HEIGHT_DIFFERENCE = 0.08
+"""Relative difference in height beyond which it may not be the same person."""
 NO_PERSON_FOUND = (
     "There are no masks, and where the poses put the body no person was found in the images; "
     "distances stay as they are. Do poses and video belong together? Give --masks, from which "
@@ -148,7 +154,7 @@ def is_same_person(a: ShapedBody, b: ShapedBody) -> bool:
     """Check whether two shapes of one body model are the same person."""
     same = a.vertices.shape == b.vertices.shape
     return same and all(
-        bool(np.abs(one - other).max() < 5e-4)
+        bool(np.abs(one - other).max() < SAME_SHAPE_M)
         for one, other in ((a.vertices, b.vertices), (a.joints, b.joints))
     )
 
@@ -174,7 +180,7 @@ def _describe_difference(shaped: ShapedBody, person: ShapedBody) -> str:
     apart = float(np.linalg.norm(off, axis=1).max())
     if abs(theirs - ours) < REPORTED_DIFFERENCE_M and apart < REPORTED_DIFFERENCE_M:
         return ""
-    doubt = " Is it the same person?" if abs(theirs / ours - 1.0) > 0.08 else ""
+    doubt = " Is it the same person?" if abs(theirs / ours - 1.0) > MAX_HEIGHT_DIFFERENCE else ""
     return (
         f"Their betas state a body of {100.0 * theirs:.0f} cm, the avatar's has "
         f"{100.0 * ours:.0f} cm (joints up to {100.0 * apart:.1f} cm elsewhere): the avatar keeps "
@@ -279,7 +285,7 @@ def fit_person(
 def _check_height(person: ShapedBody, height_m: float | None) -> None:
     """Raises if a stated height is not the avatar's."""
     height_cm = 100.0 * body_height_m(person)
-    if height_m is not None and abs(100.0 * height_m - height_cm) > 1.5:
+    if height_m is not None and abs(100.0 * height_m - height_cm) > HEIGHT_TOLERANCE_CM:
         raise InputError(
             f"--height-cm is {100.0 * height_m:.0f}, but the avatar in --out is {height_cm:.0f} cm "
             "tall, which was settled by its first video. Leave it out, or train it from the start "

@@ -30,6 +30,8 @@ VIEW_SECTORS = 12
 """Sectors of directions around the body."""
 MIN_VIEW_COVERAGE = 0.5
 """Fraction of the sectors below which the video shows too few sides."""
+MAX_BETA = 6.0
+"""Largest plausible magnitude of a shape coefficient."""
 MAX_LISTED_FRAMES = 6
 """Frame numbers that a message lists."""
 
@@ -258,7 +260,7 @@ def _timestamp_warnings(geometry: CaptureGeometry, frames: list[int]) -> Iterato
 def _range_warnings(geometry: CaptureGeometry) -> Iterator[str]:
     motion = geometry.motion
     yield from plausibility_warnings(motion)
-    if len(motion.betas) and np.abs(motion.betas).max() > 6.0:
+    if len(motion.betas) and np.abs(motion.betas).max() > MAX_BETA:
         yield f"A shape coefficient is {np.abs(motion.betas).max():.1f}; people have -3 to 3."
 
 

@@ -29,6 +29,8 @@ MAX_UNMATCHED_OFFSETS = 24
 """Largest number of offsets to try where there are fewer poses than frames."""
 FRAME_RATES = (24.0, 25.0, 30.0, 50.0, 60.0)
 """Frame rates, Hz, that are mistaken for one another."""
+TRANSLATION_UNITS = {0.001: "millimetres", 0.01: "centimetres"}
+"""Metres in each unit that translations may wrongly be given in."""
 AXIS_FLIPS = {"y": (1.0, -1.0, 1.0), "z": (1.0, 1.0, -1.0), "y and z": (1.0, -1.0, -1.0)}
 """Signs of the root translation's coordinates, by those that are wrong."""
 KNOWN_TURNS = {
@@ -180,7 +182,7 @@ def _pose_entries(motion: Motion, pelvis: Float[np.ndarray, "3"]) -> CatalogEntr
         (-1.0, "the root's translation was already converted from the origin to the pelvis"),
     ):
         yield "root_origin", words, _moves(partial(about_origin, sign=sign))
-    for factor, unit in {0.001: "millimetres", 0.01: "centimetres"}.items():
+    for factor, unit in TRANSLATION_UNITS.items():
         words = f"the poses' translations are in {unit}, not in metres"
         yield "body_scale", words, _moves(partial(scaled, factor=factor))
 

@@ -36,6 +36,8 @@ MIN_STANDARD_ERRORS = 3.0
 """Standard errors, over the frames, by which a gain must exceed 0."""
 MAX_LOST_FRACTION = 0.3
 """Fraction of the frames with poses that a correction may leave without; more count as score 0."""
+MAX_CORRECTIONS = 3
+"""Corrections that are named at most."""
 COARSE_SAMPLES = 6
 """Masks in which every candidate is scored where there are no key points."""
 MAX_CANDIDATES = 8
@@ -158,7 +160,7 @@ class _CorrectionSearch:
         scores = self.objective.frame_scores(geometry)
         chosen: list[Correction] = []
         first: tuple[CorrectionCandidate, ...] = ()
-        while len(chosen) < 3:
+        while len(chosen) < MAX_CORRECTIONS:
             candidates = self._best_candidates(geometry)
             first = first if chosen else best_per_cause(candidates)
             candidates = [c for c in candidates if is_significant(c, geometry, scores)]

@@ -30,6 +30,8 @@ MAX_LOG_WINDOW = 0.7
 """Largest logarithm of the size of a cropped or padded video relative to the masks' image."""
 CAMERA_ERROR_HEIGHTS = 0.06
 """Distance at which a key point is an outlier of a fitted camera, in the person's height."""
+MIN_CAMERA_POINTS = 24
+"""Fewest key points to which a camera is fitted."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -273,7 +275,7 @@ def fit_extrinsics(geometry: CaptureGeometry, objective: KeypointObjective) -> C
     if len(geometry.extrinsics) > 1 or found is None:
         return None
     used = bodies.known[:, None] & (objective.confidence >= np.median(objective.confidence))
-    if used.sum() < 24:
+    if used.sum() < MIN_CAMERA_POINTS:
         return None
     success, turn, shift, _ = cv2.solvePnPRansac(
         bodies.world_m[used], found[used], geometry.intrinsics[0], np.array(geometry.distortion),

@@ -43,6 +43,8 @@ THUMBNAIL_PX = 300
 """Height of the images that are kept to be shown."""
 HALF_SCORE_HEIGHTS = 0.04
 """Distance of a key point at which it counts half, in the person's height."""
+ROBUST_STEPS = 8
+"""Steps of a robust linear fit."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -207,7 +209,7 @@ class KeypointObjective:
         weights = np.broadcast_to(self.confidence[..., None], rows.shape)[rows]
         design, target, robust = design[rows], target[rows], np.float64(1.0)
         numbers = np.zeros(design.shape[-1])
-        for _ in range(8 if len(target) else 0):
+        for _ in range(ROBUST_STEPS if len(target) else 0):
             scaled = np.sqrt(weights * robust)
             numbers = np.linalg.lstsq(scaled[:, None] * design, scaled * target, rcond=None)[0]
             off = np.abs(design @ numbers - target)

@@ -51,6 +51,12 @@ def rescale_motion(geometry: CaptureGeometry, shaped: ShapedBody, resized: Shape
 
 ALIGNMENT_SAMPLES = 8
 """Frames to whose masks a body is aligned."""
+ALIGNMENT_EVALUATIONS = 110
+"""Evaluations of the search."""
+FIRST_LOG_DISTANCE = 0.08
+"""First step of the distance's logarithm."""
+FIRST_PELVIS_SHIFT_M = 0.03
+"""First step of the pelvis's shift, metres."""
 SHIFT_PENALTY = 4.0
 """Penalty of a shift in IoU per m²: from one side, a smaller distance and a shift towards the
 camera look alike."""
@@ -126,11 +132,11 @@ def place_body_on_masks(geometry: CaptureGeometry, objective: SilhouetteObjectiv
     found = np.zeros(4)
     if posed:
         simplex = np.vstack(
-            [np.zeros(4), np.diag([0.08, 0.03, 0.03, 0.03])]  # first steps of the search
+            [np.zeros(4), np.diag([FIRST_LOG_DISTANCE, *[FIRST_PELVIS_SHIFT_M] * 3])]
         )
         found = minimize(
             lambda x: -penalized_iou(x), found, method="Nelder-Mead",
-            options={"maxfev": 110, "initial_simplex": simplex},
+            options={"maxfev": ALIGNMENT_EVALUATIONS, "initial_simplex": simplex},
         ).x  # fmt: skip
     divisor = float(np.exp(found[0]))
     motion = _move_motion(geometry, shaped, divisor, found[1:])

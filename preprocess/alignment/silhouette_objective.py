@@ -27,12 +27,16 @@ USABLE_IOU = 0.5
 """Mean IoU below which a capture cannot be trained on."""
 SAMPLED_FRAMES = 16
 """Number of frames that are sampled."""
+COARSE_MASK_PX = 256.0
+"""Longer side of the masks in which the person's height is measured, px."""
 MIN_BOX_FILL = 0.95
 """Fraction of its bounding box that no person's outline fills."""
 MIN_COVERED_FRACTION = 0.1
 """Fraction of a mask's connected part that the body must cover to be of the same person."""
 MIN_PERSON_PX = 60
 """Median height of the person below which there is little detail, px."""
+MAX_CACHED_POSES = 256
+"""Posed skins in the cache: 25 MB."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -123,7 +127,7 @@ class SilhouetteObjective:
     def posed_points(self, motion: Motion, row: int) -> Float32[np.ndarray, "points 3"]:
         """The skin in one of a motion's poses; cached, as candidates share poses."""
         if (motion, row) not in self._posed_cache:
-            if len(self._posed_cache) >= 256:  # 25 MB of posed skins
+            if len(self._posed_cache) >= MAX_CACHED_POSES:
                 self._posed_cache.clear()
             self._posed_cache[motion, row] = self.skin.posed(motion[row])
         return self._posed_cache[motion, row]
@@ -198,7 +202,7 @@ def sample_masks(
     usable = [start + step * n for n in range(source.frame_count or 1)]
     usable = [frame for frame in usable if frame not in excluded_frames] or usable
     frames = [usable[n] for n in spaced_indices(len(usable), count)]
-    size_px = _scaled_size(source.size_px, 256.0)
+    size_px = _scaled_size(source.size_px, COARSE_MASK_PX)
     if masks is None:
         found, refused = _sample_alpha_channels(source, frames, size_px), []
     else:

@@ -43,6 +43,11 @@ EASYMOCAP_KEYS = (
 IMAGE_SIZE_PATTERN = re.compile(r"^([HW]_\w+):\s*([0-9.]+)\s*$", re.MULTILINE)
 """Width or height of a camera's images in OpenCV's YAML."""
 
+MM_PER_M = 1000.0
+"""Millimetres in a metre: the unit of ZJU-MoCap's translations."""
+
+MAX_PARENT_FOLDERS = 3
+"""Number of folders above an image whose names may be its camera's."""
 
 StudioCamera = Mapping[str, Float[np.ndarray, "rows columns"]]
 """K, R, T, and perhaps D (distortion), W and H, by these names."""
@@ -90,7 +95,7 @@ def _camera_named_like(video: Path | None, cameras: Mapping[str, StudioCamera]) 
     if video is None:
         return None
     whole = video.resolve()
-    folders = [folder.name for folder in whole.parents[:3]]
+    folders = [folder.name for folder in whole.parents[:MAX_PARENT_FOLDERS]]
     return next((name for name in (whole.stem, whole.name, *folders) if name in cameras), None)
 
 
@@ -136,6 +141,5 @@ def _read_zju(path: Path) -> dict[str, StudioCamera]:
     cameras: dict[str, StudioCamera] = {}
     for row, image in enumerate(content["ims"][0]["ims"]):
         camera = {key: np.array(cams[key][row], dtype=np.float64, ndmin=2) for key in "KDRT"}
-        # millimetres in the file
-        cameras[PurePosixPath(str(image)).parent.name] = {**camera, "T": camera["T"] / 1000.0}
+        cameras[PurePosixPath(str(image)).parent.name] = {**camera, "T": camera["T"] / MM_PER_M}
     return cameras

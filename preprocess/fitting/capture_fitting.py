@@ -44,8 +44,20 @@ KEY_FRAMES = 50
 CHAIN_FRAMES = 150
 """Frames, evenly spread, whose given poses are fitted: those without a mask follow their neighbors
 and are human; poses between them follow."""
+MIN_ITERATIONS = 4
+"""Fewest Gauss-Newton iterations."""
+MAX_ITERATIONS = 12
+"""Most Gauss-Newton iterations."""
 TRACKED_KEY_FRAMES = 300
 """Frames, evenly spread, whose masks are fitted together with key points."""
+TRACKED_FRAMES_PER_PRIOR = 30.0
+"""Frames that count as one for the proportions where key points see the joints, too."""
+KEYPOINT_ITERATIONS = 5
+"""Iterations with key points alone, after which the body is near its outline."""
+TRACKED_ITERATIONS = 3
+"""Iterations with outlines after that."""
+POSE_ITERATIONS = 2
+"""Iterations over poses alone after those, with `TRACKED_POSE_WEIGHTS`."""
 TRACKED_POSE_WEIGHTS = EvidenceWeights(outline_rows=480.0, keypoints=0.6)
 """Weights while poses alone are fitted: with these, proportions would follow the clothes."""
 MIN_ERROR_DECREASE = 0.01
@@ -137,21 +149,21 @@ def _fit_tracked(fitter: ClipFitter, everything: FitParameters) -> list[float]:
 
     Returns the error before each iteration with outlines.
     """
-    for _ in range(5):  # then the body is near its outline
+    for _ in range(KEYPOINT_ITERATIONS):
         fitter.iterate(everything._replace(outlines=False))
-    errors = [fitter.iterate(everything) for _ in range(3)]
+    errors = [fitter.iterate(everything) for _ in range(TRACKED_ITERATIONS)]
     fitter.weights = TRACKED_POSE_WEIGHTS
     poses = everything._replace(proportions=False, focal=False)
-    return errors + [fitter.iterate(poses) for _ in range(2)]
+    return errors + [fitter.iterate(poses) for _ in range(POSE_ITERATIONS)]
 
 
 def _iterate_until_settled(fitter: ClipFitter, fitted: FitParameters) -> list[float]:
     """Iterates until the error hardly decreases; returns it before each iteration."""
     errors: list[float] = []
-    while len(errors) < 12:
+    while len(errors) < MAX_ITERATIONS:
         errors.append(fitter.iterate(fitted))
         settled = errors[-1] > (1.0 - MIN_ERROR_DECREASE) * errors[max(len(errors) - 2, 0)]
-        if len(errors) >= 4 and settled:
+        if len(errors) >= MIN_ITERATIONS and settled:
             break
     return errors
 
@@ -186,7 +198,7 @@ def make_fitter(capture: Capture) -> ClipFitter | None:
         frames,
         track=track,
         sigma_log_focal=SIGMA_LOG_FOCAL if capture.paths.cameras else SIGMA_LOG_ASSUMED_FOCAL,
-        frames_per_prior=30.0,  # key points see the joints, too
+        frames_per_prior=TRACKED_FRAMES_PER_PRIOR,
         weights=TRACKED_WEIGHTS if outlines else USUAL_WEIGHTS,
     )
 

@@ -26,6 +26,8 @@ from preprocess.tracking.keypoints import KeypointTrack
 
 SIGMA_OUTLINE_PX = 1.0
 """Standard deviation of an outline's distance, px of the reduced masks."""
+FRAMES_PER_PRIOR = 10.0
+"""Frames of one person that count as one for the proportions: their clothes err alike."""
 SIGMA_LOG_FOCAL = 0.08
 """Prior standard deviation of the logarithm of a stated focal length."""
 SIGMA_LOG_ASSUMED_FOCAL = 0.3
@@ -103,7 +105,7 @@ class ClipFitter:
         track: KeypointTrack | None = None,
         settled: bool = False,
         sigma_log_focal: float = SIGMA_LOG_FOCAL,
-        frames_per_prior: float = 10.0,  # the clothes of one person err alike
+        frames_per_prior: float = FRAMES_PER_PRIOR,
         weights: EvidenceWeights = USUAL_WEIGHTS,
         model: OutlineModel | None = None,
     ) -> None:

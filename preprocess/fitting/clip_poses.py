@@ -42,6 +42,8 @@ SHARED_PRECISION = 0.1
 errs alike in all frames, and a turn that they share blurs nothing."""
 SIGMA_GUESSED_RAD = 0.12
 """Standard deviation of the given rotations of toes and hands, which trackers guess, radians."""
+GUESSED_JOINTS = (10, 11, 22, 23)
+"""Toes and hands."""
 TURN_FACTOR = 1.5
 """Standard deviation of a given rotation relative to the root, in `JOINT_SIGMAS_RAD`."""
 UNUSUAL_TURN_RAD = 0.08
@@ -155,6 +157,8 @@ POSE_SIGMA = _pose_sigma()
 """Prior standard deviation of a frame's correction: root and joint rotations, root position. These
 are the units of a frame's parameters in the equations."""
 
+MIRRORED_AXES = (1.0, -1.0, -1.0)
+"""An axis-angle of a left joint times this is that of the right one."""
 LEFT_PRIORS = {
     1: ((0.0, 0.0, 0.0), (0.70, 0.35, 0.30)), 4: ((0.25, 0.0, 0.0), (0.70, 0.12, 0.08)),
     7: ((0.0, 0.0, 0.0), (0.20, 0.13, 0.10)), 10: ((0.0, 0.0, 0.0), (0.10, 0.03, 0.03)),
@@ -175,6 +179,8 @@ CHANGES_PER_SECOND = (
     (0.05, (7, 8, 20, 21)), (0.005, (10, 11, 22, 23)), (0.11, (16, 17, 18, 19)),
 )  # fmt: skip
 """Standard deviation of how far a joint strays from a steady motion in a second, radians."""
+CHANGE_M = (0.013, 0.013, 0.013)
+"""Standard deviation of how far the root strays from a steady motion in a second, metres."""
 CUT_TURN_RAD = 0.25
 """Rotation of the root from frame to frame that photographs show, but no video; at it neighbors
 tell a quarter about each other."""
@@ -246,7 +252,7 @@ class HumanPosePrior:
         change = np.zeros((25, 3))
         for value, joints in CHANGES_PER_SECOND:
             change[list(joints)] = value
-        change[24] = (0.013, 0.013, 0.013)  # metres
+        change[24] = CHANGE_M
         gaps = np.maximum(np.diff(times_s), 1e-3)
         self._change = change.ravel() * np.sqrt(gaps)[:, None]
         self._steady_frames = STEADY_S / float(np.median(gaps)) if len(gaps) else 1.0
@@ -297,7 +303,7 @@ def _add_human(
 def _human_priors() -> tuple[Float[np.ndarray, "24 3"], Float[np.ndarray, "24 3"]]:
     mean, sigma = np.zeros((24, 3)), np.full((24, 3), SIGMA_FREE)
     for left, (middle, spread) in LEFT_PRIORS.items():
-        mean[left], mean[left + 1] = middle, np.array(middle) * (1.0, -1.0, -1.0)  # mirrored
+        mean[left], mean[left + 1] = middle, np.array(middle) * MIRRORED_AXES
         sigma[left] = sigma[left + 1] = spread
     for joint, spread in MIDDLE_PRIORS.items():
         sigma[joint] = spread
@@ -339,7 +345,7 @@ def _given_precision() -> Float[np.ndarray, "75"]:
     """Precision of the given rotations relative to the root, in units of `POSE_SIGMA`."""
     precision = np.full((25, 3), TURN_FACTOR**-2.0)
     precision[[0, 24]] = 1.0
-    guessed = [10, 11, 22, 23]  # toes and hands
+    guessed = list(GUESSED_JOINTS)
     precision[guessed] = (POSE_SIGMA.reshape(25, 3)[guessed] / SIGMA_GUESSED_RAD) ** 2
     return precision.ravel()
 

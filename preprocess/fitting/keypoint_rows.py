@@ -23,6 +23,8 @@ KEYPOINT_JOINTS = np.array(
      0, 0, 4, 5, 7, 8, 7, 8, 7, 8]
 )  # fmt: skip
 """The joint in whose frame each of the 33 key points is fixed."""
+MIDDLE_OFFSETS_CM = {0: (1.8, 10.9)}
+"""Place of the nose before its joint: up and to the front, centimetres."""
 LEFT_OFFSETS_CM = {
     1: (1.5, 5.0, 8.6), 2: (2.6, 5.0, 8.0), 3: (3.7, 5.1, 7.5), 7: (5.5, 3.7, 3.3),
     9: (1.9, -1.4, 9.3), 11: (-2.1, 0.6, -0.1), 13: (-2.3, -0.2, 0.9), 15: (0.8, -0.8, 0.1),
@@ -56,7 +58,8 @@ RATIO_BONES = ((11, 13, 16, 18), (12, 14, 17, 19), (13, 15, 18, 20), (14, 16, 19
 
 def _offsets_m() -> Float[np.ndarray, "33 3"]:
     offsets = np.zeros((33, 3))
-    offsets[0] = 0.0, 1.8, 10.9  # the nose
+    for middle, (up, front) in MIDDLE_OFFSETS_CM.items():
+        offsets[middle] = 0.0, up, front
     for left, place in LEFT_OFFSETS_CM.items():
         offsets[left] = place
         offsets[MIRRORED_POINTS[left]] = np.array(place) * (-1.0, 1.0, 1.0)

@@ -35,6 +35,8 @@ MIN_GAIN = 0.2
 """Least gain; less is a frame without light, after which the plate starts again."""
 PLATE_STRIDE = 7
 """Gains are estimated from every n-th row and column."""
+MIN_SAMPLES = 50
+"""Fewest known background pixels from which gains are estimated."""
 
 
 SIGHT_WINDOW_PX = 7
@@ -50,6 +52,8 @@ Pixels = Float32[np.ndarray, "pixels"]
 PixelMask = Bool[np.ndarray, "height width"]
 DARK_LEVEL, BRIGHT_LEVEL = 80.0, 180.0
 """Level of the brightest pixels (2 %) below which a film is brightened, and the level after it."""
+NOISE_BLUR_PX = 1.0
+"""Gaussian σ, px, by which the noise of a dark film is smoothed."""
 LEVEL_STRIDE = 4
 """The level is taken from every n-th row and column."""
 
@@ -142,7 +146,7 @@ class BackgroundPlate:
         self._rescale(background.shape)
         some = np.s_[::PLATE_STRIDE, ::PLATE_STRIDE]
         known = background[some] & (self._frames[some] >= MIN_SEEN_FRAMES)
-        if known.sum() < 50:
+        if known.sum() < MIN_SAMPLES:
             return
         seen, before = (
             np.stack([plane[some][known] for plane in planes]) for planes in (image, self._mean)
@@ -214,5 +218,5 @@ class DarkFilmBrightener:
             self._brightest = max(self._brightest, level)
         if self._brightest >= DARK_LEVEL:
             return rgb
-        smooth = cv2.GaussianBlur(rgb.astype(np.float32), (0, 0), 1.0)
+        smooth = cv2.GaussianBlur(rgb.astype(np.float32), (0, 0), NOISE_BLUR_PX)
         return np.clip(BRIGHT_LEVEL / self._brightest * smooth, 0.0, 255.0).astype(np.uint8)

@@ -13,6 +13,12 @@ from capture.input_error import InputError
 from capture.source import FrameSelection
 from capture.video import DecodedFrame, VideoFile
 
+MAX_RLE_PIXELS = 1 << 28
+"""Largest number of pixels of one run-length encoded mask."""
+
+MAX_TRACK_FRAMES = 1_000_000
+"""Largest frame number that a file of tracks may name."""
+
 VIDEO_BLACK = 16.0
 """Brightness of a video up to which alpha is 0: compression rings around edges."""
 VIDEO_WHITE = 239.0
@@ -97,7 +103,7 @@ def _track_rle(content: Any, person: str | None) -> list[list[dict[str, Any]]]:
         for who, mask, lost in zip(frame["tid"], frame["mask"], guessed, strict=True):
             if not lost:
                 seen.setdefault(str(int(who)), {})[number] = mask
-    if not 0 <= last < 1_000_000:
+    if not 0 <= last < MAX_TRACK_FRAMES:
         return []
     most = max(seen, key=lambda who: len(seen[who]), default="")
     rows = seen.get(most if person is None else person, {})
@@ -145,7 +151,7 @@ def decode_rle(code: dict[str, Any]) -> UInt8[np.ndarray, "height width"]:
         ValueError: If the runs do not fill the image.
     """
     height, width = (int(side) for side in code["size"])
-    if not 0 < height * width <= 1 << 28:
+    if not 0 < height * width <= MAX_RLE_PIXELS:
         raise ValueError(f"a size of {height}x{width}")
     counts = [height * width] if code["counts"] is None else code["counts"]
     if isinstance(counts, str | bytes):

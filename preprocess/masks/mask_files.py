@@ -87,6 +87,8 @@ MALFORMED_TRACK_ERRORS = (
 RLE_SUFFIXES = frozenset({".json", ".npy", ".pkl", ".pickle", ".pth", ".pt"})
 """Suffixes of files that may hold run-length encoded masks."""
 
+POLARITY_SAMPLES = 9
+"""Number of masks from which polarity and kind are detected."""
 
 MaskReader = Callable[[int], Float32[np.ndarray, "height width"]]
 """From a row to the mask as stored."""
@@ -116,7 +118,7 @@ class Masks:
         self.names = names
         self._read = read
         self._doubts = invert is None
-        rows = np.unique(np.linspace(0, count - 1, 9).round().astype(int))
+        rows = np.unique(np.linspace(0, count - 1, POLARITY_SAMPLES).round().astype(int))
         samples = _readable(read, [int(row) for row in rows])
         self._numbers = are_object_ids(samples)
         samples = [self._binarize_ids(sample) for sample in samples]

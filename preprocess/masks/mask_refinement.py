@@ -66,6 +66,8 @@ FILTER_RADIUS_PX = 3
 """Radius of the guided filter's windows in the working image, px."""
 FILTER_TOLERANCE = 5.0
 """Standard deviation of colors, in levels, that the guided filter does not follow."""
+PERSON_FREE_ALPHA = 0.05
+"""Alpha below which a pixel enters the background plate."""
 
 Plane = Float32[np.ndarray, "height width"]
 Channels = Float32[np.ndarray, "3 height width"]
@@ -151,7 +153,7 @@ class MaskRefiner:
             alpha = self._decide(band, plate)
             fitted = guided_coefficients(band.image, alpha, FILTER_RADIUS_PX, FILTER_TOLERANCE)
             filtered = apply_coefficients(band.image, fitted)
-            person = filtered > 0.05  # the rest enters the background plate
+            person = filtered > PERSON_FREE_ALPHA
             far[part] = cv2.dilate(person.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
             there = np.s_[
                 top * times : (top + height) * times, left * times : (left + width) * times

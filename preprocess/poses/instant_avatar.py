@@ -46,6 +46,8 @@ SMPLX_KEYS = frozenset(
 MODEL_BY_JOINT_COUNT = {52: "smpl", 55: "smplx"}
 """Bodies by the number of joints of a pose, hands and face included."""
 
+SIBLING_KEYS = ("frame", "time", "valid", "K", "camera")
+"""Keys that may lie beside `smpl`."""
 RECOGNIZED_KEYS = (
     *{key: None for keys in POSE_KEY_LAYOUTS for key in keys}, *CAMERA_KEYS, "betas", "frame",
     "time", "valid", "K", "model", "space", "scale", "proportions", *KEYPOINT_SHAPES,
@@ -71,11 +73,7 @@ def parse_instant_avatar(content: Any, path: Path, default_model: str) -> Motion
         if isinstance(content.get("camera"), dict):
             beside |= content["camera"]
         around = normalize_keys(beside)
-        named |= {
-            key: around[key]
-            for key in ("frame", "time", "valid", "K", "camera")
-            if key in around and key not in named
-        }
+        named |= {key: around[key] for key in SIBLING_KEYS if key in around and key not in named}
         named.setdefault("model", "smpl")
     if not any(set(keys) <= named.keys() for keys in POSE_KEY_LAYOUTS):
         return None

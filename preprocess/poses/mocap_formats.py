@@ -16,6 +16,11 @@ from preprocess.body.kinematics import rigid_transform
 from preprocess.frame_association import frame_numbers_from_names
 from preprocess.poses.motion_builder import MotionByPerson, build_motion, stack_rows
 
+AIST_FPS = 60.0
+"""Poses per second of all AIST++ motions, by their documentation."""
+SMPLX_ROW_SIZE = 165
+"""Numbers a row that only SMPL-X has: 55 joints."""
+
 EASYMOCAP_KEYS = {"Rh", "Th", "poses"}
 """Keys by which a file of EasyMocap is recognised."""
 
@@ -48,7 +53,7 @@ def parse_amass(content: Any, prefer_world: bool = False) -> MotionByPerson | No
     rate = _rate(content)
     model = str(content.get("surface_model_type", "smpl"))
     numbers = sum(np.asarray(part).size for part in parts) / max(1, len(content["trans"]))
-    is_smplx = "smplx" in model.replace("-", "").lower() or numbers == 165  # 55 joints
+    is_smplx = "smplx" in model.replace("-", "").lower() or numbers == SMPLX_ROW_SIZE
     motion = build_motion(
         parts,
         content["trans"],
@@ -68,7 +73,7 @@ def _aist_motion(content: dict[str, Any]) -> Motion:
     if not np.isfinite(scaling) or scaling <= 0.0:
         raise ValueError(f"`smpl_scaling` of {scaling}")
     poses = np.asarray(content["smpl_poses"], dtype=np.float64).reshape(len(places), -1)
-    times_s = np.arange(len(places)) / 60.0  # by AIST++'s documentation
+    times_s = np.arange(len(places)) / AIST_FPS
     return build_motion([poses], places / scaling, times_s=times_s, space="world")
 
 

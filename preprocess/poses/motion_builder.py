@@ -180,6 +180,9 @@ def _fill_gap(
 SMPLX_PELVIS = np.array([0.0031, -0.3514, 0.0120])
 """Pelvis of SMPL-X's neutral mean shape at rest, metres (its joint regressor's)."""
 
+FOCAL_TOLERANCE = 0.01
+"""Focal lengths and principal points nearer than this share are one."""
+
 
 def place_in_camera_world(
     motion: Motion, shaped: ShapedBody, cameras: CameraTrack, *, cameras_given: bool
@@ -290,7 +293,7 @@ def _refocus_motion(motion: Motion, shaped: ShapedBody, camera: Camera) -> Motio
 
 def _same_intrinsics(intrinsic: Float[np.ndarray, "3 3"], camera: Camera) -> bool:
     off = np.abs(intrinsic - camera.intrinsic)[:2]
-    return bool((off <= 0.01 * max(camera.focal_px)).all())
+    return bool((off <= FOCAL_TOLERANCE * max(camera.focal_px)).all())
 
 
 def _camera_of(motion: Motion, row: int, cameras: CameraTrack) -> Float[np.ndarray, "4 4"]:

@@ -21,6 +21,10 @@ from preprocess.body.kinematics import rotation_matrices
 
 MAX_JOINT_ANGLE_RAD = 4.0 * np.pi
 """Largest angle of a joint in any pose. An axis-angle needs π; optimizers may leave 2π or 3π."""
+MAX_DISTANCE_M = 500.0
+"""Largest median distance from the origin, metres."""
+SUSPICIOUS_DISTANCE_M = 50.0
+"""Median distance from the origin beyond which the unit is in doubt, metres."""
 FLIP_RAD = 0.5 * np.pi
 """Rotation of the root between two frames from which it may be a flip."""
 MAX_TURN_RAD_PER_S = 16.0
@@ -98,7 +102,7 @@ def implausibility_reason(motion: Motion) -> str | None:
             "pi / 180 (numpy.deg2rad)."
         )
     distance_m = _median_distance_m(motion)
-    if distance_m > 500.0:
+    if distance_m > MAX_DISTANCE_M:
         return (
             f"The body is {distance_m:,.0f} m from the origin (median); were translations in "
             "metres expected, and millimetres or centimetres given? Divide them by 1000 or 100."
@@ -133,7 +137,7 @@ def plausibility_warnings(motion: Motion) -> Iterator[str]:
             "than those just before and after them: front was taken for back. They are left out."
         )
     distance_m = _median_distance_m(motion)
-    if distance_m > 50.0:
+    if distance_m > SUSPICIOUS_DISTANCE_M:
         yield f"The poses lie {distance_m:.0f} m from the origin; are they in metres?"
 
 

@@ -26,6 +26,8 @@ CAMERA_KEYS = ("camera_from_world", "w2c", "camera")
 MAX_MAGNITUDE = 1e9
 """Largest magnitude of an angle or a translation; numbers beyond it mean a damaged file."""
 
+MAX_PROPORTION = 100.0
+"""Largest magnitude of a coefficient of proportions, in prior standard deviations."""
 
 Arrays = dict[str, Shaped[np.ndarray, "..."]]
 
@@ -195,8 +197,7 @@ def _proportions(arrays: Arrays, path: Path) -> Float[np.ndarray, "coefficients"
     if "proportions" not in arrays:
         return None
     proportions = _read_numbers(arrays, "proportions", path)
-    # in prior standard deviations
-    if proportions.ndim != 1 or not (np.abs(proportions) < 100.0).all():
+    if proportions.ndim != 1 or not (np.abs(proportions) < MAX_PROPORTION).all():
         raise InputError(f"`proportions` in {path} are no coefficients; expected finite numbers.")
     return proportions
 

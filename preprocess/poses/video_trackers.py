@@ -14,6 +14,9 @@ from preprocess.body.body_pose import Motion, RelativeFocalLength
 from preprocess.frame_association import frame_numbers_from_names
 from preprocess.poses.motion_builder import MotionByPerson, build_motion, stack_rows
 
+WHAM_FOCAL = RelativeFocalLength(ratio=1.0, reference="diagonal")
+"""WHAM's focal length where none was given."""
+
 VIBE_FOCAL = RelativeFocalLength(ratio=0.85)
 """Any would do: weak perspective has none, and the depth follows from it. A phone's is taken."""
 
@@ -23,6 +26,18 @@ PROMPTHMR_VIEWS = ("smplx_cam", "smplx_world")
 
 TRAM_KEYS = {"pred_rotmat", "pred_trans", "frame"}
 """Keys by which a file of TRAM is recognised."""
+
+PHALP_FOCAL = RelativeFocalLength(ratio=5000.0 / 256.0)
+"""PHALP's focal length: 5,000 px on a square of 256 px."""
+
+ROMP_PERSPECTIVE_FOCAL = RelativeFocalLength(ratio=443.4 / 512.0)
+"""The camera of ROMP's and BEV's perspective fit: 60 degrees over the padded square."""
+
+ROMP_WEAK_PERSPECTIVE_FOCAL = RelativeFocalLength(ratio=1.0)
+"""The camera in which z = 2 / s puts a point where weak perspective with the scale s does."""
+
+ROMP_VIDEO_RESULTS = "video_results.npz"
+"""Name of ROMP's file for a whole video."""
 
 MAX_LINK_STEP_M = 1.0
 """Largest step of one person between frames, metres; it separates people without track numbers."""
@@ -59,7 +74,7 @@ def parse_wham(content: Any, prefer_world: bool = False) -> MotionByPerson | Non
             betas=rows.get("betas"),
             frames=rows["frame_ids"],
             space="world" if in_world else "camera",
-            lens=None if in_world else RelativeFocalLength(ratio=1.0, reference="diagonal"),
+            lens=None if in_world else WHAM_FOCAL,
         )
     return people
 
@@ -217,7 +232,7 @@ def _phalp_person(rows: list[tuple[int, Any, Any]]) -> Motion:
         stack_rows([np.reshape(camera, 3) for _, _, camera in rows]),
         betas=stack_rows([np.reshape(pose["betas"], -1) for pose in poses]),
         frames=[number for number, _, _ in rows],
-        lens=RelativeFocalLength(ratio=5000.0 / 256.0),  # 5,000 px on a square of 256 px
+        lens=PHALP_FOCAL,
     )
 
 
@@ -231,7 +246,7 @@ def parse_romp(content: Any, prefer_world: bool = False) -> MotionByPerson | Non
     """
     if not isinstance(content, dict):
         return None
-    content = content.get("video_results.npz", content)  # a folder with everything in it
+    content = content.get(ROMP_VIDEO_RESULTS, content)  # a folder with everything in it
     sequence = content.get("sequence_results")
     if isinstance(sequence, dict) and sequence:
         return {
@@ -259,11 +274,11 @@ def _romp_person(rows: dict[str, Any], frames: Any) -> Motion:
     thetas, places = stack_rows(list(rows["smpl_thetas"])), stack_rows(list(rows["cam_trans"]))
     betas = stack_rows(list(rows["smpl_betas"]))
     is_bev = betas.shape[-1] == 11
-    lens = RelativeFocalLength(ratio=443.4 / 512.0)  # 60 degrees over the padded square
+    lens = ROMP_PERSPECTIVE_FOCAL
     if not is_bev and "cam" in rows:
         scales = stack_rows(list(rows["cam"]))[:, 0]
         if np.allclose(places[:, 2] * scales, 2.0, rtol=1e-3):
-            lens = RelativeFocalLength(ratio=1.0)  # so that z = 2 / s suits the scale s
+            lens = ROMP_WEAK_PERSPECTIVE_FOCAL
     return build_motion(
         [thetas], places, betas=betas[:, :10], frames=frames, lens=lens,
         lost=places[:, 2] <= 0.0,  # (-1, -1, -1) where their perspective fit has failed

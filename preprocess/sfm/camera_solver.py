@@ -54,6 +54,11 @@ MAX_TRACKED_POINT_ERROR_PX = 3.0
 MIN_TRACKED_KEYFRAMES = 0.5
 """Fraction of the key frames that points must be tracked into."""
 
+MIN_SOLVED_FRAMES = 0.5
+"""Fraction of the frames that must have a camera in the end."""
+
+MAX_IGNORED_DISTORTION_PX = 0.3
+"""Distortion of the corners below which a lens counts as free of distortion, pixels."""
 
 STAGE_SHARES = {
     "key frames": 0.07, "features": 0.5, "matches": 0.15, "mapping": 0.22, "frames between": 0.06,
@@ -137,7 +142,7 @@ def _solve(
     cameras, status = _cameras_of_all_frames(source, model, between)
     wanted = [i for i in range(source.frames_in_file) if source.selection.contains(i)]
     share = float((status[wanted] != MISSING).mean())
-    if share < 0.5:
+    if share < MIN_SOLVED_FRAMES:
         raise InputError(
             f"--cameras solve: only {share:.0%} of the frames could be placed. Film without sudden "
             "movements, or give only the part that goes well (--frames START:STOP)."
@@ -219,7 +224,7 @@ def _drop_small_distortion(model: SparseModel) -> SparseModel:
     """The model without distortion, where that moves the corners by less than can be measured."""
     corner = np.hypot(*model.size_px) / 2.0 / model.focal_px
     shift_px = abs(model.radial_distortion) * corner**3 * model.focal_px
-    return replace(model, radial_distortion=0.0) if shift_px < 0.3 else model
+    return replace(model, radial_distortion=0.0) if shift_px < MAX_IGNORED_DISTORTION_PX else model
 
 
 def _cameras_of_all_frames(

@@ -139,9 +139,29 @@ def write_keyframes(keys: Iterator[SfmKeyframe], images: Path, masks: Path) -> l
     return kept
 
 
+MAX_FEATURES = 2048
+"""Most features per key frame."""
+
+SEQUENTIAL_OVERLAP = 10
+"""Number of following key frames that each is matched with, besides powers of two beyond."""
+
+MAX_EXHAUSTIVE_IMAGES = 40
+"""Largest number of key frames of which every pair is matched, which closes loops."""
+
+MAX_MODELS = 2
+"""Most models that the incremental mapper starts."""
+
+MAX_INITIAL_PAIRS = 50
+"""Most pairs that it tries to start with; without parallax it would try for minutes."""
+
+MIN_MATCHES = 15
+"""Fewest matches of an image pair that is used."""
+
 STATED_FOCAL_TOLERANCE = 0.02
 """Relative difference to the solved focal length within which the stated one is used."""
 
+IMAGES_PER_THREAD = 4
+"""Images per thread between two reports of progress."""
 
 ProgressFn = Callable[[float], None]
 """Called now and then with how much of a stage is done, in [0, 1]."""
@@ -187,8 +207,8 @@ def extract_features(workspace: ColmapWorkspace, report_progress: ProgressFn) ->
         reader.default_focal_length_factor = 0.85
     options.num_threads, options.use_gpu = workspace.threads, False
     options.max_image_size = max(width, height)
-    options.sift.max_num_features = 2048
-    names, step = _names(workspace), 4 * workspace.threads
+    options.sift.max_num_features = MAX_FEATURES
+    names, step = _names(workspace), IMAGES_PER_THREAD * workspace.threads
     with colmap.Database.open(workspace.database):  # makes it
         pass
     colmap.import_images(
@@ -211,13 +231,13 @@ def match_features(workspace: ColmapWorkspace, report_progress: ProgressFn) -> N
     options.num_threads, options.use_gpu = 1, False
     count = len(_names(workspace))
     report_progress(0.0)
-    if count <= 40:  # all pairs close loops
+    if count <= MAX_EXHAUSTIVE_IMAGES:
         colmap.match_exhaustive(
             workspace.database, matching_options=options, device=colmap.Device.cpu
         )
         return
     pairing = colmap.SequentialPairingOptions()
-    pairing.overlap, pairing.num_threads = 10, 1  # and powers of two beyond
+    pairing.overlap, pairing.num_threads = SEQUENTIAL_OVERLAP, 1
     colmap.match_sequential(
         workspace.database, matching_options=options, pairing_options=pairing,
         device=colmap.Device.cpu,
@@ -233,7 +253,7 @@ def parallax_fraction(database: Path) -> tuple[int, float]:
     flat = colmap.TwoViewGeometryConfiguration
     with colmap.Database.open(database) as base:
         found = base.read_two_view_geometries()[1]
-    kinds = [int(pair.config) for pair in found if len(pair.inlier_matches) >= 15]
+    kinds = [int(pair.config) for pair in found if len(pair.inlier_matches) >= MIN_MATCHES]
     plain = {int(flat.PLANAR), int(flat.PANORAMIC), int(flat.PLANAR_OR_PANORAMIC)}
     return len(kinds), sum(kind not in plain for kind in kinds) / max(len(kinds), 1)
 
@@ -245,9 +265,8 @@ def map_incrementally(
     colmap = _colmap()
     options = colmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = 1, seed
-    options.min_model_size, options.max_num_models = 3, 2
-    # without parallax it would try for minutes
-    options.init_num_trials, options.extract_colors = 50, False
+    options.min_model_size, options.max_num_models = 3, MAX_MODELS
+    options.init_num_trials, options.extract_colors = MAX_INITIAL_PAIRS, False
     total, done = len(_names(workspace)), 0
 
     def next_image() -> None:

@@ -17,6 +17,9 @@ from jaxtyping import Bool, Float
 
 from preprocess.sfm.camera_solution import SparseModel
 
+MAX_TILT_DEG = 20.0
+"""Largest angle between the floor's normal and the first guess of up, degrees."""
+
 PLANE_TOLERANCE = 0.01
 """Distance within which points belong to a plane; a fraction of their median camera distance."""
 
@@ -28,6 +31,12 @@ MIN_INLIER_FRACTION = 0.05
 
 MAX_FRACTION_BELOW = 0.05
 """Largest fraction of the points that may lie below the floor."""
+
+RANSAC_ITERATIONS = 2000
+"""Number of planes through three points that are tried."""
+
+MIN_VIEWS = 3
+"""Fewest cameras that must see a point."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -60,7 +69,7 @@ def fit_floor_plane(model: SparseModel, up: Float[np.ndarray, "3"]) -> FloorPlan
     `up` is a first guess.
     """
     views = np.bincount(model.observation_point, minlength=len(model.points))
-    points = model.points[views >= 3]
+    points = model.points[views >= MIN_VIEWS]
     centers = model.camera_centers()
     distance = np.linalg.norm(
         model.points[model.observation_point] - centers[model.observation_camera], axis=1
@@ -74,7 +83,7 @@ def fit_floor_plane(model: SparseModel, up: Float[np.ndarray, "3"]) -> FloorPlan
         return None
     rng = np.random.default_rng(0)
     best, most = None, max(MIN_POINTS, MIN_INLIER_FRACTION * len(points))
-    for _ in range(2000):
+    for _ in range(RANSAC_ITERATIONS):
         plane = _plane_through(points[rng.choice(len(points), 3, replace=False)], up)
         if plane is None:
             continue
@@ -93,7 +102,7 @@ def _plane_through(
     if length < 1e-12:
         return None
     normal = normal / length * (1.0 if normal @ up > 0.0 else -1.0)
-    if normal @ up < np.cos(np.radians(20.0)):
+    if normal @ up < np.cos(np.radians(MAX_TILT_DEG)):
         return None
     return normal, -float(normal @ three[0])
 
@@ -120,6 +129,12 @@ SIGMA_GROUND_M = 0.06
 
 SIGMA_PLACE_M = 0.20
 """Standard deviation of a person from its usual place, metres."""
+
+IRLS_ITERATIONS = 5
+"""Rounds of reweighted least squares."""
+
+HUBER_THRESHOLD = 1.345
+"""Residual beyond which a cue counts less; standard deviations (95 % efficiency)."""
 
 MAX_CUE_DIFFERENCE = 0.10
 """Relative difference of both cues beyond which the person walks and only the ground counts."""
@@ -258,8 +273,8 @@ def _fit_scale_huber(
     Iteratively reweighted: s = Σ w a b / Σ w a², w = min(1, threshold / |a s - b|).
     """
     scale = start
-    for _ in range(5):
+    for _ in range(IRLS_ITERATIONS):
         off = np.abs(rows * scale - right)
-        weights = np.minimum(1.0, 1.345 / np.maximum(off, 1e-12))  # Huber's, of 95 % efficiency
+        weights = np.minimum(1.0, HUBER_THRESHOLD / np.maximum(off, 1e-12))
         scale = float((weights * rows * right).sum() / (weights * rows**2).sum())
     return scale

@@ -61,6 +61,12 @@ def to_metric_world(
     return rigid_transform(rotations, -np.einsum("cab,cb->ca", rotations, there))
 
 
+FOOT_JOINTS = (7, 8, 10, 11)
+"""Ankles and feet among SMPL's joints."""
+MAX_LEAN_DEG = 30.0
+"""Largest angle between up as the cameras are held and up as the person stands."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MetricPlacement:
     """A capture in a world of metres, y up, the floor at 0.
@@ -148,7 +154,7 @@ def _person_in_cameras(
     shaped: ShapedBody,
 ) -> PersonInCameras:
     weights = shaped.body.weights
-    feet = np.flatnonzero(weights[:, (7, 8, 10, 11)].sum(axis=1) > 0.5)  # ankles and feet
+    feet = np.flatnonzero(weights[:, FOOT_JOINTS].sum(axis=1) > 0.5)
     rest = np.column_stack([shaped.vertices[feet], np.ones(len(feet))])
     soles = []
     for row in rows.tolist():
@@ -180,7 +186,7 @@ def _estimate_up(
     views = solved.camera_from_solved[frames[usable], :3, :3]
     up = np.median(np.einsum("nba,nb->na", views, backs), axis=0)
     length = float(np.linalg.norm(up))
-    if length < 0.5 or up @ held < length * np.cos(np.radians(30.0)):
+    if length < 0.5 or up @ held < length * np.cos(np.radians(MAX_LEAN_DEG)):
         return held
     return up / length
 

@@ -20,12 +20,17 @@ from preprocess.body.kinematics import rigid_transform
 from preprocess.sfm.camera_solution import SparseModel
 from preprocess.sfm.colmap_mapping import SfmKeyframe, to_grayscale
 
+WINDOW = (17, 17)
+"""Size of the patch around a point, pixels."""
+
 LEVELS = 4
 """Levels of the pyramid without a guess."""
 
 LEVELS_WITH_GUESS = 3
 """Levels of the pyramid with a guess of where a point is."""
 
+MAX_ROUND_TRIP_PX = 0.7
+"""Largest distance of a point that was tracked there and back, pixels; beyond it is lost."""
 
 GrayImage = UInt8[np.ndarray, "height width"]
 
@@ -47,7 +52,7 @@ def track_points(
     back, again = _optical_flow(picture, start, there, pixels, levels)
     height, width = picture.shape
     inside = ((there > 0.0) & (there < (width, height))).all(axis=1)
-    same = np.linalg.norm(back - pixels, axis=1) < 0.7
+    same = np.linalg.norm(back - pixels, axis=1) < MAX_ROUND_TRIP_PX
     return there, found & again & same & inside
 
 
@@ -72,11 +77,14 @@ def _optical_flow(
     """OpenCV's, whose first pixel's centre is at (0, 0)."""
     there, status, _ = cv2.calcOpticalFlowPyrLK(
         start, picture, (pixels - 0.5).astype(np.float32)[:, None],
-        (guess - 0.5).astype(np.float32)[:, None].copy(), winSize=(17, 17), maxLevel=levels,
+        (guess - 0.5).astype(np.float32)[:, None].copy(), winSize=WINDOW, maxLevel=levels,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )  # fmt: skip
     return there[:, 0].astype(np.float64) + 0.5, status[:, 0] > 0
 
+
+MAX_CORNERS = 400
+"""Most points of the background that are tracked."""
 
 MIN_TRACKED_FRACTION = 0.3
 """Fraction of the points that must be tracked for a static camera."""
@@ -86,6 +94,9 @@ MAX_STATIC_SHIFT = 0.005
 
 MIN_TRACKED_POINTS = 12
 """Fewest points that must be tracked for a static camera."""
+
+COMPARED_KEYFRAMES = 12
+"""Number of key frames that are compared with the first."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,11 +114,11 @@ class StaticCameraTest:
 def detect_static_camera(keys: list[SfmKeyframe]) -> StaticCameraTest:
     """Track points of the first key frame's background into others."""
     first = keys[0]
-    pixels = detect_corners(first.gray, ~first.person_mask, 400)
+    pixels = detect_corners(first.gray, ~first.person_mask, MAX_CORNERS)
     longer, moved = max(first.gray.shape), 0.0
     if len(pixels) < MIN_TRACKED_POINTS:
         return StaticCameraTest(is_static=False, background_motion=float("nan"))
-    rows = np.unique(np.linspace(1, len(keys) - 1, 12).round().astype(int))
+    rows = np.unique(np.linspace(1, len(keys) - 1, COMPARED_KEYFRAMES).round().astype(int))
     for key in (keys[int(row)] for row in rows):
         there, found = track_points(first.gray, key.gray, pixels)
         x, y = np.clip(pixels.astype(int).T, 0, np.array(key.gray.shape[::-1])[:, None] - 1)
@@ -124,6 +135,9 @@ def detect_static_camera(keys: list[SfmKeyframe]) -> StaticCameraTest:
 
 MIN_PNP_POINTS = 20
 """Fewest tracked points that a camera is placed by."""
+
+MAX_PNP_POINTS = 600
+"""Most points that are tracked from a key frame."""
 
 INLIER_PX = 2.0
 """Largest reprojection error of an inlier, pixels."""
@@ -228,7 +242,9 @@ class _KeyframePoints:
     def of(cls, model: SparseModel, row: int, key: SfmKeyframe) -> "_KeyframePoints":
         seen = model.observations_of_camera(row)
         lengths = np.bincount(model.observation_point, minlength=len(model.points))
-        longest = np.argsort(-lengths[model.observation_point[seen]], kind="stable")[:600]
+        longest = np.argsort(-lengths[model.observation_point[seen]], kind="stable")[
+            :MAX_PNP_POINTS
+        ]
         seen = seen[longest]
         return cls(
             frame=key.index,

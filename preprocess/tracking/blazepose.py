@@ -40,6 +40,8 @@ ALONG = np.linspace(0.1, 0.9, 12)
 """Places where colors are taken: shares of the way from left to right, and downwards."""
 QUANTILES = (0.15, 0.5, 0.85)
 """Quantiles of the colors that are compared: stripes differ from one color of the same mean."""
+LEARNING_RATE = 0.15
+"""Share of a new image in what is remembered."""
 HIP_JOINTS, NECK_JOINT = (1, 2), 12
 """SMPL's hips and neck."""
 MAX_CLOTHING_M = 0.2
@@ -71,7 +73,7 @@ class PersonLooks:
     def learn(self, colors: Float[np.ndarray, "numbers"]) -> None:
         """Remember the colors of an image that shows the person."""
         self._pictures += 1
-        self._colors += max(0.15, 1 / self._pictures) * (colors - self._colors)
+        self._colors += max(LEARNING_RATE, 1 / self._pictures) * (colors - self._colors)
 
 
 def colors_of(
@@ -99,6 +101,10 @@ MAX_GROWTH = 1.4
 """Most that a person grows or shrinks in the image in one frame."""
 MAX_STEP_AFTER_LOSS = 0.1
 """Distance beyond `MAX_STEP` that a lost person may have moved, for each frame since."""
+SEARCH_SIDE = 1.5
+"""Side of the area around the last place that is searched, in sides of the person's square."""
+WATCH_INTERVAL = 5
+"""Frames from one look for other persons to the next."""
 NEAR = 0.6
 """Distance of another person, in sides of the square, within which the two may be mixed up."""
 OVERLAPPING = 0.3
@@ -208,7 +214,7 @@ class BlazePoseTracker:
         last = self._last
         if last is None:
             return self._choose(rgb)
-        around = replace(last.square, side=1.5 * last.square.side, angle=0.0)
+        around = replace(last.square, side=SEARCH_SIDE * last.square.side, angle=0.0)
         for area in (None, around):
             detections = self._detect(rgb, area)
             likely = [each for each in detections if last.strangeness(each.square) <= 1]
@@ -237,7 +243,7 @@ class BlazePoseTracker:
         self._frames_to_watch -= 1
         if self._frames_to_watch > 0:
             return
-        self._frames_to_watch = 5
+        self._frames_to_watch = WATCH_INTERVAL
         nearest = 1.0
         for other in self._detect(rgb):
             apart = distance_in_sides(found.square, other.square)

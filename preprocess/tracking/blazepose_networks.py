@@ -21,6 +21,12 @@ WEIGHTS = Path(__file__).parent / "weights"
 """Folder of this project's own networks."""
 MARGIN = 1.25
 """Side of the square, in diameters of the circle."""
+ANCHOR_GRIDS = ((8, 2), (16, 2), (32, 6))
+"""Distance of the anchors, pixels, and how many there are at each place."""
+MIN_SCORE = 0.5
+"""Least probability of a person."""
+MAX_OVERLAP = 0.3
+"""Largest intersection over union of two persons' boxes."""
 SAME_PERSON_DISTANCE = 0.12
 """Two detections whose middles are nearer than this share of their squares' side are one person."""
 SMALL_PERSON = 0.6
@@ -28,6 +34,8 @@ SMALL_PERSON = 0.6
 the network was made for persons who fill the image."""
 HEATMAP_REACH = 3
 """Cells of a heat map on each side of a key point that make it more exact."""
+MIN_HEAT = 0.5
+"""Least peak of a heat map that is used."""
 
 
 class OnnxNetwork:
@@ -162,7 +170,7 @@ class BlazePoseDetector:
         size = self._network.picture_size
         output = self._network.run(area.crop(rgb, size), -1.0, 1.0)
         scores = sigmoid(output["scores"][:, 0])
-        candidates = np.flatnonzero(scores >= 0.5)
+        candidates = np.flatnonzero(scores >= MIN_SCORE)
         candidates = candidates[np.argsort(-scores[candidates], kind="stable")]
         image_from_crop = area.image_from_crop(size)
         found: list[PersonDetection] = []
@@ -230,7 +238,7 @@ def parts_of_frame(rgb: UInt8[np.ndarray, "height width 3"]) -> list[PersonSquar
 def anchors(picture_size: int) -> Float[np.ndarray, "anchors 2"]:
     """Places of the anchors, as shares of the image's width and height."""
     grids = []
-    for distance, count in ((8, 2), (16, 2), (32, 6)):  # pixels apart, and how many at each place
+    for distance, count in ANCHOR_GRIDS:
         cells = picture_size // distance
         rows, columns = np.mgrid[:cells, :cells] + 0.5
         grids.append(np.repeat(np.column_stack([columns.ravel(), rows.ravel()]) / cells, count, 0))
@@ -242,7 +250,7 @@ def is_same_person(a: PersonDetection, b: PersonDetection) -> bool:
     apart = np.hypot(a.square.x - b.square.x, a.square.y - b.square.y)
     if apart < SAME_PERSON_DISTANCE * min(a.square.side, b.square.side):
         return True
-    return overlap(a.box, b.box) > 0.3
+    return overlap(a.box, b.box) > MAX_OVERLAP
 
 
 def overlap(a: Float[np.ndarray, "4"], b: Float[np.ndarray, "4"]) -> float:
@@ -313,7 +321,7 @@ def refine(
                 index, top : row + HEATMAP_REACH + 1, left : column + HEATMAP_REACH + 1
             ].astype(np.float64)
         )
-        if heat.max() < 0.5:
+        if heat.max() < MIN_HEAT:
             continue
         columns = left + np.arange(heat.shape[1])
         rows = top + np.arange(heat.shape[0])

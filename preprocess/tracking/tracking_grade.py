@@ -22,6 +22,10 @@ MIN_IOU = 0.7
 """Least mean IoU of body and mask of poses that are good enough for an avatar."""
 DOUBTFUL_IOU = 0.65
 """IoU below which a frame is doubtful."""
+MIN_FOUND_SHARE = 0.7
+"""Least share of the frames in which the person must be found."""
+MAX_DOUBTFUL_SHARE = 0.5
+"""Largest share of doubtful frames of poses that are good enough for an avatar."""
 MIN_PERSON_PX = 96.0
 """Least median height of the person in the frames, px."""
 MIN_VISIBILITY = 0.1
@@ -30,6 +34,8 @@ FAST_HEIGHTS_PER_S = 4.5
 """Speed of a wrist or an ankle above which networks are often wrong, body heights per second."""
 MIN_SPEED_FRAMES = 16
 """Fewest frames of which speeds are judged; a few photographs have no times."""
+BRIDGED_S = 0.35
+"""Gap between two doubtful stretches with the same reason that are joined, seconds."""
 MIN_STRETCH_FRAMES = 3
 """Fewest frames of a doubtful stretch that is reported."""
 MIN_FRAMES = 4
@@ -98,7 +104,7 @@ class TrackingGrade:
     def objections(self) -> tuple[str, ...]:
         """Reasons why the poses are not good enough for an avatar; empty if they are."""
         objections = []
-        if self.found_share < 0.7:
+        if self.found_share < MIN_FOUND_SHARE:
             objections.append(f"the person was found in only {self.found_share:.0%} of the frames")
         count = round(self.found_share * self.frames)
         if count < MIN_FRAMES:
@@ -107,7 +113,7 @@ class TrackingGrade:
             objections.append(
                 f"body and masks agree by an IoU of only {self.iou_mean:.2f} (expected {MIN_IOU})"
             )
-        if self.doubtful_share > 0.5:
+        if self.doubtful_share > MAX_DOUBTFUL_SHARE:
             objections.append(f"{self.doubtful_share:.0%} of the frames are doubtful")
         if self.person_px < MIN_PERSON_PX:
             objections.append(
@@ -317,7 +323,7 @@ def _stretches(
         rows = [number for number in numbers if reason in reasons.get(number, [])]
         groups: list[list[int]] = []
         for number in rows:
-            near = groups and frame_times_s[number] - frame_times_s[groups[-1][-1]] <= 0.35
+            near = groups and frame_times_s[number] - frame_times_s[groups[-1][-1]] <= BRIDGED_S
             groups[-1].append(number) if near else groups.append([number])
         stretches += [
             DoubtfulStretch(

@@ -23,6 +23,8 @@ from preprocess.tracking.keypoints import CroppedMask, KeypointTrack, PersonKeyp
 
 BORDER_SAMPLES = 128
 """Places along each border of a frame at which the mask is read."""
+MIN_TOUCHING = 2
+"""Places with the person in them that make a touch."""
 BODY_POINTS = (0, 7, 8, *range(11, 17), *range(23, 29))
 """Key points of the body, without fingers, heels and toes."""
 CUT_MARGIN = 0.05
@@ -30,8 +32,12 @@ CUT_MARGIN = 0.05
 heights. Shoes and fingertips that touch a border are farther: they cut nothing off."""
 ELSEWHERE = 0.6
 """Distance from the last place, in sides of the square around the person, that is worth a word."""
+MIN_FOUND = 8
+"""Fewest frames in which the person must be found; 4 of fewer than 16 frames."""
 FRAMES_REFINED_AGAIN = 60
 """First frames whose masks are made again in the end, when the background behind them is known."""
+QUEUED_MASKS = 8
+"""Most masks that wait to be written."""
 
 
 class TrackingProblem(Enum):
@@ -103,7 +109,7 @@ def touched_borders(found: PersonKeypoints, size_px: tuple[int, int]) -> set[Tra
             continue
         column, row = np.floor(crop_from_image @ np.array([x, y, high])).astype(int)
         inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-        if (found.mask.values[row[inside], column[inside]] > 127).sum() >= 2:
+        if (found.mask.values[row[inside], column[inside]] > 127).sum() >= MIN_TOUCHING:
             touched.add(problem)
     return touched
 
@@ -186,7 +192,7 @@ def track_video(
             if mask_folder is not None:
                 path = _mask_path(mask_folder, frame.index)
                 waiting.append(pool.submit(_write_mask, path, frame.rgb, person, refine))
-            while len(waiting) > 8 or (waiting and waiting[0].done()):
+            while len(waiting) > QUEUED_MASKS or (waiting and waiting[0].done()):
                 waiting.pop(0).result()
             advance(len(times))
         for each in waiting:
@@ -238,7 +244,7 @@ def _write_mask(
 
 def _require_person(source: FrameSource, found: int, total: int) -> None:
     """Raise InputError if the person was found in too few of the frames."""
-    if found and found >= min(8, max(1, total // 4)):
+    if found and found >= min(MIN_FOUND, max(1, total // 4)):
         return
     where = "none" if not found else f"only {found}"
     raise InputError(
