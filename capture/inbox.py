@@ -19,6 +19,7 @@ class Inbox(Generic[Item]):
     Attributes:
         paced: Whether items come at times of their own, so that hurrying would not help.
         live: Whether the producer never waits and older items are dropped for the latest.
+        ends_run: Whether nothing is learnt after the last item, however much time is left.
         dropped: Number of items that were dropped for later ones.
     """
 
@@ -29,11 +30,11 @@ class Inbox(Generic[Item]):
         capacity: int = 64,
         paced: bool = False,
         live: bool = False,
+        ends_run: bool = False,
     ) -> None:
         """Start the producer; at most `capacity` items wait."""
-        self.paced = paced
+        self.paced, self.live, self.ends_run = paced, live, ends_run
         self.dropped = 0
-        self.live = live
         self._queue: queue.Queue[Item] = queue.Queue(maxsize=capacity)
         self._error: BaseException | None = None
         self._stop = threading.Event()

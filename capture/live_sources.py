@@ -1,7 +1,7 @@
 """Live sources: a camera, and a folder of images that still grows.
 
 A camera is read by a thread of its own; the latest images are kept, older ones dropped. An image in
-a folder is taken when it is complete.
+a folder is taken when it is complete, and waits until then.
 """
 
 import errno
@@ -12,7 +12,7 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
-from typing import final
+from typing import NamedTuple, final
 
 import cv2
 import numpy as np
@@ -23,12 +23,11 @@ from capture.image_folder import (
     any_has_cutout_alpha,
     exif_orientation,
     list_images,
-    natural_sort_key,
     read_image,
     silence_opencv,
 )
 from capture.input_error import InputError
-from capture.source import Frame, FrameSelection, PacingClock
+from capture.source import ASSUMED_FPS, Frame, FrameSelection, PacingClock
 
 CAMERA_PREFIX = "camera:"
 """Start of an argument that names a camera instead of a file."""
@@ -206,27 +205,30 @@ POLL_INTERVAL_S = 0.05
 """Shortest time between two looks at the folder, seconds."""
 
 DAMAGED_AFTER_S = 2.0
-"""Time after its last change from which an unreadable image counts as damaged, seconds."""
+"""Time without a change after which an unreadable image counts as damaged, seconds."""
 
-MAX_PENDING = 8
-"""Most pending images; of more, this number is taken, evenly spaced and with the newest."""
+MAX_STEP_S = 1.0
+"""Longest time between two images that is taken from their time stamps, seconds."""
 
-MAX_PENDING_AT_START = 200
-"""Most images that are taken of those that exist when the watch begins, evenly spaced."""
 
-Picture = tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"] | None]
+class _FileState(NamedTuple):
+    """Size and time stamp of a file, which change while it is written."""
+
+    size: int
+    written_s: float
 
 
 @final
 class WatchedImageFolder:
-    """A live source: images that another program writes, in natural order.
+    """A source that grows: images that another program writes.
 
-    `dropped` counts images that were passed over because too many were waiting; `started_at` is
-    when the first was written.
+    Files wait until they are taken, so none is lost. They come in the order in which they are first
+    seen, those that are seen together in natural order. Their time stamps, which `mv`, `cp -p` and
+    `rsync -a` keep, tell at most how much time lies between two of them.
     """
 
-    live = paced = True
-    frames_in_file = 0
+    live, paced = False, True
+    dropped = frames_in_file = 0
     frame_count: int | None = None
     duration_s: float | None = None
 
@@ -237,33 +239,31 @@ class WatchedImageFolder:
         pace: PacingClock,
         *,
         idle_s: float = IDLE_TIMEOUT_S,
+        watch_s: float | None = None,
     ) -> None:
         """Wait for the first image.
 
         Args:
             path: The folder, which may be empty.
-            selection: Counted in natural order.
+            selection: Counted in the order of arrival.
             pace: Its clock; stopping it ends the watch.
             idle_s: The source ends when no new image has come for this time, seconds.
+            watch_s: Images that come later than this after the first are not waited for, seconds.
 
         Raises:
             InputError: If there is no such folder, or no image in it after `idle_s`.
         """
         if not path.is_dir():
-            raise InputError(
-                f"{path} is no folder; --live watches a folder of pictures that grows."
-            )
+            raise InputError(f"{path} is no folder; --live watches a folder of images that grows.")
         self.path = path
         self.selection = selection
         self.warnings: list[str] = []
-        self.dropped = 0
-        self._pace, self._idle_s = pace, idle_s
-        self._there_before: set[Path] = set()
-        first, (rgb, _) = self._first()
+        self._pace, self._idle_s, self._watch_s = pace, idle_s, watch_s
+        first, rgb = self._first()
         self.quarter_turns = EXIF_QUARTER_TURNS.get(exif_orientation(first.read_bytes()), 0)
-        there = list_images(path)
-        self.started_at = min(map(_modified_at, there), default=time.time())
-        self.size_px, self.has_alpha = (rgb.shape[1], rgb.shape[0]), any_has_cutout_alpha(there)
+        self.started_at, self._first_at = time.time(), pace.now()
+        self.size_px = (rgb.shape[1], rgb.shape[0])
+        self.has_alpha = any_has_cutout_alpha(list_images(path))
 
     @property
     def waited_s(self) -> float:
@@ -272,26 +272,18 @@ class WatchedImageFolder:
 
     def frames(self) -> Iterator[Frame]:
         """The images as they are completed."""
-        last_s = 0.0
-        for index, path in self._arriving():
+        time_s, written_s = 0.0, None
+        for index, (path, seen_s) in enumerate(self._arriving()):
             if self.selection.is_past_end(index):
                 return
-            if not self.selection.contains(index):
-                continue
-            picture = self._complete(path)
-            if picture is None:
-                continue
-            written = _modified_at(path)
-            last_s = max(last_s, written - self.started_at)
-            age_s = 0.0 if path in self._there_before else max(0.0, time.time() - written)
-            yield Frame(
-                index=index,
-                time_s=last_s,
-                rgb=picture[0],
-                alpha=picture[1],
-                due_s=self._now() - age_s,
-                name=path.stem,
-            )
+            image, state = self._complete(path), _state_of(path)
+            if state is not None:  # those that came together were filmed one after the other
+                apart_s = 0.0 if written_s is None else state.written_s - written_s
+                step_s = min(max(apart_s, 1.0 / ASSUMED_FPS), MAX_STEP_S) if index else 0.0
+                time_s, written_s = max(time_s + step_s, seen_s), state.written_s
+            if self.selection.contains(index) and image is not None:
+                rgb, alpha = image
+                yield Frame(index=index, time_s=time_s, rgb=rgb, alpha=alpha, name=path.stem)
 
     def count_frames(self) -> int:
         """The number of images by now."""
@@ -301,71 +293,68 @@ class WatchedImageFolder:
         """End the watch, also in the middle of a wait."""
         self._pace.stop()
 
-    def _first(self) -> tuple[Path, Picture]:
+    def _first(self) -> tuple[Path, UInt8[np.ndarray, "height width 3"]]:
         """The first image that can be read."""
-        deadline = self._now() + self._idle_s
+        deadline = self._pace.now() + self._idle_s
         while True:
             for path in list_images(self.path):
                 try:
-                    return path, read_image(path)
+                    return path, read_image(path)[0]
                 except (InputError, OSError):
                     continue
-            if self._now() >= deadline:
+            if self._pace.now() >= deadline:
                 raise InputError(
-                    f"No picture came into {self.path} within {self._idle_s:.0f} s (--idle-seconds)"
+                    f"No image came into {self.path} within {self._idle_s:g} s (--idle-seconds)"
                     "; expected PNG, JPEG or the like, written one after the other."
                 )
-            self._pace.wait_until(self._now() + POLL_INTERVAL_S)
+            self._pace.wait_until(self._pace.now() + POLL_INTERVAL_S)
 
-    def _arriving(self) -> Iterator[tuple[int, Path]]:
-        """Place in natural order and path of each image that is to be taken."""
-        count, newest, quiet_since = 0, None, self._now()
+    def _arriving(self) -> Iterator[tuple[Path, float]]:
+        """Each image once, and when it was first seen, seconds after the first one."""
+        known, quiet_since = set[Path](), self._pace.now()
         while not self._pace.stopped:
-            looked_at = self._now()
+            looked_at = self._pace.now()
+            seen_s = looked_at - self._first_at
             try:
                 done = self._is_done()  # before looking: what came until then is taken
-                images = list_images(self.path)
+                arrived = [path for path in list_images(self.path) if path not in known]
             except OSError as error:
                 self._warn(f"{self.path} can no longer be read ({error.strerror}).")
                 return
-            if newest is None:
-                new, most, self._there_before = images, MAX_PENDING_AT_START, set(images)
-            else:
-                new, most = [p for p in images if natural_sort_key(p) > newest], MAX_PENDING
-            if new:
-                chosen = np.linspace(0, len(new) - 1, min(most, len(new))).round().astype(int)
-                self.dropped += len(new) - len(chosen)
-                yield from ((count + int(i), new[i]) for i in chosen)
-                count, newest, quiet_since = (
-                    count + len(new),
-                    natural_sort_key(new[-1]),
-                    self._now(),
-                )
-                continue
-            if done or self._now() - quiet_since >= self._idle_s:
+            yield from ((path, seen_s) for path in arrived)
+            known.update(arrived)
+            quiet_since = looked_at if arrived else quiet_since
+            is_over = self._watch_s is not None and seen_s >= self._watch_s
+            if is_over or (not arrived and (done or looked_at - quiet_since >= self._idle_s)):
                 return
-            # long folders are looked at less often
-            self._pace.wait_until(
-                self._now() + max(POLL_INTERVAL_S, 4.0 * (self._now() - looked_at))
-            )
+            if not arrived:  # long folders are looked at less often
+                now = self._pace.now()
+                self._pace.wait_until(now + max(POLL_INTERVAL_S, 4.0 * (now - looked_at)))
 
-    def _now(self) -> float:
-        return self._pace.now()
-
-    def _complete(self, path: Path) -> Picture | None:
-        """An image once it is whole; None if it never is."""
+    def _complete(
+        self, path: Path
+    ) -> (
+        tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"] | None] | None
+    ):
+        """An image once it is whole, and its alpha channel; None if it never is."""
+        state, since = None, self._pace.now()
         while not self._pace.stopped:
             try:
-                picture = read_image(path)
+                image = read_image(path)
             except (InputError, OSError) as cause:
-                if time.time() - _modified_at(path) > DAMAGED_AFTER_S:
+                before, state = state, _state_of(path)
+                since = since if state == before else self._pace.now()
+                if state is None or self._pace.now() - since >= DAMAGED_AFTER_S:
                     self._warn(f"{cause} It was left out.")
                     return None
-                self._pace.wait_until(self._now() + POLL_INTERVAL_S)
+                self._pace.wait_until(self._pace.now() + POLL_INTERVAL_S)
                 continue
-            if picture[0].shape[1::-1] == self.size_px:
-                return picture
-            self._warn(f"{path.name} is not of the first picture's size. It was left out.")
+            if image[0].shape[1::-1] == self.size_px:
+                return image
+            self._warn(
+                f"{path.name} has {image[0].shape[1]}x{image[0].shape[0]} px, the first image "
+                f"{self.size_px[0]}x{self.size_px[1]}. It was left out."
+            )
             return None
         return None
 
@@ -378,9 +367,10 @@ class WatchedImageFolder:
             self.warnings.append(message)
 
 
-def _modified_at(path: Path) -> float:
-    """Time of the last change of a file, seconds since 1970; long ago if it is gone."""
+def _state_of(path: Path) -> _FileState | None:
+    """The state of a file; None if it is gone."""
     try:
-        return path.stat().st_mtime
+        stat = path.stat()
     except OSError:
-        return 0.0
+        return None
+    return _FileState(stat.st_size, stat.st_mtime)

@@ -68,7 +68,13 @@ def _ambiguous_folder_error(path: Path, videos: list[Path]) -> InputError:
 
 
 def open_live_source(
-    path: Path, camera: str | None, frames: slice | None, pace: PacingClock, *, idle_s: float
+    path: Path,
+    camera: str | None,
+    frames: slice | None,
+    pace: PacingClock,
+    *,
+    idle_s: float,
+    watch_s: float | None = None,
 ) -> FrameSource:
     """Open a camera, or a folder that another program writes images to.
 
@@ -76,9 +82,11 @@ def open_live_source(
         path: The folder; a capture folder's images lie in its `images/`.
         camera: Number or address of a camera instead.
         idle_s: Time without a new image after which a folder ends, seconds.
+        watch_s: Time after which a folder ends even so; None: never.
     """
     selection = FrameSelection.of(frames)
     if camera is not None:
         return CameraDevice(camera, selection, pace)
     inside = path / "images"
-    return WatchedImageFolder(inside if inside.is_dir() else path, selection, pace, idle_s=idle_s)
+    folder = inside if inside.is_dir() else path
+    return WatchedImageFolder(folder, selection, pace, idle_s=idle_s, watch_s=watch_s)

@@ -38,6 +38,7 @@ class CaptureInputs:
         live: Whether `video` is a folder that grows; a camera is live without it.
         person: Whose poses, where the file holds several people's; None for the longest track.
         idle_s: Longest time without a new image from a live source, seconds.
+        watch_s: Time after which new images in a live folder are not waited for; None: no limit.
         height_m: Height of the person; None if only the poses tell.
         tracker: Name of the tracker that finds poses where none are given; None: the built-in one.
         refine_masks: Whether given masks are refined where their borders miss the images' edges.
@@ -55,6 +56,7 @@ class CaptureInputs:
     live: bool = False
     person: str | None = None
     idle_s: float = IDLE_TIMEOUT_S
+    watch_s: float | None = None
     height_m: float | None = None
     tracker: str | None = None
     refine_masks: bool = True

@@ -273,5 +273,7 @@ def _unread_live_parts(inputs: CaptureInputs) -> Iterator[str]:
 def _open_stream_source(inputs: CaptureInputs, pace: PacingClock) -> FrameSource:
     if inputs.is_live:
         camera = camera_address(inputs.video)
-        return open_live_source(inputs.video, camera, inputs.frames, pace, idle_s=inputs.idle_s)
+        return open_live_source(
+            inputs.video, camera, inputs.frames, pace, idle_s=inputs.idle_s, watch_s=inputs.watch_s
+        )
     return RealtimePlayback(open_source(inputs.video, frames=inputs.frames), pace)

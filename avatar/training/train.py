@@ -88,7 +88,8 @@ def train(
     The learning rate is constant while frames arrive and falls as a cosine after the last one. No
     frame of a recording is lost: if the time is too short to read them all beside training, reading
     takes precedence and may overrun the time. Frames of a paced source are not waited for, except
-    for the first. A live source is left when the time is up. Where steps are counted, one more
+    for the first. A live source is left when the time is up, and training ends with the last frame
+    of a folder that grows. Where steps are counted, one more
     frame of a recording is read before each step until all are read.
 
     Held-out frames that arrive are appended to `held_out`. Events are yielded on the caller's
@@ -237,7 +238,7 @@ class _FrameIntake:
     def is_done(self, now: float) -> bool:
         """True if the schedule is over and every frame has been trained on."""
         config, admitted_at = self._trainer.config, self._last_frame_step
-        if not (self.ended and now >= config.seconds):
+        if not self.ended or (now < config.seconds and not self._inbox.ends_run):
             return False
         farewell = 0 if config.steps or admitted_at is None else MIN_STEPS_AFTER_LAST_FRAME
         return self._trainer.steps >= (admitted_at or 0) + farewell

@@ -92,11 +92,13 @@ class IngestArguments(CaptureArguments):
     video ends; extra --seconds continue training after the last frame."""
     live: Flag = False
     """VIDEO is a folder to which another program is still writing images; the person is tracked
-    while they come. The run ends with a file named DONE in the folder, after --idle-seconds without
-    a new image, after --seconds, or by Ctrl-C. A camera is live without this flag."""
+    while they come, and each image is used, however late it is its turn. The run ends with a file
+    named DONE in the folder, after --idle-seconds without a new image, after --seconds if they are
+    given, or by Ctrl-C. A camera is live without this flag, and its images are dropped where
+    tracking is too slow for them."""
     idle_seconds: float = IDLE_TIMEOUT_S
-    """Stop a live source after this many seconds without a new image; also the limit for the first
-    one."""
+    """End the run when no new image has come into a live folder for this many seconds; also the
+    limit for the first one."""
     size: Annotated[int | None, arg(metavar="PX", help_behavior_hint="")] = None
     """Longer side of training images in pixels; never upscaled (default: 540 for 60 s, proportional
     to the square root of --seconds). The head is learnt in the video's own resolution."""
@@ -198,6 +200,7 @@ class IngestArguments(CaptureArguments):
             live=self.live,
             tracker=self.tracker,
             idle_s=self.idle_seconds,
+            watch_s=self.seconds if self.steps is None else self.steps / NOMINAL_STEPS_PER_S,
             refine_masks=self.refine_masks,
             height_m=None if self.height_cm is None else self.height_cm / 100.0,
         )

@@ -16,6 +16,7 @@ from avatar.rig import Rig
 from avatar.training import checkpoint, train
 from avatar.training.trainer import Trainer
 from capture.input_error import InputError
+from capture.live_sources import DONE_FILE_NAME
 from export.bake import proxy_surface
 from instant_avatar.cli.command_line import exit_on_interrupt, stop_on_interrupt
 from instant_avatar.cli.console import Console
@@ -76,7 +77,7 @@ def prepare_trainer(
         train.warm_up(prepared.trainer)
         proxy_surface.warm_up()
     _announce_coverage(capture, console)
-    _announce_duration(prepared.trainer, console)
+    _announce_duration(arguments, prepared.trainer, console)
     return prepared
 
 
@@ -258,9 +259,15 @@ def _announce_coverage(capture: Capture, console: Console) -> None:
         )
 
 
-def _announce_duration(trainer: Trainer, console: Console) -> None:
+def _announce_duration(arguments: IngestArguments, trainer: Trainer, console: Console) -> None:
     """Print how long training will take, and roughly what comes after it."""
     config = trainer.config
+    if arguments.live and arguments.seconds is None and arguments.steps is None:
+        console.info(
+            f"Training while images come: until a file {DONE_FILE_NAME} lies in {arguments.video}, "
+            f"no image has come for {arguments.idle_seconds:g} s, or Ctrl-C."
+        )
+        return
     seconds = max(0.0, config.seconds - trainer.wall_seconds)
     duration = f"{seconds:.0f} s" if seconds >= 10.0 else f"{seconds:.1g} s"
     if config.steps:

@@ -129,7 +129,10 @@ class TrainingSession:
         """Train until the budget is used or the user stops; `bake` packages and scores."""
         source = self._recording.source
         self._set_unpaced(self._restore_count > 0)
-        self._inbox = inbox = Inbox(self._frame_stream(), paced=source.paced, live=source.live)
+        grows = source.frame_count is None and not source.live
+        self._inbox = inbox = Inbox(
+            self._frame_stream(), paced=source.paced, live=source.live, ends_run=grows
+        )
         try:
             added = self._restore_frames(inbox, self._restore_count) - self.trainer.frames_seen
             self._set_unpaced(False)

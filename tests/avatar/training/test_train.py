@@ -298,6 +298,14 @@ def test_a_live_source_is_left_when_the_time_is_up(rig, clip, ticking):
     assert trainer.steps >= train_module.MIN_STEPS_AFTER_LAST_FRAME
 
 
+def test_training_ends_with_the_last_image_of_a_folder_that_grows(rig, clip):
+    frames = [prepare_frame(observation, rig) for observation in clip.observations[:2]]
+    trainer = Trainer(rig, dataclasses.replace(QUICK, seconds=3600.0))
+    events = list(train(trainer, Inbox(frames, paced=True, ends_run=True), []))
+    assert isinstance(events[-1], Finished)
+    assert trainer.steps >= train_module.MIN_STEPS_AFTER_LAST_FRAME
+
+
 def test_while_nothing_has_come_the_listener_is_heard(rig):
     """So that Ctrl-C ends a run that waits for its first frame."""
     closed = threading.Event()

@@ -60,13 +60,13 @@ def test_a_growing_folder_becomes_an_avatar(watch, studio):
     folder, film_the_rest = studio
     thread = threading.Thread(target=film_the_rest)
     thread.start()
-    code, report = watch(folder, "--live", "--seconds", "2", "--idle-seconds", "5")
+    code, report = watch(folder, "--live", "--seconds", "600", "--idle-seconds", "5")
     thread.join()
     assert code == 0
     assert report["stream"]["realtime"]
     assert report["recipe"]["masks"] == "tracked"
-    frames = report["frames"]
-    assert 2 <= frames["read"] + report["stream"]["inbox_dropped"] <= FRAMES
+    assert report["frames"]["read"] == FRAMES
+    assert report["stream"]["inbox_dropped"] == 0
     assert report["training"]["steps"] > 0
 
 
@@ -91,7 +91,7 @@ def test_a_camera_becomes_an_avatar(watch, filmed):
     ("arguments", "word"),
     [
         (["--realtime"], "--realtime"),
-        (["--idle-seconds", "0.2"], "No picture came"),
+        (["--idle-seconds", "0.2"], "No image came"),
         (["--poses", "growing.jsonl"], "--poses"),
         (["--masks", "masks"], "--masks"),
         (["--cameras", "solve"], "--cameras solve"),
