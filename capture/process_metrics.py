@@ -1,12 +1,13 @@
 """Figures about this process: its peak memory, and percentiles of an endless stream of numbers."""
 
 import random
-import resource
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import final
 
 import numpy as np
+import psutil
 
 PROC_STATUS = Path("/proc/self/status")
 """Linux's figures about this process."""
@@ -22,8 +23,13 @@ def peak_memory_mb() -> float:
         lines = PROC_STATUS.read_text(encoding="ascii").splitlines()
         return next(float(line.split()[1]) / 1024.0 for line in lines if line.startswith("VmHWM:"))
     except (OSError, ValueError, StopIteration):  # another system
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)
+        with suppress(ImportError):  # Windows has no such module
+            import resource
+
+            peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+            return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)
+        memory = psutil.Process().memory_info()
+        return getattr(memory, "peak_wset", memory.rss) / (1 << 20)
 
 
 RESERVOIR_SIZE = 4096

@@ -1,6 +1,5 @@
 """Video files, read by PyAV as upright RGB frames with the container's timestamps."""
 
-import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,7 +11,7 @@ from jaxtyping import UInt8
 
 from capture.hdr_tone_mapping import HDR_TRANSFERS, tone_map_hdr
 from capture.image_folder import has_cutout_alpha, refuse_pipe
-from capture.input_error import InputError
+from capture.input_error import InputError, quote_command
 from capture.source import Frame, FrameSelection, Recording
 
 VIDEO_SUFFIXES = frozenset(
@@ -171,7 +170,7 @@ class VideoFile(Recording):
             self._warn(
                 f"{self.path.name} has pixels that are not square ({aspect:.2f}:1): the person is "
                 f"too {kind} in them, and so is the avatar. Convert the video first: ffmpeg -i "
-                f"{shlex.quote(self.path.name)} -vf scale=iw*sar:ih,setsar=1 square.mp4"
+                f"{quote_command(self.path.name)} -vf scale=iw*sar:ih,setsar=1 square.mp4"
             )
 
 

@@ -1,6 +1,5 @@
 """Validation of a capture, for ia-check, and in part before a run starts: IoU, mistakes, advice."""
 
-import shlex
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -9,7 +8,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from capture.camera import same_aspect_ratio
-from capture.input_error import InputError
+from capture.input_error import InputError, quote_command
 from capture.live_sources import camera_address
 from instant_avatar.cli.console import Console
 from instant_avatar.cli.shared_options import (
@@ -321,7 +320,7 @@ def check_command(inputs: CaptureInputs, *, fix: bool = True) -> str:
         beside = inputs.video if inputs.video.name else inputs.video.absolute()
         free = unused_path(beside.with_name(f"{capture_name(beside)}-corrected"))
         words += ["--fix", str(free)]
-    return shlex.join(words)
+    return quote_command(*words)
 
 
 def preflight_check(

@@ -1,6 +1,5 @@
 """ia-sample: film a synthetic actor into a capture folder with ground truth."""
 
-import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -9,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from capture.input_error import quote_command
 from instant_avatar.cli.command_line import DONE, parse_arguments, run_command
 from instant_avatar.cli.console import Console
 from instant_avatar.cli.shared_options import check_output_folder
@@ -58,7 +58,7 @@ def _film(config: SampleArguments, console: Console) -> int:
     except (OSError, KeyboardInterrupt) as error:
         error.add_note("Nothing was written.")
         raise
-    video, poses = (shlex.quote(str(config.out / name)) for name in ("video.mp4", "poses.npz"))
+    video, poses = (quote_command(config.out / name) for name in ("video.mp4", "poses.npz"))
     console.info(f"Filmed {config.shoot.frames} frames into {config.out}.")
     if not config.shoot.like_a_phone:
         console.info(f"Preview for a browser: {config.out / 'preview.webm'}.")

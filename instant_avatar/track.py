@@ -2,7 +2,6 @@
 
 import json
 import os
-import shlex
 import sys
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,7 +16,7 @@ from jaxtyping import UInt8
 from tyro.conf import Positional, arg
 
 from capture.atomic_files import OutputFileList, atomic_file, write_text_atomically
-from capture.input_error import InputError
+from capture.input_error import InputError, quote_command
 from capture.live_sources import camera_address
 from capture.video_writer import VP9, write_video
 from instant_avatar.cli.command_line import (
@@ -132,7 +131,7 @@ class TrackArguments:
             raise InputError(f"--out is {poses}, but must end in .npz.")
         free = unused_path(Path(os.path.abspath(folder)).with_name("tracked")) / "poses.npz"
         free = free if folder.is_absolute() else Path(os.path.relpath(free))
-        advice = f"choose another folder: --out {shlex.quote(str(free))}"
+        advice = f"choose another folder: --out {quote_command(free)}"
         if RunFolder(path=folder).has_checkpoint():
             raise InputError(f"{folder} holds a run of ia-ingest; {advice}")
         written = [poses, self.grade_path(), *([self.film_path()] if self.film else [])]
@@ -208,7 +207,7 @@ def track(arguments: TrackArguments, console: Console) -> int:
     print_grade(tracking.grade, console)
     if tracking.grade.is_good_enough:
         console.info("Next:")
-        console.info(f"  {shlex.join(next_command(arguments, tracking.inputs.frames))}")
+        console.info(f"  {quote_command(*next_command(arguments, tracking.inputs.frames))}")
     if tracking.interrupted:
         return INTERRUPTED
     return DONE if tracking.grade.is_good_enough else NOT_GOOD_ENOUGH

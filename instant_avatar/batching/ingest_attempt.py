@@ -191,13 +191,15 @@ def _time_limit(seconds: float, log: TextIO) -> Iterator[None]:
         raise CommandExit(f"took longer than {seconds:g} s (--limit)", NO_AVATAR)
 
     if seconds:
-        signal.signal(signal.SIGALRM, stop)
-        signal.setitimer(signal.ITIMER_REAL, seconds)
+        if hasattr(signal, "SIGALRM"):  # not on Windows, where the process is ended instead
+            signal.signal(signal.SIGALRM, stop)
+            signal.setitimer(signal.ITIMER_REAL, seconds)
         faulthandler.dump_traceback_later(seconds + GRACE_S, exit=True, file=log)
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        if hasattr(signal, "SIGALRM"):
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
         faulthandler.cancel_dump_traceback_later()
 
 

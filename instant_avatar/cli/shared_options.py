@@ -2,7 +2,6 @@
 
 import os
 import re
-import shlex
 import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from capture.atomic_files import (
     check_replaceable_folder,
     is_stream,
 )
-from capture.input_error import InputError
+from capture.input_error import InputError, quote_command
 from preprocess.capture_session import CaptureInputs
 
 Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
@@ -146,7 +145,7 @@ def check_output_file(
     if os.path.lexists(path) and not overwrite:
         raise InputError(
             f"{flag} {path} already exists. Pass --overwrite to replace it, or choose another "
-            f"file: {flag} {shlex.quote(str(unused_path(path)))}"
+            f"file: {flag} {quote_command(unused_path(path))}"
         )
     check_writable(path, flag)
 

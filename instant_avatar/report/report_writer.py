@@ -1,6 +1,5 @@
 """Report of a run: report.json, report.html with its images, and the verdict on the console."""
 
-import shlex
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from avatar.evaluation.image_metrics import (
     overall_verdict,
 )
 from capture.atomic_files import atomic_file, write_text_atomically
+from capture.input_error import quote_command
 from capture.live_sources import camera_address
 from capture.process_metrics import peak_memory_mb
 from export.player import Player
@@ -78,7 +78,7 @@ def _check_advice(command: Mapping[str, Any]) -> str:
     if camera_address(Path(video)) is not None:
         return "."
     named = {name: command.get(name) for name in CHECK_OPTIONS if command.get(name) != "solve"}
-    words = shlex.join(["ia-check", video, *option_words(named)])
+    words = quote_command("ia-check", video, *option_words(named))
     return f", and check poses and masks: {words}"
 
 
@@ -176,7 +176,7 @@ def _refusal(result: TrainingResult) -> str | None:
 
 def play_command(package: Path, poses: Path) -> str:
     """Return the command that plays a package in the poses it was learnt from, for a shell."""
-    return shlex.join(["ia-play", str(package), "--poses", str(poses)])
+    return quote_command("ia-play", package, "--poses", poses)
 
 
 def comparison_pairs(result: TrainingResult) -> list[ComparisonPair]:

@@ -6,14 +6,13 @@ phone that was carried around the person are solved, and written next to the ava
 
 import json
 import os
-import shlex
 import threading
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
 from capture.atomic_files import OutputFileList, atomic_file, write_text_atomically
-from capture.input_error import InputError
+from capture.input_error import InputError, quote_command
 from capture.source_opening import open_source
 from instant_avatar.cli.command_line import INTERRUPTED, CommandExit, stop_on_interrupt
 from instant_avatar.cli.console import Console
@@ -77,7 +76,7 @@ def track_missing_poses(
             print_grade(tracking.grade, console)
         else:
             _remove_tracking(run)
-            look = shlex.join(["ia-track", str(arguments.video)])
+            look = quote_command("ia-track", arguments.video)
             raise InputError(
                 f"{tracking.grade.describe()} Look at the poses ({look}), film the person again, "
                 "or give --poses of another tracker. To train anyway, pass --force."

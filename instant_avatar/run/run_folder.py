@@ -3,7 +3,6 @@
 import errno
 import json
 import os
-import shlex
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -12,7 +11,7 @@ from pathlib import Path
 from filelock import BaseFileLock, FileLock, Timeout
 
 from capture.atomic_files import RESERVED_PREFIX, OutputFileList
-from capture.input_error import InputError
+from capture.input_error import InputError, quote_command
 from instant_avatar.cli.command_line import RESOURCE_UNAVAILABLE, CommandExit
 from instant_avatar.cli.console import Console
 from instant_avatar.cli.shared_options import (
@@ -167,7 +166,7 @@ class RunFolder:
         if self.path.exists() and not self.path.is_dir():
             raise InputError(f"{self.path} is a file; --out names the folder that holds the run.")
         check_disjoint_from_inputs(self.path, "--out", inputs)
-        marker, free = OutputFileList(self.path), shlex.quote(str(unused_path(self.path)))
+        marker, free = OutputFileList(self.path), quote_command(unused_path(self.path))
         if marker.owns("grade.json"):
             raise InputError(
                 f"{self.path} holds poses that ia-track wrote. Choose another folder: --out {free}"

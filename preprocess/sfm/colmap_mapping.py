@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
+from capture.image_folder import write_png
 from capture.input_error import InputError
 from capture.source import Frame, FrameSource
 from preprocess.sfm.camera_solution import SparseModel
@@ -128,8 +129,8 @@ def write_keyframes(keys: Iterator[SfmKeyframe], images: Path, masks: Path) -> l
     kept = []
     for key in keys:
         name = f"{key.index:06d}.png"
-        cv2.imwrite(str(images / name), key.gray)
-        cv2.imwrite(str(masks / f"{name}.png"), np.where(key.person_mask, 0, 255).astype(np.uint8))
+        write_png(images / name, key.gray)
+        write_png(masks / f"{name}.png", np.where(key.person_mask, 0, 255).astype(np.uint8))
         kept.append(key)
     if len(kept) < MIN_KEYFRAMES:
         raise InputError(
