@@ -29,6 +29,9 @@ BT709_FROM_BT2020 = np.array(
 )
 """Linear BT.709 from linear BT.2020 (ITU-R BT.2087)."""
 
+STRIP_ROWS = 16
+"""Rows that are converted at once: those of a 4K image stay in the processor's cache."""
+
 LUT_SIZE = 4096
 """Entries of the table from code values to linear light (12 bits)."""
 
@@ -41,13 +44,21 @@ def tone_map_hdr(
     Light is linearised, white scaled to `WHITE_NITS` and colors converted to BT.709; above the knee
     all three channels are compressed by one factor, which preserves hues.
     """
+    strips = range(0, len(rgb), STRIP_ROWS)
+    return np.concatenate([_tone_map_strip(rgb[top : top + STRIP_ROWS], curve) for top in strips])
+
+
+def _tone_map_strip(
+    rgb: UInt16[np.ndarray, "rows width 3"], curve: int
+) -> UInt8[np.ndarray, "rows width 3"]:
     light = np.take(_linear_light_lut(curve), rgb >> 4)
     if curve == HLG:  # the display's gamma of 1.2 for the luminance (ITU-R BT.2100)
         luma = light @ np.array([0.2627, 0.6780, 0.0593], np.float32)
         light *= np.power(np.maximum(luma, 1e-6), np.float32(0.2))[..., None]
     light *= np.float32(PEAK_NITS / WHITE_NITS)
     light = cv2.transform(light, BT709_FROM_BT2020)
-    brightest = np.maximum(light.max(axis=-1), np.float32(1e-6))
+    brightest = np.maximum(light[..., 0], np.maximum(light[..., 1], light[..., 2]))
+    brightest = np.maximum(brightest, np.float32(1e-6))
     light *= (_compress_highlights(brightest) / brightest)[..., None]
     codes = np.clip(light * np.float32(LUT_SIZE - 1), 0.0, LUT_SIZE - 1).astype(np.uint16)
     return np.take(_srgb_lut(), codes)

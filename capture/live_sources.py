@@ -54,8 +54,8 @@ class CameraDevice:
     `dropped` counts images that were dropped for later ones; `started_at` is when the first came.
     """
 
-    has_alpha = False
-    quarter_turns = 0
+    has_alpha = is_hdr = False
+    quarter_turns = rotate = 0
     live = paced = True
     frames_in_file = 0
     frame_count: int | None = None
@@ -227,8 +227,8 @@ class WatchedImageFolder:
     `rsync -a` keep, tell at most how much time lies between two of them.
     """
 
-    live, paced = False, True
-    dropped = frames_in_file = 0
+    live, paced, is_hdr = False, True, False
+    dropped = frames_in_file = rotate = 0
     frame_count: int | None = None
     duration_s: float | None = None
 

@@ -110,6 +110,8 @@ class FrameSource(Protocol):
         has_alpha: Whether the frames' own alpha channel is their mask: it cuts the person out of
             one of the sampled images, and no segmenter was named instead.
         quarter_turns: Counter-clockwise quarter turns that make stored images upright.
+        rotate: Degrees by which the user had frames turned clockwise, after `quarter_turns`.
+        is_hdr: Whether frames are tone mapped from HDR.
         live: Whether frames that are not taken in time are lost.
         paced: Whether frames come at times of their own, however fast they are taken.
         started_at: Time when the first frame of a live source was filmed, seconds since 1970.
@@ -124,6 +126,8 @@ class FrameSource(Protocol):
     duration_s: float | None
     has_alpha: bool
     quarter_turns: int
+    rotate: int
+    is_hdr: bool
     live: bool
     paced: bool
     started_at: float
@@ -155,9 +159,9 @@ class FrameSource(Protocol):
 class Recording:
     """The common part of a video file and a folder of images: nothing waits or is lost."""
 
-    live = paced = False
+    live = paced = is_hdr = False
     started_at = waited_s = 0.0
-    dropped = 0
+    dropped = rotate = 0
 
     def __init__(self, path: Path, selection: FrameSelection) -> None:
         """Keep the arguments; nothing is read yet."""
@@ -173,9 +177,7 @@ class Recording:
 
 
 class _WrappedSource:
-    """A recording whose size or times are changed; all else is the recording's own."""
-
-    live = paced = False
+    """A source whose size or times are changed; all else is the source's own."""
 
     def __init__(self, source: FrameSource) -> None:
         self._source = source
@@ -186,7 +188,8 @@ class _WrappedSource:
         self.frame_count = source.frame_count
         self.duration_s = source.duration_s
         self.has_alpha = source.has_alpha
-        self.quarter_turns = source.quarter_turns
+        self.quarter_turns, self.rotate = source.quarter_turns, source.rotate
+        self.is_hdr, self.live, self.paced = source.is_hdr, source.live, source.paced
         self.started_at = source.started_at
         self.warnings = source.warnings
 
@@ -211,6 +214,27 @@ class _WrappedSource:
     def close(self) -> None:
         """Close the recording."""
         self._source.close()
+
+
+@final
+class RotatedSource(_WrappedSource):
+    """A source whose frames are turned clockwise by 90, 180 or 270 degrees."""
+
+    def __init__(self, source: FrameSource, degrees: int) -> None:
+        """Wrap a source; nothing is read yet."""
+        super().__init__(source)
+        self.rotate = degrees
+        if degrees % 180:
+            self.size_px = (source.size_px[1], source.size_px[0])
+
+    def frames(self) -> Iterator[Frame]:
+        """The frames, turned."""
+        turns = -self.rotate // 90
+        for frame in self._source.frames():
+            alpha = (
+                None if frame.alpha is None else np.ascontiguousarray(np.rot90(frame.alpha, turns))
+            )
+            yield replace(frame, rgb=np.ascontiguousarray(np.rot90(frame.rgb, turns)), alpha=alpha)
 
 
 @final
@@ -281,11 +305,10 @@ class RealtimePlayback(_WrappedSource):
             has seen before. Where it ends, the video plays on from there at its own speed.
     """
 
-    paced = True
-
     def __init__(self, source: FrameSource, pace: PacingClock) -> None:
         """Wrap a recording; stopping the clock ends the playback, also in the middle of a wait."""
         super().__init__(source)
+        self.paced = True
         self._pace = pace
         self.catch_up = False
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from capture.image_folder import IMAGE_SUFFIXES, ImageFolder, list_images
 from capture.input_error import InputError
 from capture.live_sources import CameraDevice, WatchedImageFolder
-from capture.source import FrameSelection, FrameSource, PacingClock
+from capture.source import FrameSelection, FrameSource, PacingClock, RotatedSource
 from capture.video import VIDEO_SUFFIXES, VideoFile
 
 HEIC_SUFFIXES = frozenset({".heic", ".heif"})
@@ -18,15 +18,37 @@ SIDE_VIDEO_PREFIXES = ("mask", "preview", "skeleton")
 """Starts of the names of videos that lie beside the one that is meant."""
 
 
-def open_source(path: Path, *, frames: slice | None = None) -> FrameSource:
+def open_source(path: Path, *, frames: slice | None = None, rotate: int = 0) -> FrameSource:
     """Open a video file, a folder of images, or a folder with `images/` or a single video in it.
 
-    Selected `frames` keep their numbers; all if None.
+    Selected `frames` keep their numbers; all if None. They are turned clockwise by `rotate`
+    degrees.
 
     Raises:
         InputError: If there is nothing there that can be read.
     """
-    selection = FrameSelection.of(frames)
+    source = _open_recording(path, FrameSelection.of(frames))
+    return RotatedSource(source, rotate) if rotate else source
+
+
+def reopen(source: FrameSource, frames: slice | None) -> FrameSource:
+    """Open other frames of a recording, turned as it is."""
+    return open_source(source.path, frames=frames, rotate=source.rotate)
+
+
+def describe_recording(source: FrameSource) -> str:
+    """Name, number, size and rate of a recording's frames, as its container states them."""
+    size = f"{source.size_px[0]}x{source.size_px[1]} px"
+    chosen = "" if source.frame_count == source.frames_in_file else f"{source.frame_count} of "
+    count = f"{source.path.name}: {chosen}{source.frames_in_file}"
+    if not source.duration_s or source.path.is_dir():
+        return f"{count} images of {size}"
+    rate = source.selection.span(source.frames_in_file) / source.duration_s
+    hdr = ", HDR (turned into the usual range)" if source.is_hdr else ""
+    return f"{count} frames of {size}, {rate:.3g} a second{hdr}"
+
+
+def _open_recording(path: Path, selection: FrameSelection) -> VideoFile | ImageFolder:
     if not path.exists():
         raise InputError(f"{path} does not exist; a video or a folder of pictures was expected.")
     if not path.is_dir():
@@ -75,6 +97,7 @@ def open_live_source(
     *,
     idle_s: float,
     watch_s: float | None = None,
+    rotate: int = 0,
 ) -> FrameSource:
     """Open a camera, or a folder that another program writes images to.
 
@@ -83,10 +106,13 @@ def open_live_source(
         camera: Number or address of a camera instead.
         idle_s: Time without a new image after which a folder ends, seconds.
         watch_s: Time after which a folder ends even so; None: never.
+        rotate: Degrees by which images are turned clockwise.
     """
     selection = FrameSelection.of(frames)
+    source: FrameSource
     if camera is not None:
-        return CameraDevice(camera, selection, pace)
-    inside = path / "images"
-    folder = inside if inside.is_dir() else path
-    return WatchedImageFolder(folder, selection, pace, idle_s=idle_s, watch_s=watch_s)
+        source = CameraDevice(camera, selection, pace)
+    else:
+        folder = path / "images" if (path / "images").is_dir() else path
+        source = WatchedImageFolder(folder, selection, pace, idle_s=idle_s, watch_s=watch_s)
+    return RotatedSource(source, rotate) if rotate else source

@@ -78,18 +78,22 @@ class VideoFile(Recording):
                 claimed_frames = int(stream.frames) or round(duration_s * self._fps)
                 pixel_aspect = float(stream.sample_aspect_ratio or 1.0)
                 first = next(_decode(container, stream), None)
-                rgb = None if first is None else first.rgb()
-        except (FFmpegError, IndexError, ValueError, OSError) as cause:
+        except IndexError as cause:
+            raise InputError(f"{path} holds no images, only sound or text.") from cause
+        except (FFmpegError, ValueError, OSError) as cause:
+            if path.is_file() and not path.stat().st_size:
+                raise InputError(f"{path} is empty (0 bytes): copy it again.") from cause
             raise InputError(
-                f"{path} is no video that can be opened; does it hold pictures, or sound alone? A "
-                "recording that was cut off before it was finished has no index and cannot be "
-                "read: copy it again from the camera."
+                f"{path} cannot be opened as a video. A recording that was cut off before it was "
+                "finished has no index and cannot be read: copy it again from the camera."
             ) from cause
-        if first is None or rgb is None:
+        if first is None:
             raise InputError(f"No frame of {path} could be decoded; the video is empty or damaged.")
         self.quarter_turns = _quarter_turns(first.frame)
         self.has_unread_alpha = _has_transparency(first.frame)
-        self.size_px = (int(rgb.shape[1]), int(rgb.shape[0]))
+        self.is_hdr = int(first.frame.color_trc) in HDR_TRANSFERS
+        size_px = (int(first.frame.width), int(first.frame.height))
+        self.size_px = size_px[::-1] if self.quarter_turns % 2 else size_px
         self.frames_in_file = claimed_frames if claimed_frames > 0 else self.count_frames()
         self.frame_count: int | None = selection.count(self.frames_in_file)
         span = selection.span(self.frames_in_file)

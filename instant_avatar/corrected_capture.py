@@ -12,7 +12,7 @@ from capture.atomic_files import atomic_folder
 from capture.image_folder import list_images, write_png
 from capture.input_error import InputError
 from capture.source import FrameSource
-from capture.source_opening import open_source
+from capture.source_opening import reopen
 from instant_avatar.capture_validation import CaptureValidation, mask_lookup
 from instant_avatar.cli.shared_options import check_writable
 from preprocess.alignment.capture_geometry import (
@@ -89,7 +89,7 @@ def _write_images(source: FrameSource, video: VideoTransform, folder: Path) -> s
     suffix, options = (".png", []) if png else (".jpg", JPEG_OPTIONS)
     missing, place = set(range(source.frames_in_file)), folder
     folder.mkdir()
-    for frame in open_source(source.path).frames():
+    for frame in reopen(source, None).frames():
         picture = np.ascontiguousarray(video.reorient(frame.rgb)[..., ::-1])
         place = folder / f"{frame.index:06d}{suffix}"
         place.write_bytes(cv2.imencode(suffix, picture, options)[1].tobytes())

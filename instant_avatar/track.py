@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import cv2
 import numpy as np
@@ -93,6 +93,9 @@ class TrackArguments:
     frames: str = "::"
     """Frames to use: START:STOP:STEP, counted from 0 (default: all; of a long video every nth, 600
     at most)."""
+    rotate: Literal[0, 90, 180, 270] = 0
+    """Turn each frame clockwise by this many degrees, where the video lies on its side or upside
+    down; masks and cameras that are given must be those of the turned frames."""
     film: Annotated[bool, arg(help_behavior_hint="")] = True
     """Draw skeleton.webm."""
     overwrite: Flag = False
@@ -121,6 +124,7 @@ class TrackArguments:
             frames=parse_frame_range(self.frames),
             person=None if self.person is None else str(self.person),
             tracker=self.tracker,
+            rotate=self.rotate,
         )
 
     def check_outputs(self) -> None:
@@ -172,7 +176,8 @@ def next_command(arguments: TrackArguments, frames: slice | None) -> list[str]:
     """Return the command that trains on what was tracked in some frames."""
     named = {
         "poses": arguments.poses_path(), "masks": arguments.masks, "cameras": arguments.cameras,
-        "body": arguments.body, "frames": None if frames is None else format_frame_range(frames),
+        "body": arguments.body, "rotate": arguments.rotate or None,
+        "frames": None if frames is None else format_frame_range(frames),
     }  # fmt: skip
     return ["ia-ingest", str(arguments.video), *option_words(named)]
 

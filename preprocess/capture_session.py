@@ -42,6 +42,8 @@ class CaptureInputs:
         height_m: Height of the person; None if only the poses tell.
         tracker: Name of the tracker that finds poses where none are given; None: the built-in one.
         refine_masks: Whether given masks are refined where their borders miss the images' edges.
+        rotate: Degrees by which frames are turned clockwise; masks, poses and cameras are those of
+            turned frames.
         transposed: Whether the video's width and height are exchanged before masks and cameras are
             compared with it; only to find out whether it was rotated.
     """
@@ -60,6 +62,7 @@ class CaptureInputs:
     height_m: float | None = None
     tracker: str | None = None
     refine_masks: bool = True
+    rotate: int = 0
     transposed: bool = False
 
     @property

@@ -108,7 +108,8 @@ def open_capture(
         InputError: If a part is missing or unreadable, or they do not fit together.
     """
     paths = find_capture_paths(inputs.video, inputs.poses, _mask_file(inputs.masks), inputs.cameras)
-    source, body = open_source(paths.video, frames=inputs.frames), load_body_model(inputs.body)
+    source = open_source(paths.video, frames=inputs.frames, rotate=inputs.rotate)
+    body = load_body_model(inputs.body)
     source = TransposedSource(source) if inputs.transposed else source
     motion = read_poses(paths.poses, default_model=body.family, person=inputs.person)
     warnings: tuple[str, ...] = ()
@@ -274,6 +275,8 @@ def _open_stream_source(inputs: CaptureInputs, pace: PacingClock) -> FrameSource
     if inputs.is_live:
         camera = camera_address(inputs.video)
         return open_live_source(
-            inputs.video, camera, inputs.frames, pace, idle_s=inputs.idle_s, watch_s=inputs.watch_s
-        )
-    return RealtimePlayback(open_source(inputs.video, frames=inputs.frames), pace)
+            inputs.video, camera, inputs.frames, pace,
+            idle_s=inputs.idle_s, watch_s=inputs.watch_s, rotate=inputs.rotate,
+        )  # fmt: skip
+    source = open_source(inputs.video, frames=inputs.frames, rotate=inputs.rotate)
+    return RealtimePlayback(source, pace)

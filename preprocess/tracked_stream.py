@@ -78,7 +78,8 @@ class TrackedStream:
         self.path, self.size_px, self.selection = source.path, source.size_px, source.selection
         self.frames_in_file, self.frame_count = source.frames_in_file, source.frame_count
         self.duration_s, self.has_alpha = source.duration_s, source.has_alpha
-        self.quarter_turns, self.started_at = source.quarter_turns, source.started_at
+        self.quarter_turns, self.rotate = source.quarter_turns, source.rotate
+        self.started_at, self.is_hdr = source.started_at, source.is_hdr
         self.live, self.paced, self.warnings = source.live, source.paced, source.warnings
 
     @property

@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
@@ -53,6 +53,9 @@ class CaptureArguments:
     """Your own SMPL body, .npz or .pkl (nothing in it is executed; default: the embedded body)."""
     frames: str = "::"
     """Frames to use: START:STOP:STEP, counted from 0."""
+    rotate: Literal[0, 90, 180, 270] = 0
+    """Turn each frame clockwise by this many degrees, where the video lies on its side or upside
+    down. Poses, masks and cameras that are given must be those of the turned frames."""
 
     def capture_inputs(self) -> CaptureInputs:
         """Return the inputs to open."""
@@ -67,6 +70,7 @@ class CaptureArguments:
             frames=parse_frame_range(self.frames),
             invert_masks=self.mask_invert if self.mask_invert or self.no_mask_invert else None,
             person=self.person,
+            rotate=self.rotate,
         )
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from capture.atomic_files import OutputFileList, atomic_file, write_text_atomically
 from capture.input_error import InputError, quote_command
-from capture.source_opening import open_source
+from capture.source_opening import reopen
 from instant_avatar.cli.command_line import INTERRUPTED, CommandExit, stop_on_interrupt
 from instant_avatar.cli.console import Console
 from instant_avatar.cli.shared_options import format_frame_range
@@ -145,7 +145,7 @@ def _describe_request(arguments: IngestArguments) -> dict[str, Any]:
     named = {
         name: None if value is None else str(value)
         for name, value in vars(arguments).items()
-        if name in ("masks", "cameras", "body", "frames", "person", "tracker")
+        if name in ("masks", "cameras", "body", "frames", "person", "tracker", "rotate")
     }
     return {"video": str(arguments.video.resolve()), **named}
 
@@ -172,7 +172,7 @@ def solve_missing_cameras(
         return capture
     source = capture.source
     if source.paced:
-        source = open_source(capture.paths.video, frames=arguments.capture_inputs().frames)
+        source = reopen(source, arguments.capture_inputs().frames)
     with console.progress("solving cameras", 1.0) as bar:
         solved = solve_capture_cameras(
             replace(capture, source=source),

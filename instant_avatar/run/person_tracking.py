@@ -14,7 +14,7 @@ import numpy as np
 from capture.atomic_files import OutputFileList, atomic_file, atomic_folder
 from capture.input_error import InputError
 from capture.source import FrameSource
-from capture.source_opening import open_source
+from capture.source_opening import describe_recording, open_source, reopen
 from instant_avatar.cli.console import Console
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.silhouette_objective import sample_masks
@@ -107,8 +107,10 @@ def track_person(
         InputError: If the recording cannot be read, or no person is found in it.
         KeyboardInterrupt: If it was stopped before the person was found.
     """
-    inputs = limit_frames(inputs, open_source(inputs.video, frames=inputs.frames))
-    source = open_source(inputs.video, frames=inputs.frames)
+    source = open_source(inputs.video, frames=inputs.frames, rotate=inputs.rotate)
+    console.info(describe_recording(source))
+    inputs = limit_frames(inputs, source)
+    source = reopen(source, inputs.frames)
     folder = poses.parent / "masks"
     given = masks_to_use(inputs, folder)
     own_masks = not source.has_alpha and given is None
@@ -122,7 +124,7 @@ def track_person(
             console.warning(warning)
         if tracked.interrupted:  # the frames after it have no masks
             inputs = replace(inputs, frames=_frames_up_to(source, max(tracked.frame_times_s)))
-            source = open_source(inputs.video, frames=inputs.frames)
+            source = reopen(source, inputs.frames)
         with console.status("fitting body and poses to key points and masks"):
             capture = fit_tracked_video(source, tracked, inputs, part)
             grade = _grade(capture, tracked.frame_times_s)
@@ -179,7 +181,7 @@ def _run_networks(
     tracker, total, chosen = make_tracker(name, person), source.frame_count, source.selection
     if before is not None and _finds_again(tracker, source, before.keypoints):
         after = int(before.keypoints.frames[-1]) + chosen.step
-        source = open_source(inputs.video, frames=slice(after, chosen.stop, chosen.step))
+        source = reopen(source, slice(after, chosen.stop, chosen.step))
     elif before is not None:  # someone else, from here on
         tracker, before = make_tracker(name, person), None
     done = 0 if before is None else len(before.frame_times_s)
@@ -226,7 +228,7 @@ def _earlier_frames(
 def _finds_again(tracker: PersonTracker, source: FrameSource, keypoints: KeypointTrack) -> bool:
     """True if a new tracker takes up the same person in the last frame that was tracked."""
     last = int(keypoints.frames[-1])
-    frame = next(iter(open_source(source.path, frames=slice(last, last + 1)).frames()), None)
+    frame = next(iter(reopen(source, slice(last, last + 1)).frames()), None)
     found = None if frame is None else tracker(frame.rgb)
     if found is None:
         return False

@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 from capture.camera import Camera
 from capture.input_error import InputError
 from capture.source import Frame, FrameSource
-from capture.source_opening import open_source
+from capture.source_opening import reopen
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.silhouette_objective import (
     MaskSample,
@@ -72,7 +72,7 @@ def sample_video(
     stride, found = chosen.step * max(1, count // ALIGNMENT_IMAGES), []
     some = slice(chosen.start + stride // 2 // chosen.step * chosen.step, chosen.stop, stride)
     size_px: tuple[int, int] | None = None
-    for frame in open_source(source.path, frames=some).frames():
+    for frame in reopen(source, some).frames():
         row = geometry.row_for_frame(frame.index)
         if (
             row is not None

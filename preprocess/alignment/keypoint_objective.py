@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 
 from capture.camera import Camera, same_aspect_ratio
 from capture.source import Frame, FrameSource
-from capture.source_opening import open_source
+from capture.source_opening import reopen
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.silhouette_objective import spaced_indices
 from preprocess.body.body_surface import NEAR_PLANE_M
@@ -70,7 +70,7 @@ def track_images(source: FrameSource) -> tuple[TrackedImage, ...]:
     step = max(1, total // TRACKED_IMAGES)
     first = spaced_indices(total, TRACKED_IMAGES)[0]
     begin, end = (chosen.start + chosen.step * place for place in (first, total))
-    wanted = open_source(source.path, frames=slice(begin, end, chosen.step * step))
+    wanted = reopen(source, slice(begin, end, chosen.step * step))
     find = _PersonFinder()
     return tuple(find.track(frame) for frame in wanted.frames() if "corrupt" not in frame.flags)
 

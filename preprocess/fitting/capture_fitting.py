@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from capture.source import FrameSource
-from capture.source_opening import open_source
+from capture.source_opening import reopen
 from preprocess.alignment.capture_evidence import CaptureEvidence
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.mask_alignment import body_height_m, rescale_motion, scale_to_height
@@ -267,7 +267,7 @@ def _observe_silhouettes(capture: Capture, count: int) -> SilhouetteObjective | 
     stride = chosen.step * max(1, -(-(source.frame_count or 1) // count))
     some = slice(chosen.start + stride // 2 // chosen.step * chosen.step, chosen.stop, stride)
     samples = []
-    for each in map(observe, open_source(source.path, frames=some).frames()):
+    for each in map(observe, reopen(source, some).frames()):
         if isinstance(each, Observation):
             index = each.frame.index
             samples.append(MaskSample(index=index, camera_row=camera_row(index), alpha=each.alpha))

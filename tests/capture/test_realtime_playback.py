@@ -35,7 +35,8 @@ class Recorded:
 
     path, size_px, selection = Path("uneven.mp4"), (2, 2), FrameSelection()
     has_alpha = live = paced = False
-    quarter_turns = 0
+    quarter_turns = rotate = 0
+    is_hdr = False
     started_at = 0.0
     frames_in_file = frame_count = len(UNEVEN_S)
     duration_s, waited_s, dropped = 0.77, 0.0, 0

@@ -10,7 +10,7 @@ import pytest
 
 from capture.input_error import InputError
 from capture.source import FrameSelection
-from capture.source_opening import open_source
+from capture.source_opening import describe_recording, open_source, reopen
 from capture.video import VideoFile
 
 
@@ -71,6 +71,34 @@ def test_a_turned_video_comes_upright(write_video, turned_clockwise):
     assert source.size_px == (48, 64) == frames[0].size_px
     upper_right_is_now_lower_right = frames[0].rgb[50, 40]
     assert upper_right_is_now_lower_right[0] > 150 > 80 > upper_right_is_now_lower_right[2]
+
+
+@pytest.mark.parametrize("degrees", [90, 180, 270])
+def test_a_video_that_lies_on_its_side_is_turned_clockwise(write_video, degrees):
+    path = write_video(frames=4)
+    stored, turned = open_source(path), open_source(path, rotate=degrees)
+    frame = next(iter(turned.frames()))
+    assert turned.size_px == frame.size_px == (stored.size_px if degrees == 180 else (48, 64))
+    expected = np.rot90(next(iter(stored.frames())).rgb, -degrees // 90)
+    np.testing.assert_array_equal(frame.rgb, expected)
+    again = next(iter(reopen(turned, slice(2, 3)).frames()))
+    assert (again.index, again.size_px) == (2, turned.size_px)
+
+
+def test_a_recording_is_described_before_its_frames_are_read(write_video):
+    path = write_video(frames=20)
+    assert describe_recording(open_source(path)) == (
+        f"{path.name}: 20 frames of 64x48 px, 25 a second"
+    )
+    some = open_source(path, frames=slice(0, 20, 2))
+    assert describe_recording(some).startswith(f"{path.name}: 10 of 20 frames")
+
+
+@pytest.mark.parametrize(("content", "word"), [(b"", "0 bytes"), (b"no video" * 99, "cannot be")])
+def test_a_file_that_is_no_video_is_refused_with_its_cause(tmp_path, content, word):
+    (tmp_path / "video.mp4").write_bytes(content)
+    with pytest.raises(InputError, match=word):
+        open_source(tmp_path / "video.mp4")
 
 
 def test_a_truncated_video_gives_what_is_there_and_says_so(write_video):

@@ -28,7 +28,7 @@ SIZE = (180, 320)
 class Pictures:
     """A source of empty frames; its clock is the test's."""
 
-    live, paced, has_alpha, quarter_turns = False, True, False, 0
+    live, paced, has_alpha, is_hdr, quarter_turns, rotate = False, True, False, False, 0, 0
     started_at = waited_s = 0.0
     dropped, path, size_px = 0, Path("film.mp4"), SIZE
     selection, frames_in_file, frame_count, duration_s = None, COUNT, COUNT, COUNT / 30.0

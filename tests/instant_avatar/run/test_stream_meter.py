@@ -17,7 +17,8 @@ class Recorded:
 
     path, size_px, selection = Path("video.mp4"), (2, 2), FrameSelection()
     has_alpha = live = paced = False
-    quarter_turns = 0
+    quarter_turns = rotate = 0
+    is_hdr = False
     started_at = 0.0
     frames_in_file, frame_count, duration_s = 3, 3, 0.1
     waited_s, dropped = 0.0, 0
