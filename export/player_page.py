@@ -7,7 +7,7 @@ import base64
 import hashlib
 import io
 import json
-import shlex
+import os
 import sys
 import tarfile
 import zlib
@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Shaped
 
 from capture.atomic_files import atomic_file
-from capture.input_error import InputError
+from capture.input_error import InputError, quote_command
 from export.package.manifest import GoldenFrame
 from export.package.package_file import AvatarPackage, read_package
 from export.player_inputs import graph_initializers
@@ -34,9 +34,15 @@ INTEGRITY = (
 )
 """npm's checksum of that release's tarball."""
 WEB = Path(__file__).with_name("web")
-"""Folder of the page's own files and of the runtime."""
-RUNTIME_FOLDER = WEB / "onnxruntime"
-"""Folder of the files: ignored by git, but part of wheels built after `make web`."""
+"""Folder of the page's own files."""
+CACHE = {"win32": "AppData/Local", "darwin": "Library/Caches"}.get(sys.platform, ".cache")
+"""Folder in the user's home for files that can be fetched again."""
+RUNTIME_FOLDER = (
+    Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser(f"~/{CACHE}"))
+    / "instant-avatar-stream"
+    / f"onnxruntime-web-{ORT_WEB_VERSION}"
+)
+"""Folder of the runtime, which is fetched once for all installations."""
 SCRIPT_FILE = "ort.mjs"
 """The script, as stored."""
 WASM_FILE = "ort.wasm"
@@ -49,9 +55,8 @@ TARBALL_MEMBERS = {
 LICENCE_FILES = ("LICENSE", "ThirdPartyNotices.txt")
 """Notices, from the Python package of the same project, as the npm package has none."""
 MISSING_MESSAGE = (
-    "The browser page needs onnxruntime-web, which is not here: {why}. In a checkout, `make web` "
-    "fetches it (npm package onnxruntime-web {version}, 33 MB once), anywhere else "
-    "{python} -m instant_avatar.animation.web_server"
+    "The browser page needs onnxruntime-web, which is not in {folder}. Fetch it once with npm, "
+    "which comes with Node.js (33 MB): {command}"
 )
 """Message of `runtime_files` for a missing file."""
 
@@ -69,7 +74,7 @@ def install_runtime(tarball: bytes, folder: Path | None = None) -> None:
             f"The tarball is not onnxruntime-web {ORT_WEB_VERSION}: its checksum is {found}, "
             f"expected {INTEGRITY}. Nothing was kept."
         )
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     with tarfile.open(fileobj=io.BytesIO(tarball)) as archive:
         for name, member in TARBALL_MEMBERS.items():
             file = archive.extractfile(member)
@@ -88,8 +93,8 @@ def runtime_files(folder: Path | None = None) -> dict[str, bytes]:
     wanted = (*TARBALL_MEMBERS, *LICENCE_FILES)
     missing = [name for name in wanted if not (folder / name).is_file()]
     if missing:
-        why, python = f"no {folder / missing[0]}", shlex.quote(sys.executable)
-        raise InputError(MISSING_MESSAGE.format(why=why, version=ORT_WEB_VERSION, python=python))
+        command = quote_command(sys.executable, "-m", "instant_avatar.animation.web_server")
+        raise InputError(MISSING_MESSAGE.format(folder=folder, command=command))
     return {name: (folder / name).read_bytes() for name in wanted}
 
 

@@ -31,7 +31,7 @@ def plan_render(
         motion = load_driving_motion(
             arguments.poses, player.manifest.rest_joints, console, person=arguments.person
         )
-    elif arguments.turntable is not None:
+    elif arguments.turntable is not None and arguments.still is None:
         canonical = player.manifest.canonical_rotations
         motion = replace(demo_motion(1), joint_rotations=canonical[None])
     else:
@@ -41,9 +41,9 @@ def plan_render(
         row = arguments.still or 0
         if not (0 <= row < len(motion) and motion.valid[row]):
             raise InputError(
-                f"--still is {row}, but must be a valid pose: {arguments.poses} holds "
-                f"{len(motion)} poses, 0 to {len(motion) - 1}, {int(motion.valid.sum())} of them "
-                "valid."
+                f"--still is {row}, but must be a valid pose: {arguments.poses or 'the motion'} "
+                f"holds {len(motion)} poses, 0 to {len(motion) - 1}, {int(motion.valid.sum())} of "
+                "them valid."
             )
         motion = replace(motion, valid=np.arange(len(motion)) == row)  # the camera faces this pose
         fps, count = min(arguments.fps or ASSUMED_FPS, max_fps), 1

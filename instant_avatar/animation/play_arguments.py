@@ -102,7 +102,7 @@ class PlayArguments:
     person: Annotated[str | None, arg(metavar="ID", help_behavior_hint="")] = None
     """Person ID in the pose file (default: the longest track)."""
     still: Annotated[int | None, arg(metavar="ROW", help_behavior_hint="")] = None
-    """Hold this pose of --poses (0 is the first): one image, or a turntable."""
+    """Hold this pose of the motion (0 is the first): one image, or a turntable."""
     out: Annotated[Path | None, arg(metavar="FILE|DIR", help_behavior_hint="")] = None
     """Clip (.mp4, .webm), animation (.gif, .webp) or image (.png) to write, or a folder for RGBA
     frames 0000.png … (default: a .webm next to the package, named after the poses). With --web: a
@@ -160,8 +160,6 @@ class PlayArguments:
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
                 raise InputError(f"--{name} is {value}, but must lie between {low} and {high}.")
-        if self.still is not None and self.poses is None:
-            raise InputError("--still requires --poses.")
         if self.camera is not None and self.viewpoint != Viewpoint():
             raise InputError(
                 "--camera sets the viewpoint: leave out --orbit, --elevation, --close-up and "

@@ -134,8 +134,8 @@ PROGRAM = "python -m instant_avatar.animation.web_server"
 class FetchArguments:
     """Fetch the pinned release of onnxruntime-web that `ia-play --web` needs (`make web`).
 
-    npm downloads it once (33 MB); its checksum is verified, and it is stored next to the page. An
-    existing copy is kept.
+    npm downloads it once (33 MB); its checksum is verified, and it is stored in your cache folder.
+    An existing copy is kept.
 
     Exit codes: 0 done; 2 npm is missing or failed; 3 disk full; 130 Ctrl-C.
     """

@@ -202,7 +202,7 @@ def comparison_pairs(result: TrainingResult) -> list[ComparisonPair]:
 
 def demo_animation(player: Player) -> bytes:
     """The avatar in a motion of our own, drawn by the player, as an animated WebP."""
-    return motion_animation(player, demo_motion(fps=ANIMATION_FPS))
+    return motion_animation(player, demo_motion())
 
 
 def motion_animation(player: Player, motion: Motion) -> bytes:

@@ -88,7 +88,7 @@ def test_every_file_that_the_page_names_is_there(files):
 
 
 def test_a_missing_runtime_is_refused_with_the_command_to_run(tmp_path):
-    with pytest.raises(InputError, match="make web"):
+    with pytest.raises(InputError, match=r"instant_avatar\.animation\.web_server"):
         player_page.runtime_files(tmp_path)
 
 
@@ -105,3 +105,9 @@ def test_what_changes_with_every_picture_is_not_read_aloud():
     outputs = re.findall(r"<output[^>]*>", page)
     assert len(outputs) == 2
     assert all('aria-live="off"' in each for each in outputs)
+
+
+def test_the_runtime_is_kept_outside_of_the_installation():
+    """`pip uninstall` would leave it behind there, and it may not be writable."""
+    assert player_page.WEB not in player_page.RUNTIME_FOLDER.parents
+    assert "instant-avatar-stream" in player_page.RUNTIME_FOLDER.parts

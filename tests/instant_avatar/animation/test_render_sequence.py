@@ -94,8 +94,17 @@ def test_without_poses_it_moves_all_the_same(call_play, package):
     outcome = call_play(package, "--size", 32, "--tier", "lite")
     assert outcome.code == 0
     assert outcome.out.strip() == str(package.parent / "avatar.webm")
-    assert "48 frames" in outcome.err
+    assert "90 frames" in outcome.err
+    assert "at 30 fps" in outcome.err
     (package.parent / "avatar.webm").unlink()
+
+
+@pytest.mark.parametrize(
+    ("wishes", "count"),
+    [(["--still", 20], 1), (["--still", 20, "--turntable", "2"], 4), (["--turntable", "2"], 4)],
+)
+def test_without_poses_a_still_and_a_turntable_show_the_built_in_motion(frames, wishes, count):
+    assert len(frames(*wishes, "--close-up", "head", "--fps", "2")) == count
 
 
 def test_frames_are_clear_unless_a_background_is_wished(frames, novel, tmp_path, rng):

@@ -322,7 +322,7 @@ def test_without_the_runtime_it_says_how_to_get_it(call_play, package, tmp_path,
     monkeypatch.setattr(player_page, "RUNTIME_FOLDER", tmp_path / "nothing")
     outcome = call_play(package, "--web", "--out", tmp_path / "page")
     assert outcome.code == 2
-    assert "make web" in outcome.complaint("ia-play")
+    assert "Fetch it once" in outcome.complaint("ia-play")
     assert not (tmp_path / "page").exists()
 
 
