@@ -11,7 +11,7 @@ from pathlib import Path
 try:
     from instant_avatar import InputError, Player, train
 except ModuleNotFoundError as missing:
-    sys.exit(f"{missing}. To train, install: pip install 'instant-avatar-stream[learn]'")
+    sys.exit(f"{missing}. To train, install in the checkout's folder: pip install -e '.[learn]'")
 
 STEPS = 500
 
@@ -40,4 +40,6 @@ if __name__ == "__main__":
     except InputError as error:
         sys.exit(str(error))
     except ModuleNotFoundError as missing:
-        sys.exit(f"{missing}. To train, install: pip install 'instant-avatar-stream[learn]'")
+        sys.exit(
+            f"{missing}. To train, install in the checkout's folder: pip install -e '.[learn]'"
+        )

@@ -14,7 +14,7 @@ try:
 
     from instant_avatar import JOINT_NAMES, BodyPose, Camera, InputError, Player
 except ModuleNotFoundError as missing:
-    sys.exit(f"{missing}. Install the player for this Python: pip install instant-avatar-stream")
+    sys.exit(f"{missing}. Install the player in the checkout's folder: pip install -e .")
 
 
 def joints(**rotations: tuple[float, float, float]) -> np.ndarray:

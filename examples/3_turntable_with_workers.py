@@ -16,7 +16,7 @@ try:
 
     from instant_avatar import BodyPose, Camera, InputError, Player
 except ModuleNotFoundError as missing:
-    sys.exit(f"{missing}. Install the player for this Python: pip install instant-avatar-stream")
+    sys.exit(f"{missing}. Install the player in the checkout's folder: pip install -e .")
 
 PICTURES, SIZE, DISTANCE_M = 24, 270, 5.0
 

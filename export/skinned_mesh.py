@@ -154,7 +154,7 @@ def _simplify(
     Float32[np.ndarray, "fewer 3"], Float32[np.ndarray, "fewer 3"], Int32[np.ndarray, "some 3"]
 ]:
     """Return a surface of fewer triangles, with the normals of the nearest vertices."""
-    import fast_simplification  # missing in an installation of the player alone
+    import fast_simplification  # not needed by the player
 
     found = fast_simplification.simplify(positions, faces, target_count=triangles)
     nearest = KDTree(positions).query(found[0])[1]

@@ -34,6 +34,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 
+STAGES = ("capture", "preprocess", "avatar", "export", "instant_avatar")
+"""Packages of this distribution."""
+
+
 def _quiet_excepthook(
     kind: type[BaseException], error: BaseException, traceback: TracebackType | None
 ) -> None:
@@ -42,6 +46,11 @@ def _quiet_excepthook(
         print("stopped by Ctrl-C.", file=sys.stderr)  # noqa: T201 - there is no console yet
     elif issubclass(kind, BrokenPipeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # discard buffered output
+    elif isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] not in STAGES:
+        from capture.input_error import install_command
+
+        name, command = error.name, install_command()
+        print(f"{name} is missing. Install what this program needs: {command}", file=sys.stderr)  # noqa: T201
     else:
         sys.__excepthook__(kind, error, traceback)
 

@@ -3,10 +3,8 @@
 import sys
 from collections.abc import Sequence
 from contextlib import closing
-from importlib.util import find_spec
 from pathlib import Path
 
-from capture.input_error import InputError
 from instant_avatar.batching.batch_arguments import BatchArguments
 from instant_avatar.batching.batch_folder import RESULTS_NAME, BatchFolder
 from instant_avatar.batching.capture_discovery import find_captures, parse_options, split_paths
@@ -14,12 +12,12 @@ from instant_avatar.batching.ray_tasks import run_attempts
 from instant_avatar.batching.remote_files import RemoteFileError
 from instant_avatar.batching.summary_page import Results, describe_result, headline, summary_page
 from instant_avatar.cli.command_line import (
-    DISTRIBUTION,
     DONE,
     NO_AVATAR,
     RESOURCE_UNAVAILABLE,
     CommandExit,
     parse_arguments,
+    require_packages,
     run_command,
 )
 from instant_avatar.cli.console import Console
@@ -50,12 +48,7 @@ def batch(arguments: BatchArguments, ingest_words: Sequence[str], console: Conso
     `ingest_words`: options of ia-ingest for all captures. After an `InputError` nothing was
     started.
     """
-    for module in ("torch", "ray", "fsspec"):
-        if find_spec(module) is None:
-            raise InputError(
-                f"{PROGRAM} requires {module}, which is not installed. Install it: pip install "
-                f"'{DISTRIBUTION}[learn,cluster]'"
-            )
+    require_packages("ray", "fsspec", "torch")
     arguments.validate()
     parse_options(split_paths(ingest_words, "")[1])
     with console.status("looking for captures"):

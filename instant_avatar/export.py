@@ -159,7 +159,7 @@ def _encode_animated(mesh: SkinnedMesh, manifest: Manifest, motion: Motion, name
 
 def _encode_static(mesh: SkinnedMesh, kind: str) -> bytes:
     """Encode the canonical pose; colors are sRGB, as programs take a PLY's to be."""
-    import trimesh  # missing in an installation of the player alone
+    import trimesh  # slow to import
 
     options: dict[str, Any] = {
         "ply": {"vertex_normal": True},

@@ -4,7 +4,6 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from importlib.util import find_spec
 
 from capture.atomic_files import write_text_atomically
 from capture.input_error import InputError
@@ -13,6 +12,7 @@ from instant_avatar.cli.command_line import (
     exit_on_interrupt,
     fill_optional_value,
     parse_arguments,
+    require_packages,
     run_command,
 )
 from instant_avatar.cli.console import Console
@@ -42,8 +42,8 @@ def ingest(arguments: IngestArguments, console: Console) -> int:
     After an `InputError` nothing was written; on a full disk the newest checkpoint is kept.
     """
     started_at = time.perf_counter()
-    if find_spec("torch") is None:  # said before minutes of tracking
-        raise ModuleNotFoundError(name="torch")
+    solver = ("pycolmap",) if arguments.cameras == "solve" else ()
+    require_packages("torch", "numba", "onnx", *solver)
     arguments.validate()
     run, inputs = arguments.run_folder(), arguments.capture_inputs().input_paths()
     run.check_usable(inputs, resume=arguments.resume, overwrite=arguments.overwrite)

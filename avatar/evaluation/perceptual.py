@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from capture.input_error import InputError
+from capture.input_error import InputError, install_command
 
 LpipsNetwork = Literal["alex", "vgg"]
 
@@ -104,9 +104,7 @@ class Lpips:
                 if network not in missing
             }
         except ImportError:
-            self.unavailable = (
-                "LPIPS needs torchmetrics: pip install 'instant-avatar-stream[lpips]'."
-            )
+            self.unavailable = f"LPIPS needs torchmetrics: {install_command('lpips')}"
         self.conventions = tuple(
             name for name in wanted if LPIPS_CONVENTIONS[name].network in self._networks
         )

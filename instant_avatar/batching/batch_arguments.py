@@ -33,7 +33,7 @@ class BatchArguments:
 
     The folder then holds a folder per capture, results.jsonl (a line per capture) and summary.html.
     Run the same command again to go on: what is done is left alone, what is new or has changed is
-    learnt. Requires Ray: pip install 'instant-avatar-stream[cluster]'. See docs/batch.md.
+    learnt. Requires the extras [learn,cluster]. See docs/batch.md.
 
     Exit codes: 0 every capture has an avatar; 1 some were refused or have failed; 2 bad input,
     nothing was started; 3 the disk is full, or another batch is writing into --out; 130 stopped.

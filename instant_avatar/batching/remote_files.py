@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from capture.input_error import InputError
+from capture.input_error import InputError, install_command
 
 VERSION_KEYS = ("ETag", "etag", "md5Hash", "LastModified", "updated", "mtime", "created")
 """Keys that tell whether a remote file has changed, best first."""
@@ -45,8 +45,8 @@ def open_remote(url: str) -> Iterator[tuple[Any, str]]:
         system, path = url_to_fs(url, use_listings_cache=False)
     except (ImportError, ValueError) as error:
         raise InputError(
-            f"{url} cannot be read: {error}. Most are covered by: pip install "
-            "'instant-avatar-stream[cluster]' (gs:// needs gcsfs)."
+            f"{url} cannot be read: {error}. Most kinds need: {install_command('cluster')} (gs:// "
+            "needs gcsfs, too)."
         ) from error
     try:
         yield system, path.rstrip("/")

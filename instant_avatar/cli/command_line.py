@@ -13,6 +13,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 from itertools import zip_longest
 from typing import Any, TypeVar
 
@@ -20,7 +21,7 @@ import tyro
 from rich.console import Console as RichConsole
 from rich.markup import escape
 
-from capture.input_error import InputError
+from capture.input_error import DISTRIBUTION, InputError, install_command
 from instant_avatar.cli.console import Console, StderrConsole
 
 DONE, NO_AVATAR, BAD_INPUT, RESOURCE_UNAVAILABLE, INTERRUPTED = 0, 1, 2, 3, 130
@@ -79,24 +80,32 @@ def exit_on_interrupt(
         yield
 
 
-LEARN_PACKAGES = frozenset({"torch", "numba", "onnx"})
-"""Large packages of the extra [learn], which playing does not need."""
-SMALL_PACKAGES = frozenset({"trimesh", "pycolmap", "fast_simplification"})
-"""Small packages of the extra [learn], which can be installed alone."""
+EXTRAS = {
+    **dict.fromkeys(("torch", "numba", "onnx", "pycolmap"), "learn"),
+    **dict.fromkeys(("ray", "fsspec"), "learn,cluster"),
+    "viser": "viewer",
+    "h5py": "datasets",
+}
+"""Optional packages, and the extras that install them."""
+
+
+def require_packages(*names: str) -> None:
+    """Raise a ModuleNotFoundError, before work is done, if a package is not installed."""
+    for name in names:
+        if find_spec(name) is None:
+            raise ModuleNotFoundError(name=name)
 
 
 def install_advice(error: ModuleNotFoundError) -> str | None:
     """Return what to install for a missing package; None if the module is not an optional one."""
     package = (error.name or "").split(".")[0]
-    if package in LEARN_PACKAGES:
-        return (
-            f"{package} is not installed: this installation plays avatars, tracks people, checks "
-            "captures and exports meshes, but cannot train. To train: pip install "
-            f"'{DISTRIBUTION}[learn]'"
-        )
-    if package in SMALL_PACKAGES:
-        return f"{package} is not installed. Install it: pip install {package}"
-    return None
+    if package not in EXTRAS:
+        return None
+    able = ": this installation plays avatars, tracks people, checks captures and exports meshes"
+    return (
+        f"{package} is not installed{able if EXTRAS[package] == 'learn' else ''}. Install it: "
+        f"{install_command(EXTRAS[package])}"
+    )
 
 
 DISK_FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
@@ -189,9 +198,6 @@ def is_disk_full(error: OSError) -> bool:
     """True if a write failed because the disk is full."""
     return error.errno in DISK_FULL_ERRNOS
 
-
-DISTRIBUTION = "instant-avatar-stream"
-"""Name of the installed package."""
 
 Arguments = TypeVar("Arguments")
 

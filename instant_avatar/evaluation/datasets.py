@@ -237,12 +237,8 @@ def _read_camera(path: Path) -> tuple[dict[str, Any], Lens]:
 
 def _open_hdf5(path: Path, keys: tuple[str, ...]) -> Any:
     """Open an HDF5 file of plain arrays."""
-    try:
-        import h5py
-    except ImportError as cause:
-        raise InputError(
-            f"{path} needs h5py: pip install 'instant-avatar-stream[datasets]'."
-        ) from cause
+    import h5py  # of the extra [datasets]
+
     try:
         file = h5py.File(path, "r")
         missing = [key for key in keys if key not in file]

@@ -33,8 +33,8 @@ class EvaluateArguments:
     Images are compared on white, in the capture's poses ("given") and in poses fitted to each frame
     with the avatar frozen ("fitted", as in the paper).
 
-    LPIPS needs torchmetrics (pip install 'instant-avatar-stream[lpips]') and torchvision's weights
-    of AlexNet and VGG-16, which are not downloaded here; without them the table says n/a.
+    LPIPS needs the extra [lpips] and torchvision's weights of AlexNet and VGG-16, which are not
+    downloaded here; without them the table says n/a.
 
     Exit codes: 0 done; 2 bad input; 3 disk full; 130 Ctrl-C, after a table of the scored frames.
     """

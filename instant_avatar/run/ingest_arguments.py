@@ -1,6 +1,5 @@
 """Arguments of ia-ingest; the text under each field is its --help."""
 
-import importlib.util
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from tyro.conf import Positional, arg
 from avatar.config import HELD_OUT_STRIDE, NOMINAL_STEPS_PER_S
 from capture.input_error import InputError
 from capture.live_sources import IDLE_TIMEOUT_S, camera_address
+from instant_avatar.cli.command_line import require_packages
 from instant_avatar.cli.shared_options import (
     CaptureArguments,
     Flag,
@@ -113,8 +113,8 @@ class IngestArguments(CaptureArguments):
     """Train even if ia-check considers poses and masks unusable."""
     view: Annotated[int | None, arg(metavar="[PORT]", help_behavior_hint="")] = None
     """Open a live viewer at http://127.0.0.1:PORT (default 8008): orbit the avatar, see body
-    coverage, pause training, save a package. Requires viser: pip install
-    'instant-avatar-stream[viewer]'. Ctrl-C closes it at the end."""
+    coverage, pause training, save a package. Requires the extra [viewer]. Ctrl-C closes it at the
+    end."""
     threads: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Threads of the trainer (default: one per core)."""
     seed: int = 0
@@ -155,12 +155,8 @@ class IngestArguments(CaptureArguments):
             check_output_file(self.json, "--json", inputs, overwrite=self.may_replace_json)
         if self.view is not None and not 0 <= self.view < 1 << 16:
             raise InputError(f"--view is {self.view}, but must be a port from 0 to 65535.")
-        if self.view is not None and importlib.util.find_spec("viser") is None:
-            raise InputError(
-                "--view requires viser, which is not installed. Install it with: pip install "
-                "'instant-avatar-stream[viewer]' (or: pip install viser). Without --view, "
-                "report.html shows the result afterwards."
-            )
+        if self.view is not None:
+            require_packages("viser")
 
     def _check_live_options(self) -> None:
         """Refuse what only a recording can have."""

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from capture.image_folder import write_png
-from capture.input_error import InputError
+from capture.input_error import InputError, install_command
 from capture.source import Frame, FrameSource
 from preprocess.sfm.camera_solution import SparseModel
 
@@ -190,8 +190,9 @@ def require_pycolmap() -> None:
     """Raise an InputError if pycolmap is missing."""
     if importlib.util.find_spec("pycolmap") is None:
         raise InputError(
-            "--cameras solve needs pycolmap, which is not installed: pip install pycolmap. Or give "
-            "the cameras that another program has solved (docs/formats.md)."
+            "--cameras solve needs pycolmap, which is not installed. Install it: "
+            f"{install_command('learn')}. Or give the cameras that another program has solved "
+            "(docs/formats.md)."
         )
 
 

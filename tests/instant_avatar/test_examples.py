@@ -32,7 +32,7 @@ def test_what_is_missing_is_one_line(file, tmp_path, monkeypatch):
     with pytest.raises(SystemExit, match=r"none|is a file"):
         runpy.run_path(str(file), run_name="__main__")
     monkeypatch.setitem(sys.modules, "numpy" if file.stem[0] != "1" else "torch", None)
-    with pytest.raises(SystemExit, match=r"pip install '?instant-avatar-stream"):
+    with pytest.raises(SystemExit, match=r"pip install -e '?\."):
         runpy.run_path(str(file), run_name="__main__")
 
 

@@ -1,5 +1,6 @@
 """What plays, checks and exports without the packages that learning needs, and what says so."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -10,7 +11,8 @@ from pathlib import Path
 import cv2
 import pytest
 
-from instant_avatar.cli.command_line import LEARN_PACKAGES, SMALL_PACKAGES, install_advice
+from capture import input_error
+from instant_avatar.cli.command_line import EXTRAS, install_advice
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -33,6 +35,7 @@ for words in {commands!r}:
     print(code, *said.getvalue().split())
 """
 """Runs commands one after the other where some packages cannot be imported."""
+LEARN_PACKAGES = {name for name, extras in EXTRAS.items() if extras == "learn"}
 
 
 def names(requirements: list[str]) -> set[str]:
@@ -75,34 +78,34 @@ PLAY = [
     ["play", "avatar.iavatar", "--poses", "poses.npz", "--size", "64", "--out", "a.webm"],
     ["play", "avatar.iavatar", "--verify"],
     ["play", "avatar.iavatar", "--bench", "--size", "64"],
-    ["export", "avatar.iavatar", "--to", "glb", "--poses", "poses.npz", "--out", "a.glb"],
+    ["export", "avatar.iavatar", "--to", "glb", "--triangles", "2000", "--out", "a.glb"],
+    ["export", "avatar.iavatar", "--to", "ply", "--out", "a.ply"],
 ]  # fmt: skip
 
 
 def test_what_learning_needs_is_an_extra():
     needed = names(PROJECT["dependencies"])
-    assert names(PROJECT["optional-dependencies"]["learn"]) == LEARN_PACKAGES | SMALL_PACKAGES
-    assert needed.isdisjoint(LEARN_PACKAGES | SMALL_PACKAGES)
+    assert names(PROJECT["optional-dependencies"]["learn"]) == LEARN_PACKAGES
+    assert needed.isdisjoint(LEARN_PACKAGES)
 
 
 def test_playing_checking_and_meshes_need_nothing_of_it(place, film):
     commands = [*PLAY, ["check", str(film), "--sheet", "sheet.png"]]
-    ended = without(LEARN_PACKAGES | SMALL_PACKAGES, commands, place)
+    ended = without(LEARN_PACKAGES, commands, place)
     assert [line[0] for line in ended] == ["0"] * len(commands), ended
     assert played(place)
 
 
 def test_commands_that_need_it_say_what_to_install(place, run, film):
-    learn = "pip install 'instant-avatar-stream[learn]'"
+    learn = f"-m pip install -e '{ROOT}[learn]'"
     wanted = [
         (["ingest", str(film), "--out", "run"], f"ia-ingest: torch is not installed.* {learn}"),
         (["evaluate", str(run)], f"ia-evaluate: torch is not installed.* {learn}"),
         (["sample", "film"], f"ia-sample: numba is not installed.* {learn}"),
         (["export", str(run), "--out", "a.iavatar"], f"ia-export: torch is not .* {learn}"),
-        (["export", "avatar.iavatar", "--to", "ply", "--out", "a.ply"], "pip install trimesh"),
     ]
     before = sorted(place.iterdir())
-    ended = without(LEARN_PACKAGES | SMALL_PACKAGES, [words for words, _ in wanted], place)
+    ended = without(LEARN_PACKAGES, [words for words, _ in wanted], place)
     for line, (_, said) in zip(ended, wanted, strict=True):
         first, last = said.split(".*")[0], said.split(".*")[-1].strip()
         assert line.startswith("2 ")
@@ -119,7 +122,30 @@ def test_a_module_of_our_own_that_is_missing_is_no_advice():
         )
         is None
     )
-    assert "pip install pycolmap" in str(install_advice(ModuleNotFoundError(name="pycolmap._core")))
+
+
+@pytest.mark.parametrize(
+    ("origin", "named"),
+    [
+        (None, "'instant-avatar-stream[viewer]'"),
+        ({"url": "file:///w/i.whl"}, "'instant-avatar-stream[viewer] @ file:///w/i.whl'"),
+        (
+            {"url": "https://g/i", "vcs_info": {}},
+            "'instant-avatar-stream[viewer] @ git+https://g/i'",
+        ),
+    ],
+)
+def test_the_advice_names_where_this_installation_came_from(origin, named, tmp_path, monkeypatch):
+    """No index may have the package."""
+
+    class Installed:
+        def read_text(self, name: str) -> str | None:
+            return None if origin is None else json.dumps(origin)
+
+    monkeypatch.setattr(input_error, "__file__", str(tmp_path / "capture" / "input_error.py"))
+    monkeypatch.setattr(input_error, "distribution", lambda name: Installed())
+    advice = install_advice(ModuleNotFoundError(name="viser"))
+    assert advice == f"viser is not installed. Install it: {sys.executable} -m pip install {named}"
 
 
 def index_or_skip(folder: Path) -> None:
@@ -157,7 +183,7 @@ def test_an_installation_without_extras_plays(place, tmp_path_factory):
         assert done.returncode == 0, done.stderr
         return done.stdout
 
-    absent = sorted(LEARN_PACKAGES | SMALL_PACKAGES)
+    absent = sorted(LEARN_PACKAGES)
     looked = f"from importlib.util import find_spec; print([*map(find_spec, {absent})])"
     assert call(python, "-c", looked).strip() == str([None] * len(absent))
     for command, *words in PLAY:
