@@ -4,6 +4,7 @@ import io
 import os
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -190,6 +191,12 @@ def _is_complete(data: bytes) -> bool:
     return True
 
 
+def _reduce(frame: Frame, longer_px: int) -> Frame:
+    scale = min(1.0, longer_px / max(frame.size_px))
+    size_px = [max(1, round(side * scale)) for side in frame.size_px]
+    return replace(frame, rgb=cv2.resize(frame.rgb, size_px, interpolation=cv2.INTER_AREA))
+
+
 class ImageFolder(Recording):
     """A folder of images; image i was taken at i / 30 s."""
 
@@ -231,6 +238,18 @@ class ImageFolder(Recording):
             flags = frozenset({"repeated"} if repeated else ())
             yield Frame(index=index, time_s=index / ASSUMED_FPS, rgb=rgb, flags=flags, alpha=alpha)
             previous = rgb
+
+    def glance(
+        self, times_s: Sequence[float], apart_s: float, longer_px: int
+    ) -> Iterator[tuple[Frame, Frame]]:
+        """Yield reduced images near some times, each with the one that follows it."""
+        del apart_s  # photographs may be far apart
+        for time_s in times_s:
+            place = min(round(time_s * ASSUMED_FPS), max(0, len(self._images) - 2))
+            some = FrameSelection(start=place, stop=place + 2)
+            pair = [_reduce(frame, longer_px) for frame in ImageFolder(self.path, some).frames()]
+            if len(pair) == 2:
+                yield pair[0], pair[1]
 
     def count_frames(self) -> int:
         """The number of images in the folder."""

@@ -1,11 +1,14 @@
 """Opens a source of frames: a video file, a folder of images, a capture folder, a camera."""
 
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from capture.image_folder import IMAGE_SUFFIXES, ImageFolder, list_images
 from capture.input_error import InputError
 from capture.live_sources import CameraDevice, WatchedImageFolder
-from capture.source import FrameSelection, FrameSource, PacingClock, RotatedSource
+from capture.source import Frame, FrameSelection, FrameSource, PacingClock, RotatedSource
 from capture.video import VIDEO_SUFFIXES, VideoFile
 
 HEIC_SUFFIXES = frozenset({".heic", ".heif"})
@@ -34,6 +37,28 @@ def open_source(path: Path, *, frames: slice | None = None, rotate: int = 0) -> 
 def reopen(source: FrameSource, frames: slice | None) -> FrameSource:
     """Open other frames of a recording, turned as it is."""
     return open_source(source.path, frames=frames, rotate=source.rotate)
+
+
+GLANCES = 6
+"""Places of a recording, evenly spread, that are looked at before it is read."""
+GLANCE_APART_S = 0.2
+"""Time between the two frames of a place, which show how the camera moves, seconds."""
+GLANCE_PX = 960
+"""Longer side of the frames of a glance, px."""
+
+
+def glance(source: FrameSource) -> list[tuple[Frame, Frame]]:
+    """Reduced frames at a few places of a recording, and for each one soon after it."""
+    recording = _open_recording(source.path, source.selection)
+    last = source.selection.span(source.frames_in_file) - 1
+    rate = (last + 1) / (source.duration_s or 1.0)
+    places = (np.arange(GLANCES) + 0.5) * last / GLANCES + source.selection.start
+    pairs = recording.glance((places / rate).tolist(), GLANCE_APART_S, GLANCE_PX)
+    turns = -source.rotate // 90
+    return [
+        tuple(replace(each, rgb=np.ascontiguousarray(np.rot90(each.rgb, turns))) for each in pair)
+        for pair in pairs
+    ]
 
 
 def describe_recording(source: FrameSource) -> str:

@@ -1,6 +1,6 @@
 """Video files, read by PyAV as upright RGB frames with the container's timestamps."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -40,14 +40,19 @@ class DecodedFrame(NamedTuple):
     time_s: float
     after_gap: bool
 
-    def rgb(self) -> UInt8[np.ndarray, "height width 3"] | None:
-        """Convert to upright 8-bit RGB; None if that fails."""
-        curve = int(self.frame.color_trc)
+    def rgb(self, longer_px: int | None = None) -> UInt8[np.ndarray, "height width 3"] | None:
+        """Convert to upright 8-bit RGB, reduced to a longer side first; None if that fails."""
+        curve, longer = int(self.frame.color_trc), max(self.frame.width, self.frame.height)
+        scale = 1.0 if longer_px is None else min(1.0, longer_px / longer)
+        size = {
+            "width": max(1, round(self.frame.width * scale)),
+            "height": max(1, round(self.frame.height * scale)),
+        }
         try:
             if curve in HDR_TRANSFERS:
-                rgb = tone_map_hdr(self.frame.to_ndarray(format="rgb48le"), curve)
+                rgb = tone_map_hdr(self.frame.to_ndarray(format="rgb48le", **size), curve)
             else:
-                rgb = self.frame.to_ndarray(format="rgb24")
+                rgb = self.frame.to_ndarray(format="rgb24", **size)
         except (FFmpegError, ValueError):
             return None
         return np.ascontiguousarray(np.rot90(rgb, _quarter_turns(self.frame)))
@@ -127,6 +132,42 @@ class VideoFile(Recording):
                 flags=frozenset(flag for flag, is_set in flags.items() if is_set),
             )
             previous = rgb
+
+    def glance(
+        self, times_s: Sequence[float], apart_s: float, longer_px: int
+    ) -> Iterator[tuple[Frame, Frame]]:
+        """Yield reduced frames near some times, each with one that comes `apart_s` later.
+
+        What lies between is skipped from key frame to key frame, where the container lists them.
+        """
+        slack_s = 0.5 * (times_s[-1] - times_s[0]) / max(1, len(times_s) - 1)
+        with av.open(str(self.path)) as container:
+            stream = container.streams.video[0]
+            entries, start = stream.index_entries, stream.start_time or 0
+            keys = np.array([entry.timestamp for entry in entries if entry.is_keyframe])
+            keys_s = (keys - start) * float(stream.time_base)
+            frames, now_s = _decode(container, stream), -1.0
+            for time_s in times_s:
+                near = np.flatnonzero((keys_s > now_s) & (keys_s <= time_s))
+                if len(near):
+                    container.seek(int(keys[near[-1]]), stream=stream)
+                first = self._next_reduced(frames, time_s - slack_s, longer_px)
+                later_s = np.inf if first is None else first.time_s + apart_s
+                second = self._next_reduced(frames, later_s, longer_px)
+                if first is None or second is None:
+                    return
+                now_s = second.time_s
+                yield first, second
+
+    def _next_reduced(
+        self, frames: Iterator[DecodedFrame], time_s: float, longer_px: int
+    ) -> Frame | None:
+        """The next frame that does not come before a time, reduced."""
+        for decoded in frames:
+            if decoded.time_s >= time_s and (rgb := decoded.rgb(longer_px)) is not None:
+                index = round(decoded.time_s * self._fps)
+                return Frame(index=index, time_s=decoded.time_s, rgb=rgb)
+        return None
 
     def count_frames(self) -> int:
         """Count the frames that can be decoded, by decoding them."""

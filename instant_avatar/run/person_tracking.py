@@ -31,6 +31,7 @@ from preprocess.observation import associate_cameras, associate_masks
 from preprocess.open_capture import open_capture, open_tracked_stream
 from preprocess.plugins import DEFAULT_TRACKER, PersonTracker, make_tracker, segmenter_name
 from preprocess.poses.pose_file import read_motion, write_motion
+from preprocess.tracking.first_look import look_at
 from preprocess.tracking.keypoints import KeypointTrack
 from preprocess.tracking.pose_lift import lift_keypoints
 from preprocess.tracking.tracking_grade import TrackingGrade, grade_tracking
@@ -109,8 +110,18 @@ def track_person(
     """
     source = open_source(inputs.video, frames=inputs.frames, rotate=inputs.rotate)
     console.info(describe_recording(source))
-    inputs = limit_frames(inputs, source)
+    inputs, step = limit_frames(inputs, source), source.selection.step
     source = reopen(source, inputs.frames)
+    if inputs.frames is not None and inputs.frames.step != step:
+        console.info(
+            f"One in {inputs.frames.step} frames is used, {source.frame_count} in all (--frames "
+            "names others)."
+        )
+    if not resume:
+        look = look_at(source)
+        console.info(look.describe())
+        for advice in look.advice():
+            console.warning(advice)
     folder = poses.parent / "masks"
     given = masks_to_use(inputs, folder)
     own_masks = not source.has_alpha and given is None
