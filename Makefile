@@ -21,7 +21,7 @@ demo: install
 	cp $(DEMO)/capture/video.mp4 $(DEMO)/video.mp4
 	$(BIN)/python -m instant_avatar.ingest $(DEMO)/video.mp4 --out $(DEMO)/from-video --seconds 60 --overwrite
 	$(BIN)/python -m instant_avatar.evaluate $(DEMO)/run $(DEMO)/from-video --markdown $(DEMO)/comparison.md --overwrite
-	$(BIN)/python -m instant_avatar.play $(DEMO)/run/avatar.iavatar --poses $(DEMO)/capture/dance.npz --out $(DEMO)/dance.webm --overwrite
+	$(BIN)/python -m instant_avatar.play $(DEMO)/run/avatar.iavatar --poses $(DEMO)/capture/dance.npz --out $(DEMO)/dance.mp4 --overwrite
 
 web: install # what `ia-play --web` needs: onnxruntime-web, pinned, through npm
 	$(BIN)/python -m instant_avatar.animation.web_server

@@ -47,10 +47,11 @@ def _quiet_excepthook(
     elif issubclass(kind, BrokenPipeError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # discard buffered output
     elif isinstance(error, ModuleNotFoundError) and (error.name or "").split(".")[0] not in STAGES:
-        from capture.input_error import install_command
-
-        name, command = error.name, install_command()
-        print(f"{name} is missing. Install what this program needs: {command}", file=sys.stderr)  # noqa: T201
+        print(  # noqa: T201
+            f"{error.name} is not installed. Install this program again with what it depends on; "
+            f"this lists what is missing: {sys.executable} -m pip check",
+            file=sys.stderr,
+        )
     else:
         sys.__excepthook__(kind, error, traceback)
 

@@ -19,7 +19,7 @@ from instant_avatar.studio.shoot_config import ShootConfig
 class SampleArguments:
     """Film a synthetic actor into a capture folder with ground truth.
 
-    OUT then holds video.mp4 (lossless FFV1: VLC, mpv and ffmpeg play it), preview.webm (the same
+    OUT then holds video.mp4 (lossless FFV1: VLC, mpv and ffmpeg play it), preview.mp4 (the same
     video for browsers and phones), masks/, cameras.npz, poses.npz, dance.npz (a novel motion to
     drive the avatar with) and truth/: the exact poses, and twelve novel poses with images. Try it:
 
@@ -61,7 +61,7 @@ def _film(config: SampleArguments, console: Console) -> int:
     video, poses = (quote_command(config.out / name) for name in ("video.mp4", "poses.npz"))
     console.info(f"Filmed {config.shoot.frames} frames into {config.out}.")
     if not config.shoot.like_a_phone:
-        console.info(f"Preview for a browser: {config.out / 'preview.webm'}.")
+        console.info(f"Preview for a browser: {config.out / 'preview.mp4'}.")
     console.info("Next:")
     console.info(f"  ia-ingest {video} --poses {poses}")
     return DONE

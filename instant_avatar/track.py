@@ -18,7 +18,7 @@ from tyro.conf import Positional, arg
 from capture.atomic_files import OutputFileList, atomic_file, write_text_atomically
 from capture.input_error import InputError, quote_command
 from capture.live_sources import camera_address
-from capture.video_writer import VP9, write_video
+from capture.video_writer import H264, write_video
 from instant_avatar.cli.command_line import (
     DONE,
     INTERRUPTED,
@@ -64,7 +64,7 @@ class TrackArguments:
 
     `tracked` then holds poses.npz (SMPL's keys: global_orient, body_pose, transl; and K, the key
     points, and the body's proportions. The angles belong to the embedded body, model "body24", not
-    to SMPL's shape), masks/, skeleton.webm (look at it) and grade.json.
+    to SMPL's shape), masks/, skeleton.mp4 (look at it) and grade.json.
 
     It works best on one person, from head to feet in the picture, in a video of a camera that
     stands still. Hidden limbs are guessed, and fast ones are often wrong.
@@ -97,7 +97,7 @@ class TrackArguments:
     """Turn each frame clockwise by this many degrees, where the video lies on its side or upside
     down; masks and cameras that are given must be those of the turned frames."""
     film: Annotated[bool, arg(help_behavior_hint="")] = True
-    """Draw skeleton.webm."""
+    """Draw skeleton.mp4."""
     overwrite: Flag = False
     """Replace what ia-track wrote there before. Files that it did not write are kept."""
 
@@ -163,7 +163,7 @@ class TrackArguments:
 
     def film_path(self) -> Path:
         """Return the path of the film."""
-        return self.poses_path().with_name("skeleton.webm")
+        return self.poses_path().with_name("skeleton.mp4")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -245,7 +245,7 @@ def write_skeleton_film(path: Path, capture: Capture, doubts: Mapping[int, str])
     count, duration = source.frame_count or 1, source.duration_s
     fps = min(60.0, max(1.0, count / duration)) if duration else 10.0
     with atomic_file(path) as part:
-        return write_video(part, _draw_frames(capture, doubts), fps, VP9)
+        return write_video(part, _draw_frames(capture, doubts), fps, H264)
 
 
 def _draw_frames(capture: Capture, doubts: Mapping[int, str]) -> Iterator[Rgb]:

@@ -105,7 +105,7 @@ class PlayArguments:
     """Hold this pose of the motion (0 is the first): one image, or a turntable."""
     out: Annotated[Path | None, arg(metavar="FILE|DIR", help_behavior_hint="")] = None
     """Clip (.mp4, .webm), animation (.gif, .webp) or image (.png) to write, or a folder for RGBA
-    frames 0000.png … (default: a .webm next to the package, named after the poses). With --web: a
+    frames 0000.png … (default: an .mp4 next to the package, named after the poses). With --web: a
     folder for the page."""
     size: Annotated[str | None, arg(metavar="PX|WxH", help_behavior_hint="")] = None
     """Size in pixels: one number for a square or for the longer side of --camera's images, or width
@@ -220,8 +220,10 @@ class PlayArguments:
         if self.out is not None:
             return self.out
         stem = self.avatar.stem if self.poses is None else self.poses.stem
-        one = self.still is not None and self.turntable is None
-        return self.avatar.parent / (f"{stem}-{self.still}.png" if one else f"{stem}.webm")
+        if self.still is not None and self.turntable is None:
+            return self.avatar.parent / f"{stem}-{self.still}.png"
+        is_clear = self.background == "transparent"
+        return self.avatar.parent / f"{stem}.{'webm' if is_clear else 'mp4'}"
 
 
 ALL_ARGUMENTS = frozenset(field.name for field in fields(PlayArguments))

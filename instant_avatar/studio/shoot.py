@@ -18,7 +18,7 @@ from capture.image_folder import write_png
 from capture.input_error import InputError
 from capture.source import FrameSelection
 from capture.video import VideoFile
-from capture.video_writer import FFV1, VP9, open_video_writer, write_video
+from capture.video_writer import FFV1, H264, open_video_writer, write_video
 from instant_avatar.studio import painted_surfaces, staging
 from instant_avatar.studio.actor import Actor
 from instant_avatar.studio.furnished_room import FurnishedRoom
@@ -271,7 +271,7 @@ def film_capture(
     """Film the actor into the folder `out`, which appears whole or not at all.
 
     Args:
-        out: Folder that will hold video.mp4, preview.webm, masks/, cameras.npz (a walkaround's lie
+        out: Folder that will hold video.mp4, preview.mp4, masks/, cameras.npz (a walkaround's lie
             in truth/), poses.npz, dance.npz and truth/; see `_write_phone_capture` for a phone's.
         progress: Called after each image; may raise to stop the shoot.
         overwrite: Whether an older capture in `out` gives way, if all of it was written by `shoot`.
@@ -362,6 +362,6 @@ def _write_video(
 
 
 def _write_preview(folder: Path, fps: float) -> None:
-    """Write preview.webm: the film for browsers and phones, which play no lossless video."""
+    """Write preview.mp4: the film for browsers and phones, which play no lossless video."""
     video = VideoFile(folder / "video.mp4", FrameSelection())
-    write_video(folder / "preview.webm", (frame.rgb for frame in video.frames()), fps, VP9)
+    write_video(folder / "preview.mp4", (frame.rgb for frame in video.frames()), fps, H264)

@@ -21,7 +21,7 @@ OTHERS = (
     "checkpoint/state.pt", "checkpoint/step_100.ckpt", "video.mp4", "masks/0000.png",
     "images/0000.png", "cameras/01/intri.yml", "0000.png", "dance.npz", "truth/poses.npz",
     "mesh.glb", "clip.webm", "letter.txt", "runs/a.png", ".avatar.iavatar.swp", "grade.json",
-    "skeleton.webm", "sub/grade.json", "batch0/results.jsonl", "batch1/summary.html",
+    "skeleton.mp4", "sub/grade.json", "batch0/results.jsonl", "batch1/summary.html",
     "batch2/_failed/bad/a.txt", "batch3/_failed", "batch4/bad/b.txt", "_failed/capture/ingest.log",
 )  # fmt: skip
 """Names of our own, and of others, that other people's files have."""

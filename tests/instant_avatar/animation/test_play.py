@@ -96,7 +96,7 @@ def test_clips_show_what_the_player_draws(call_play, package, novel, tmp_path, s
 def test_a_clip_without_a_name_lies_beside_the_package(call_play, package, novel):
     outcome = call_play(package, "--poses", novel, "--size", SIZE)
     assert outcome.code == 0
-    expected = package.parent / "poses.webm"
+    expected = package.parent / "poses.mp4"
     assert outcome.out.strip() == str(expected)
     assert len(frames_of(expected)) == 12
     expected.unlink()

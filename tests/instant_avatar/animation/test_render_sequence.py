@@ -93,10 +93,10 @@ def test_without_a_name_a_still_lies_beside_the_package(call_play, package, nove
 def test_without_poses_it_moves_all_the_same(call_play, package):
     outcome = call_play(package, "--size", 32, "--tier", "lite")
     assert outcome.code == 0
-    assert outcome.out.strip() == str(package.parent / "avatar.webm")
+    assert outcome.out.strip() == str(package.parent / "avatar.mp4")
     assert "90 frames" in outcome.err
     assert "at 30 fps" in outcome.err
-    (package.parent / "avatar.webm").unlink()
+    (package.parent / "avatar.mp4").unlink()
 
 
 @pytest.mark.parametrize(

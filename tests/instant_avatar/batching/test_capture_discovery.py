@@ -22,7 +22,7 @@ def names(*places: object) -> list[str]:
 def test_folders_videos_and_images_are_captures(tmp_path):
     touch(
         tmp_path / "anna" / "video.mp4", tmp_path / "anna" / "poses.npz",
-        tmp_path / "anna" / "preview.webm", tmp_path / "anna" / "truth" / "video.mp4",
+        tmp_path / "anna" / "preview.mp4", tmp_path / "anna" / "truth" / "video.mp4",
         tmp_path / "bob" / "images" / "0.png",
         tmp_path / "carl" / "0.jpg", tmp_path / "carl" / "1.jpg",
         tmp_path / "takes" / "one.mp4", tmp_path / "takes" / "two.mov",

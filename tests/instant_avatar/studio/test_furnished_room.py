@@ -45,7 +45,7 @@ def test_the_phone_walks_an_arc_and_holds_the_person_in_the_picture(subject):
 
 def test_the_cameras_are_written_to_the_ground_truth_only(capture):
     assert {path.name for path in capture.iterdir()} == {
-        "video.mp4", "preview.webm", "masks", "poses.npz", "dance.npz", "truth", LIST
+        "video.mp4", "preview.mp4", "masks", "poses.npz", "dance.npz", "truth", LIST
     }  # fmt: skip
     with np.load(capture / "poses.npz") as poses:
         assert "camera" not in poses

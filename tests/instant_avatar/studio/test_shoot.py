@@ -111,7 +111,7 @@ def test_novel_poses_are_far_from_all_that_is_filmed(actor):
 def test_the_folder_is_a_native_capture(capture):
     top = {
         "video.mp4",
-        "preview.webm",
+        "preview.mp4",
         "masks",
         "cameras.npz",
         "poses.npz",
@@ -161,11 +161,11 @@ def test_the_video_is_exact_and_masks_fit_it(capture):
 
 
 def test_a_preview_shows_the_film_to_browsers(capture):
-    exact, shown = (list(frames_of(capture / n)) for n in ("video.mp4", "preview.webm"))
+    exact, shown = (list(frames_of(capture / n)) for n in ("video.mp4", "preview.mp4"))
     assert len(shown) == SMALL.frames
     off = np.abs(np.stack(shown).astype(float) - np.stack(exact))
     assert off.mean() < 12.0  # of 255: colors at half the resolution
-    assert (capture / "preview.webm").read_bytes()[:64].find(b"webm") > 0
+    assert (capture / "preview.mp4").read_bytes()[:64].find(b"ftyp") > 0
     assert open_source(capture).path == capture / "video.mp4"
 
 

@@ -61,7 +61,7 @@ def test_grades_and_film_are_written(tracked):
     assert grade["good_enough"]
     assert grade["found_share"] == 1.0
     assert grade["iou_mean"] > 0.75
-    film = cv2.VideoCapture(str(tracked / "out" / "skeleton.webm"))
+    film = cv2.VideoCapture(str(tracked / "out" / "skeleton.mp4"))
     assert film.read()[0]
     assert int(film.get(cv2.CAP_PROP_FRAME_COUNT)) in (0, 20)
 
