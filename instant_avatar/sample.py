@@ -11,7 +11,7 @@ import tyro
 from capture.input_error import quote_command
 from instant_avatar.cli.command_line import DONE, parse_arguments, run_command
 from instant_avatar.cli.console import Console
-from instant_avatar.cli.shared_options import check_output_folder
+from instant_avatar.cli.shared_options import Flag, check_output_folder
 from instant_avatar.studio.shoot_config import ShootConfig
 
 
@@ -25,7 +25,7 @@ class SampleArguments:
 
         ia-sample demo/capture
 
-        ia-ingest demo/capture/video.mp4 --poses demo/capture/poses.npz --out demo/run
+        ia-ingest demo/capture/video.mp4 --poses demo/capture/poses.npz
 
     With --motion walkaround a phone is carried around the actor in a furnished room. Like a phone
     video it comes without cameras: poses.npz is relative to the camera of each frame, with K; the
@@ -42,7 +42,7 @@ class SampleArguments:
     out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
     """Folder to write."""
     shoot: Annotated[ShootConfig, tyro.conf.arg(name="")] = field(default_factory=ShootConfig)
-    overwrite: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    overwrite: Flag = False
     """Replace an existing capture."""
 
 

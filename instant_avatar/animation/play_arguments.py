@@ -78,14 +78,13 @@ class PlayArguments:
 
     Try it:
 
-        ia-play run/avatar.iavatar                                       the built-in motion
+        ia-play run/avatar.iavatar                 the built-in motion
+        ia-play run/avatar.iavatar --web           in a browser
+        ia-play run/avatar.iavatar --verify        check rendering here
+        ia-play run/avatar.iavatar --still 12 --close-up head --out face.png
+        ia-play run/avatar.iavatar --turntable --background transparent
         ia-play run/avatar.iavatar --poses dance.npz --out dance.mp4
-        ia-play run/avatar.iavatar --turntable --out turn.webp --background transparent
-        ia-play run/avatar.iavatar --poses walk.npz --still 12 --close-up head --out face.png
-        ia-play run/avatar.iavatar --poses amass.npz --orbit 40 --size 1280x720 \\
-            --background beach.jpg --speed 0.5
-        ia-play run/avatar.iavatar --web                                 in a browser
-        ia-play run/avatar.iavatar --verify                              check rendering here
+        ia-play run/avatar.iavatar --poses amass.npz --orbit 40 --size 1280x720
 
     Needs no GPU and no torch. Without --camera the camera stands in front of the first pose,
     follows the pelvis and shows the standing person at 80 % of the image height.

@@ -12,12 +12,14 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from itertools import zip_longest
 from typing import Any, TypeVar
 
 import tyro
+from docstring_parser import parse_from_object
 from rich.console import Console as RichConsole
 from rich.markup import escape
 
@@ -215,10 +217,22 @@ def parse_arguments(
         print(f"{program} ({DISTRIBUTION}) {_installed_version()}")  # noqa: T201 - the answer
         raise SystemExit(0)
     if {"-h", "--help"} & set(argv):  # tyro would not wrap paragraphs
+        _join_help_lines(arguments_type)
         about = f"{inspect.getdoc(arguments_type)}\n\n--version prints the version and exits.\n"
         paragraphs = re.sub(r"(?<=\S)\n(?=\S)", " ", about)
         RichConsole(highlight=False, markup=False).print(paragraphs)
     return tyro.cli(arguments_type, prog=program, args=argv, description="")
+
+
+def _join_help_lines(arguments_type: Any) -> None:
+    """Set the help of each field to its docstring as one paragraph; tyro would keep line breaks."""
+    for record in (arguments_type, *(field.default_factory for field in fields(arguments_type))):
+        if is_dataclass(record):
+            named = {field.name: field for field in fields(record)}
+            for base in reversed(record.__mro__[:-1]):
+                for parameter in parse_from_object(base).params:
+                    text = " ".join((parameter.description or "").split())
+                    named[parameter.arg_name].metadata = {"help": text}
 
 
 def _installed_version() -> str:

@@ -17,13 +17,13 @@ class EvaluateArguments:
 
     Try it:
 
-        ia-evaluate run                              a run's own held-out frames
-        ia-evaluate run other/run --json table.json  several, with their mean
-        ia-evaluate run --on another/capture         the same person in another video
-        ia-evaluate run/avatar.iavatar --on capture --frames 100:200:5      the player alone
-        ia-evaluate run --card run.html              a page with conditions, scores and pictures
-        ia-evaluate PeopleSnapshot --out evaluation --body SMPL_MALE.pkl    the paper's protocol
-        ia-evaluate neuman/dataset --out evaluation --body SMPL_NEUTRAL.pkl    NeuMan's
+        ia-evaluate run                            its own held-out frames
+        ia-evaluate run other/run                  which one is better
+        ia-evaluate run --on another/capture       the same person elsewhere
+        ia-evaluate run/avatar.iavatar --on capture --frames 100:200:5
+        ia-evaluate run --card run.html            a page with images
+        ia-evaluate PeopleSnapshot --body SMPL_MALE.pkl
+        ia-evaluate neuman/dataset --body SMPL_NEUTRAL.pkl
 
     A dataset is a folder with subjects of PeopleSnapshot (as distributed, or in InstantAvatar's
     layout: male-3-casual, …) or of NeuMan (seattle, …). Each subject is trained on the protocol's

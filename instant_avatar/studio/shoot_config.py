@@ -2,7 +2,9 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+from tyro.conf import FlagCreatePairsOff, arg
 
 from capture.input_error import InputError
 
@@ -17,7 +19,7 @@ class ShootConfig:
     """Frames per second of the video."""
     size: int = 270
     """Width and height of the pictures in pixels; a walkaround's are so wide, and 16:9."""
-    turns: float | None = None
+    turns: Annotated[float | None, arg(metavar="N", help_behavior_hint="")] = None
     """How often the actor turns round; if not given 2, in a walkaround -0.75 (against the walk)."""
     seed: int = 0
     """Of the swaying, the clutter and the noise; from 1 on it varies the actor's looks, too."""
@@ -27,10 +29,13 @@ class ShootConfig:
     """What happens: the actor turns with arms held off the body, or dances; or gestures while a
     phone is carried around (poses.npz is then in the camera of each frame, with K; the cameras
     lie in truth/cameras.npz)."""
-    track: Path | None = None
+    track: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Pose file whose motion is filmed instead of a turn of the studio's own, such as a track of
     PeopleSnapshot; `frames` of its poses, evenly spread, on the spot."""
-    background: Literal["plain", "clutter", "room", "tiles"] | None = None
+    background: Annotated[
+        Literal["plain", "clutter", "room", "tiles"] | None,
+        arg(metavar="{plain,clutter,room,tiles}", help_behavior_hint=""),
+    ] = None
     """What stands behind the actor: a bare wall, a painted room full of things (if not given), a
     real room with furniture (a walkaround's, if not given), or one where every pattern repeats."""
     pose_noise_deg: float = 0.0
@@ -39,7 +44,7 @@ class ShootConfig:
     """Noise of the poses: standard deviation of each component of the place, in centimetres."""
     mask_noise_px: float = 0.0
     """Noise of the masks: standard deviation of their border, in pixels."""
-    like_a_phone: bool = False
+    like_a_phone: Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")] = False
     """Film as a user does: a portrait by a phone (`size` wide, 9:16) whose exposure drifts, in a
     room with a window; the person's proportions are not the body model's; poses err as a
     tracker's do, masks as a segmenter's, the focal length is off by about 10 %. What is exact

@@ -3,6 +3,7 @@
 import importlib
 import tomllib
 from importlib.metadata import version
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -35,15 +36,25 @@ def test_every_command_knows_its_version(program, capsys):
     assert answered(program, ["--version"], capsys) == told
 
 
+@pytest.mark.parametrize("width", [80, 100])
 @pytest.mark.parametrize("program", COMMANDS)
-def test_every_command_explains_itself_within_the_terminal(program, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "72")
+def test_help_is_paragraphs_that_fill_the_terminal(program, width, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", str(width))
     text = answered(program, ["--help"], capsys)
     assert f"usage: {program} [-h]" in text
     assert "Exit codes: 0 " in text
-    assert "--version" in text
-    prose = [line for line in text.splitlines() if line[:1].isalnum()]
-    assert max(map(len, prose)) <= 72
+    assert "None" not in text
+    assert max(map(len, text.splitlines())) <= width
+    about, options = text.split("\nusage: ")
+    for above, below in pairwise(about.splitlines()):
+        assert above[:4] != "    " or not below or below.startswith("    ia-"), "a wrapped example"
+        if above[:1].strip() and below:
+            assert len(above.rstrip()) + 1 + len(below.split()[0]) > width, above
+    boxed = [line[2:-2] for line in options.splitlines() if line[:2] in ("│ ", "  ")]
+    column = next(line.index("show this") for line in boxed if "show this" in line)
+    for above, below in pairwise(boxed):
+        if below.strip() and not below[:column].strip() and above[column - 2 : column] == "  ":
+            assert len(above.rstrip()) + 1 + len(below.split()[0]) > width - 4, above
 
 
 def test_a_checkout_has_a_version_without_installation(capsys, monkeypatch):
