@@ -13,6 +13,14 @@ class FrameArrived:
 
 
 @dataclass(frozen=True, kw_only=True)
+class FrameLeftOut:
+    """A frame that cannot be used; `reason` says why, in a few words."""
+
+    index: int
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
 class WaitingForFrame:
     """No frame has arrived yet; the trainer has waited for a moment."""
 
@@ -76,4 +84,4 @@ class Finished:
     samples: int
 
 
-TrainEvent = FrameArrived | WaitingForFrame | Stepped | Evaluated | Warned | Finished
+TrainEvent = FrameArrived | FrameLeftOut | WaitingForFrame | Stepped | Evaluated | Warned | Finished

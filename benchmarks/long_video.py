@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,6 @@ from benchmarks.hardware import ROOT
 from benchmarks.measurements import Measurement
 from benchmarks.sample_training import open_sample
 from capture.source_opening import open_source
-from instant_avatar.cli.console import Console
 from instant_avatar.run.run_folder import RunFolder
 from preprocess.body.body_pose import Motion
 from preprocess.poses.pose_file import read_motion, write_motion
@@ -86,6 +86,7 @@ def resident_bytes() -> int:
 def main() -> None:
     """Learns, and prints what was resident at two frames, and how many were read."""
 
+    from instant_avatar.run.session_events import PackageWritten
     from instant_avatar.run.session_start import new_trainer
     from instant_avatar.run.training_session import TrainingSession
 
@@ -101,8 +102,9 @@ def main() -> None:
         at[lesson.meter.frames_read] = resident_bytes()
 
     trainer.add_frame = counted
-    lesson = TrainingSession(trainer, recording, run, Console(), threading.Event(), {})
-    lesson.train()
+    lesson = TrainingSession(trainer, recording, run, threading.Event(), {})
+    with closing(lesson.run()) as events:
+        next(event for event in events if isinstance(event, PackageWritten))
     shutil.rmtree(run.path, ignore_errors=True)
     early = min((count for count in at if count >= FIRST), default=max(at))
     print(at[early], at[max(at)], lesson.meter.frames_read)

@@ -21,7 +21,7 @@ from export.bake.bake_tables import ExportRefused
 from export.package.player_tables import QUALITY_TIERS
 from export.player import Player
 from instant_avatar.animation.player_checks import PlayerTiming, benchmark_player
-from instant_avatar.run.snapshot_writer import write_package_snapshot
+from instant_avatar.run.snapshot_writer import write_packages
 
 MB = 1e6
 
@@ -45,7 +45,7 @@ def time_bake(trainer: Trainer, package: Path, shots: Sequence[ComparedView]) ->
     views = [(shot.pose, shot.camera) for shot in shots]
     for _ in range(2):
         cpu, wall = time.process_time(), time.perf_counter()
-        taken = write_package_snapshot(trainer, package, views, curve_point=None)
+        (taken,) = write_packages(trainer, package, views, curve_point=None)
         cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
         if taken.export_report is None:
             raise ExportRefused(str(taken.refusal))

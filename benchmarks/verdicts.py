@@ -32,7 +32,6 @@ from benchmarks.sample_training import film_sample
 from benchmarks.stopwatch import limit_threads
 from export.bake.bake_tables import ExportRefused
 from export.build import export_avatar
-from instant_avatar.cli.console import Console
 from instant_avatar.run.final_scoring import score_finally
 from instant_avatar.run.session_start import new_trainer
 from preprocess.observation import Observation
@@ -157,7 +156,7 @@ def judge(job: VerdictJob, case: JudgedAvatar) -> tuple[str | None, list[str]]:
         if isinstance(item, Observation):
             coverage.add(item)
     train_for_steps(trainer, steps)
-    scores = score_finally(trainer, compared.held_out, Console(), fit_poses=True)
+    scores = score_finally(trainer, compared.held_out, fit_poses=True)
     held_out = better_verdict(overall_verdict(scores.given), overall_verdict(scores.fitted))
     known = {"seen": coverage.seen_share, "half_transparent": scores.half_transparent}
     found, player = AllRoundVerdict.of(held_out, **known, player_psnr=None, film_advice=""), None

@@ -7,7 +7,7 @@ The checks compare a package's player with its reference and with the volume ren
 
 import io
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -22,7 +22,6 @@ from avatar.avatar_model import Avatar
 from avatar.evaluation.image_metrics import psnr
 from avatar.render import render
 from avatar.rig import Rig
-from capture.camera import Camera
 from capture.input_error import InputError
 from export.bake.bake_tables import BakeConfig, ExportRefused, bake_tables, sample_field
 from export.bake.fine_tuning import (
@@ -32,7 +31,6 @@ from export.bake.fine_tuning import (
     FineTuningResult,
     PosedView,
     RenderFunction,
-    RgbaPicture,
     fine_tune,
     is_below_target,
 )
@@ -56,7 +54,6 @@ from export.player import (
     premultiply,
 )
 from export.player_inputs import fit_camera
-from preprocess.body.body_pose import BodyPose
 
 GRAPH_CHECK_PICTURES = {"hq": 2, "lite": 1}
 """Golden frames on which each tier's graph is compared with its reference, 0.2 s each. They test
@@ -96,45 +93,52 @@ class ExportReport:
 
 
 def export_avatar(
+    avatar: Avatar, path: Path, *, views: Sequence[PosedView], metrics: Mapping[str, Any]
+) -> ExportReport:
+    """Write an avatar's fine-tuned package, or nothing; arguments as of `export_in_stages`."""
+    (report,) = export_in_stages(avatar, path, views=views, metrics=metrics, baked_first=False)
+    return report
+
+
+def export_in_stages(
     avatar: Avatar,
     path: Path,
     *,
     views: Sequence[PosedView],
     metrics: Mapping[str, Any],
-    renderer: Callable[[Avatar, BodyPose, Camera], RgbaPicture] = render,
-    config: BakeConfig | None = None,
-    quick: bool = False,
+    baked_first: bool = True,
     fine_tune_bricks: bool = True,
     progress: ExportProgress = lambda _: None,
-) -> ExportReport:
-    """Write an avatar's package, or nothing.
+) -> Iterator[ExportReport]:
+    """Write an avatar's package as it was baked, then the fine-tuned one in its place.
 
     Args:
         path: The `.iavatar` file; replaced atomically if it exists.
         views: Poses and cameras to check it with, at least one; the first is the preview, and the
             first few become golden frames. Lens distortion is ignored.
         metrics: Training metrics, kept in the manifest (JSON).
-        config: Resolution; follows the field's finest cells if None.
-        quick: Bake a coarser package of one tier, not fine-tuned, for a preview during training.
-        fine_tune_bricks: Takes some ten seconds; has no effect on a quick package.
+        baked_first: Whether the package is written before its bricks are fine-tuned, too.
+        fine_tune_bricks: Takes some ten seconds.
         progress: Receives the fraction of the export that is done, from 0 to 1, while bricks are
-            fine-tuned. Ctrl-C meanwhile ends only the fine-tuning.
+            fine-tuned. A KeyboardInterrupt meanwhile, or from it, ends only the fine-tuning.
+
+    Yields:
+        The report of each package, once the file is complete.
 
     Raises:
         ExportRefused: If there is nothing to draw, or this onnxruntime computes something else.
     """
-    occupied = avatar.rendering_grid().occupied.numpy()
-    config = config or BakeConfig.for_sample_step(avatar.sample_step_m)
-    config = config if fine_tune_bricks else replace(config, fine_tuning_pictures=0)
+    config = BakeConfig.for_sample_step(avatar.sample_step_m)
     return export_field(
         avatar.color_and_density_at,
         avatar.rig,
-        occupied,
+        avatar.rendering_grid().occupied.numpy(),
         path,
         views=views,
         metrics=metrics,
-        renderer=lambda pose, camera: renderer(avatar, pose, camera),
-        config=config.quick() if quick else config,
+        renderer=lambda pose, camera: render(avatar, pose, camera),
+        config=config if fine_tune_bricks else replace(config, fine_tuning_pictures=0),
+        baked_first=baked_first,
         progress=progress,
     )
 
@@ -149,19 +153,30 @@ def export_field(
     metrics: Mapping[str, Any],
     renderer: RenderFunction,
     config: BakeConfig | None = None,
+    baked_first: bool = False,
     progress: ExportProgress = lambda _: None,
-) -> ExportReport:
-    """Write the package of any canonical field; arguments and errors as of `export_avatar`."""
+) -> Iterator[ExportReport]:
+    """Write packages of any canonical field; arguments and errors as of `export_in_stages`."""
     if not views:
         raise InputError("An avatar cannot be checked without a pose and a camera; give one view.")
     started, config = time.perf_counter(), config or BakeConfig()
     views = [(pose, replace(camera, distortion=())) for pose, camera in views]
     # the field, and the renderer with it, is evaluated on this thread alone
-    with PackageWriter(path) as writer, ThreadPoolExecutor(2) as executor:
-        baked = executor.submit(
+    with ThreadPoolExecutor(2) as executor:
+        baking = executor.submit(
             bake_tables, sample_field(field_at, rig, occupied=occupied, config=config), rig, config
         )
         exact = [picture_on_white(renderer(pose, fit_camera(c, CHECK_PX))) for pose, c in views]
+        draft = _PackageDraft(
+            path=path, rig=rig, views=views, exact=exact, metrics=metrics, executor=executor
+        )
+        settings = {tier: QUALITY_TIERS[tier] for tier in config.tiers}
+        baked = FineTuningResult(tables=baking.result(), settings=settings, psnr=None)
+        if baked_first or not config.fine_tuning_pictures:
+            yield draft.write(baked, seconds=time.perf_counter() - started)
+            started = time.perf_counter()
+        if not config.fine_tuning_pictures:
+            return
 
         def bake_again(tables: PlayerTables) -> PlayerTables:
             thick = config.for_thick_field(estimate_brick_bytes(tables.bricks))
@@ -171,32 +186,55 @@ def export_field(
 
         tuned = _fine_tune(
             FineTuningInputs(
-                tables=baked.result(), rig=rig,
-                settings={tier: QUALITY_TIERS[tier] for tier in config.tiers},
-                renderer=renderer, views=views, executor=executor,
+                tables=baked.tables, rig=rig, settings=settings, renderer=renderer, views=views,
+                executor=executor,
             ),
             bake_again, config.fine_tuning_pictures,
             lambda done: progress(BAKING_PROGRESS + FINE_TUNING_PROGRESS * done),
         )  # fmt: skip
-        compressed = executor.submit(writer.add_tables, tuned.tables)
-        interrupted = config.fine_tuning_pictures > 0 and tuned.psnr is None
-        package = _checked_package(
-            _unchecked_package(tuned.tables, tuned.settings, rig, views, metrics), views, exact,
-            executor,
-            warnings=[INTERRUPTED_WARNING] if interrupted else [],
-        )  # fmt: skip
-        compressed.result()
-        size = writer.finish(package)
-    tiers = package.manifest.tiers
-    return ExportReport(
-        path=path,
-        bytes=size,
-        seconds=time.perf_counter() - started,
-        psnr_to_renderer={name: tier.psnr_to_renderer for name, tier in tiers.items()},
-        largest_difference=max(tier.largest_difference for tier in tiers.values()),
-        fine_tuning_psnr=tuned.psnr,
-        warnings=tuple(package.manifest.metrics["warnings"]),
-    )
+        warnings = [] if tuned.psnr else [INTERRUPTED_WARNING]
+        if tuned.psnr or not baked_first:
+            yield draft.write(tuned, warnings, seconds=time.perf_counter() - started)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _PackageDraft:
+    """What the packages of an export have in common; `exact` are the views by the renderer."""
+
+    path: Path
+    rig: Rig
+    views: Sequence[PosedView]
+    exact: Sequence[Float32[np.ndarray, "_ _ 3"]]
+    metrics: Mapping[str, Any]
+    executor: Executor
+
+    def write(
+        self, tuned: FineTuningResult, warnings: Sequence[str] = (), *, seconds: float
+    ) -> ExportReport:
+        """Check and write a package, which took `seconds` so far."""
+        started = time.perf_counter()
+        with PackageWriter(self.path) as writer:
+            compressed = self.executor.submit(writer.add_tables, tuned.tables)
+            try:
+                package = _checked_package(
+                    _unchecked_package(
+                        tuned.tables, tuned.settings, self.rig, self.views, self.metrics
+                    ),
+                    self.views, self.exact, self.executor, warnings=list(warnings),
+                )  # fmt: skip
+            finally:
+                compressed.result()
+            size = writer.finish(package)
+        tiers = package.manifest.tiers
+        return ExportReport(
+            path=self.path,
+            bytes=size,
+            seconds=seconds + time.perf_counter() - started,
+            psnr_to_renderer={name: tier.psnr_to_renderer for name, tier in tiers.items()},
+            largest_difference=max(tier.largest_difference for tier in tiers.values()),
+            fine_tuning_psnr=tuned.psnr,
+            warnings=tuple(package.manifest.metrics["warnings"]),
+        )
 
 
 def _fine_tune(
@@ -206,13 +244,12 @@ def _fine_tune(
     progress: ExportProgress,
 ) -> FineTuningResult:
     """Fine-tune bricks until Ctrl-C; bake again where the player is far from the renderer."""
-    if max_pictures:
-        with suppress(KeyboardInterrupt):
-            if is_below_target(inputs):
-                settings = {tier: THICK_FIELD_TIERS[tier] for tier in inputs.settings}
-                inputs = replace(inputs, tables=bake_again(inputs.tables), settings=settings)
-                max_pictures = min(max_pictures, THICK_FIELD_PICTURES)
-            return fine_tune(inputs, max_pictures=max_pictures, progress=progress)
+    with suppress(KeyboardInterrupt):
+        if is_below_target(inputs):
+            settings = {tier: THICK_FIELD_TIERS[tier] for tier in inputs.settings}
+            inputs = replace(inputs, tables=bake_again(inputs.tables), settings=settings)
+            max_pictures = min(max_pictures, THICK_FIELD_PICTURES)
+        return fine_tune(inputs, max_pictures=max_pictures, progress=progress)
     return FineTuningResult(tables=inputs.tables, settings=inputs.settings, psnr=None)
 
 

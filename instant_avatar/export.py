@@ -191,12 +191,12 @@ def _export_package(folder: Path, out: Path, console: Console, *, fine_tune: boo
         )
     with console.status("loading the checkpoint"):
         from avatar.training import checkpoint
-        from instant_avatar.run.snapshot_writer import write_package_snapshot
+        from instant_avatar.run.snapshot_writer import write_packages
 
         trainer, _ = checkpoint.load(run.checkpoint)
     with console.progress("writing the package", 1.0) as bar:
         shots = synthetic_views(trainer.avatar.rig)
-        taken = write_package_snapshot(
+        (taken,) = write_packages(
             trainer, out, shots, curve_point=None, fine_tune=fine_tune, progress=bar.set_share
         )
     if taken.export_report is None:

@@ -4,8 +4,8 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
-from capture.atomic_files import write_text_atomically
 from capture.input_error import InputError
 from instant_avatar.capture_validation import correction_hint, preflight_check
 from instant_avatar.cli.command_line import (
@@ -28,6 +28,9 @@ from preprocess.capture_session import Capture
 from preprocess.fitting.capture_fit import load_capture_fit
 from preprocess.fitting.capture_fitting import apply_fit, fit_capture
 
+if TYPE_CHECKING:  # it imports torch
+    from instant_avatar.run.session_events import EventReader
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
@@ -36,8 +39,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     return run_command(PROGRAM, lambda: ingest(arguments, Console()))
 
 
-def ingest(arguments: IngestArguments, console: Console) -> int:
-    """Open, track, solve cameras, align, stream, train, bake, report.
+def ingest(
+    arguments: IngestArguments, console: Console, readers: Sequence["EventReader"] = ()
+) -> int:
+    """Open, track, solve cameras, align; then train, bake and report, which `readers` read of.
 
     After an `InputError` nothing was written; on a full disk the newest checkpoint is kept.
     """
@@ -56,21 +61,18 @@ def ingest(arguments: IngestArguments, console: Console) -> int:
         placed = solve_missing_cameras(arguments, capture, console)
         capture = _fit_to_masks(arguments, placed, run, console)
         threads = threads or _load_trainer_code(arguments, run, console)
-        from instant_avatar.report.report_writer import print_results, write_report
-        from instant_avatar.run.session_start import start_session
+        from instant_avatar.report.report_writer import ReportWriter
+        from instant_avatar.run.session_start import run_session
 
-        with start_session(arguments, capture, run, console) as session:
-            write_solved_cameras(placed, run, console)
-            result = session.bake(session.train())
-            report = write_report(
-                result, capture, run, console, command=command, threads=threads,
-                startup_seconds=(result.meter.first_frame_at or started_at) - started_at,
-            )  # fmt: skip
-            if arguments.json is not None:
-                write_text_atomically(
-                    arguments.json, report.to_json(), replace=arguments.may_replace_json
-                )
-            return print_results(report, result, run, console, interrupted=session.stop_requested)
+        report = ReportWriter(
+            capture, run, console, command=command, started_at=started_at, threads=threads,
+            copy=None if arguments.json is None else (arguments.json, arguments.may_replace_json),
+        )  # fmt: skip
+        run_session(
+            arguments, capture, run, console, [report, *readers],
+            on_start=lambda: write_solved_cameras(placed, run, console),
+        )  # fmt: skip
+        return report.exit_code()
 
 
 def _load_trainer_code(arguments: IngestArguments, run: RunFolder, console: Console) -> int:
@@ -96,7 +98,7 @@ def _open_checked(arguments: IngestArguments, run: RunFolder, console: Console) 
     capture = replace(capture, tracking_report=read_tracking_report(arguments, run))
     console.info(_describe_capture(capture))
     for note in capture.notes:
-        console.warning(note)
+        console.note(note)
     if not (arguments.resume and run.has_checkpoint()):
         preflight_check(capture, arguments.capture_inputs(), console, force=arguments.force)
     return capture
@@ -118,7 +120,7 @@ def _fit_to_masks(
         return capture
     fitted = apply_fit(capture, fit, height_m=arguments.capture_inputs().height_m)
     for note in fitted.notes[len(capture.notes) :]:
-        console.info(note)
+        console.note(note)
     if (advice := fit.advice()) is not None:
         console.warning(advice)
     return fitted

@@ -1,9 +1,10 @@
 """Training from Python: a video in, a package and its report out."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console as RichConsole
 
@@ -12,6 +13,9 @@ from instant_avatar.cli.command_line import INTERRUPTED, NO_AVATAR, CommandExit
 from instant_avatar.cli.console import Console
 from instant_avatar.ingest import ingest
 from instant_avatar.run.ingest_arguments import IngestArguments
+
+if TYPE_CHECKING:  # it imports torch
+    from instant_avatar.run.session_events import EventReader
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +48,7 @@ def train(
     seconds: float | None = None,
     steps: int | None = None,
     quiet: bool = False,
+    readers: Sequence["EventReader"] = (),
     **options: Any,
 ) -> TrainedAvatar:
     """Train an avatar from a video of one person, as `ia-ingest` does.
@@ -57,6 +62,7 @@ def train(
         seconds: Training time (default: 60).
         steps: Number of training steps instead of `seconds`.
         quiet: Print no progress on stderr.
+        readers: Functions that receive every event of the run (`session_events`).
         **options: Further options of `ia-ingest`, with underscores: `height_cm`, `size`, `seed`, …
 
     Returns:
@@ -74,7 +80,7 @@ def train(
     )  # fmt: skip
     console = Console(RichConsole(stderr=True, quiet=True) if quiet else None)
     try:
-        code = ingest(arguments, console)
+        code = ingest(arguments, console, readers)
     except CommandExit as ended:
         code = ended.code
         if code not in (NO_AVATAR, INTERRUPTED):

@@ -21,6 +21,7 @@ from avatar.events import (
     Evaluated,
     Finished,
     FrameArrived,
+    FrameLeftOut,
     HeldOutScore,
     Stepped,
     TrainEvent,
@@ -180,7 +181,7 @@ class _FrameIntake:
     def ended(self) -> bool:
         return self._ended_at is not None
 
-    def receive(self, now: float) -> Iterator[FrameArrived | Warned]:
+    def receive(self, now: float) -> Iterator[FrameArrived | FrameLeftOut]:
         """Adds the frames that have arrived to the trainer; the clock starts with the first."""
         if self.ended or (
             self._one_frame_per_step and self._last_frame_step == self._trainer.steps
@@ -198,9 +199,9 @@ class _FrameIntake:
         if self._inbox.finished or too_late:
             self._ended_at = self.clock.read()
 
-    def _accept(self, item: StreamItem) -> Iterator[FrameArrived | Warned]:
+    def _accept(self, item: StreamItem) -> Iterator[FrameArrived | FrameLeftOut]:
         if isinstance(item, DroppedFrame):
-            yield Warned(message=f"Frame {item.index} is left out: {item.reason}.")
+            yield FrameLeftOut(index=item.index, reason=item.reason)
             return
         if isinstance(item, RedundantFrame):
             return

@@ -107,8 +107,6 @@ BYTES_EXPONENT = 2.5
 VOXEL_FACTORS = (0.62, 1.6)
 """Bounds of the factor on voxels of a thick field. Finer ones gain 1 to 1.5 dB on the light avatar
 of few photographs; in fog 0.3 dB for three times the bytes."""
-QUICK_VOXEL_FACTOR = 1.5
-"""Factor on voxel size and surfel spacing of a quick package."""
 POSITION_CODE_STEP = 32
 """Multiple to which position codes are rounded, about a millimetre, so that they deflate well."""
 NORMAL_CODE_STEP = 7
@@ -156,16 +154,6 @@ class BakeConfig:
             voxel_m=factor * self.voxel_m,
             surface_density=THICK_SURFACE_DENSITY,
             faint_fraction=THICK_FAINT_FRACTION,
-        )
-
-    def quick(self) -> "BakeConfig":
-        """Return the configuration of a coarser package of one tier, without fine-tuning."""
-        return replace(
-            self,
-            voxel_m=min(QUICK_VOXEL_FACTOR * self.voxel_m, MAX_VOXEL_M),
-            surfel_spacing_m=QUICK_VOXEL_FACTOR * self.surfel_spacing_m,
-            tiers=("hq",),
-            fine_tuning_pictures=0,
         )
 
 

@@ -13,9 +13,9 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Column
 
 MAX_PRINTED_WARNINGS = 5
-"""Warnings that are printed; the rest are counted, and the report lists all of them."""
+"""Warnings, and notes, that are printed; the report lists all of them."""
 MAX_KEPT_WARNINGS = 500
-"""Warnings that are kept, so that memory stays bounded for any length of video."""
+"""Warnings, and notes, that are kept, so that memory stays bounded for any length of video."""
 LOG_INTERVAL_S = 10.0
 """Seconds between two progress lines in a log."""
 MIN_BAR_WIDTH = 8
@@ -48,12 +48,17 @@ class StderrConsole(RichConsole):
 
 @final
 class Console:
-    """Messages on stderr, and the first `MAX_KEPT_WARNINGS` warnings; stdout is for results."""
+    """Messages on stderr; stdout is for results.
+
+    Attributes:
+        warnings: What asks the user for something; the first `MAX_KEPT_WARNINGS`.
+        notes: What asks for nothing, as many.
+    """
 
     def __init__(self, console: RichConsole | None = None) -> None:
         """Write to stderr, unless another console is given."""
         self._rich = console or StderrConsole()
-        self.warnings: list[str] = []
+        self.warnings, self.notes = list[str](), list[str]()
 
     @property
     def is_terminal(self) -> bool:
@@ -76,11 +81,20 @@ class Console:
 
     def warning(self, message: str) -> None:
         """Print and keep a warning, once."""
-        if message in self.warnings or len(self.warnings) == MAX_KEPT_WARNINGS:
-            return
-        self.warnings.append(message)
-        if len(self.warnings) <= MAX_PRINTED_WARNINGS:
+        if self._keep(message, self.warnings):
             self._rich.print(f"[yellow]warning:[/] {escape(message)}", highlight=False)
+
+    def note(self, message: str) -> None:
+        """Print and keep a note, once."""
+        if self._keep(message, self.notes):
+            self.info(message)
+
+    def _keep(self, message: str, messages: list[str]) -> bool:
+        """Keep a message unless it is among `messages`; return whether to print it."""
+        if message in messages or len(messages) == MAX_KEPT_WARNINGS:
+            return False
+        messages.append(message)
+        return len(messages) <= MAX_PRINTED_WARNINGS
 
     def summarize_warnings(self) -> None:
         """Print how many warnings were not printed."""
@@ -120,7 +134,7 @@ class ProgressBar:
         self._started_at = self._logged_at = time.perf_counter()
         self._drawn_at = 0.0
 
-    def __enter__(self) -> "ProgressBar":
+    def start(self) -> None:
         """Show the bar."""
         if self._console.is_terminal:
             self._progress = Progress(
@@ -136,6 +150,15 @@ class ProgressBar:
             self._task = self._progress.add_task(self._label, total=self._total, note="")
         else:
             self._console.print(escape(self._label), highlight=False)
+
+    def stop(self) -> None:
+        """Remove the bar."""
+        if self._progress is not None:
+            self._progress.stop()
+
+    def __enter__(self) -> "ProgressBar":
+        """Show the bar."""
+        self.start()
         return self
 
     def __exit__(
@@ -145,8 +168,7 @@ class ProgressBar:
         traceback: TracebackType | None,
     ) -> None:
         """Remove the bar."""
-        if self._progress is not None:
-            self._progress.stop()
+        self.stop()
 
     def set_count(self, done: int) -> None:
         """Set the number done of the total, and show the remaining time."""

@@ -29,35 +29,41 @@ def report_page(
     report: Report,
     *,
     name: str,
+    verdict: str,
     body_map: Markup | str = "",
     pairs: Sequence[ComparisonPair] = (),
     animation: str | None = None,
     warnings: Sequence[str] = (),
-    failure: str | None = None,
+    notes: Sequence[str] = (),
     present_files: Collection[str] = (),
-    play_command: str | None = None,
+    next_steps: Mapping[str, str] | None = None,
 ) -> str:
     """Return the page as HTML.
 
     Args:
+        verdict: The verdict on the avatar, and what would make it better.
         body_map: SVG of the body coverage (`CoverageMap.svg`).
         animation: Animation of novel poses as a data URI.
+        warnings: What asks the user for something; `notes` ask for nothing.
         present_files: Names of the files next to the page; the page refers to no others.
+        next_steps: Commands by what they do.
     """
     content = asdict(report)
     return render_template(
         "report.html",
         title=f"{name}: avatar",
         name=name,
+        verdict=verdict,
         report=report,
+        frames=report.frames.sentence(tracked=report.tracking is not None),
         curve=curve_svg(report.curve),
         body_map=body_map,
         pairs=pairs,
         animation=animation,
-        warnings=[warning for warning in warnings if not warning.startswith("Frame ")],
-        failure=failure,
+        warnings=warnings,
+        notes=notes,
         present_files=present_files,
-        play_command=play_command,
+        next_steps=next_steps or {},
         values=list(_flatten({key: content[key] for key in SHOWN_VALUES})),
         recipe=list(_flatten(content["recipe"])),
         command=list(_flatten(content["command"])),

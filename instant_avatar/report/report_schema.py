@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +21,14 @@ from preprocess.observation import DroppedFrame
 
 REPORT_FORMAT = 1
 """Version of the format of report.json."""
+DROP_REASONS = {
+    "no pose": "without a pose",
+    "pose invalid": "without a pose",
+    "no camera": "without a camera",
+    "mask empty": "with an empty mask",
+    "picture damaged": "damaged",
+}
+"""Reasons for which frames are left out, as an attribute of the frames."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,6 +58,22 @@ class FrameStats:
     dropped: tuple[DroppedFrame, ...]
     near_duplicates: int
     not_replayed: int
+
+    def sentence(self, *, tracked: bool) -> str:
+        """Tell what became of all frames; `tracked` poses are missing where no person was found."""
+        parts = [f"{self.used} learnt from"]
+        if self.held_out:
+            parts.append(f"{self.held_out} held out for scores")
+        if self.near_duplicates:
+            parts.append(f"{self.near_duplicates} almost like the one before")
+        left_out = self.read - self.used - self.held_out - self.near_duplicates
+        if left_out:
+            words = [DROP_REASONS.get(drop.reason, f"with {drop.reason}") for drop in self.dropped]
+            if tracked:
+                words = [word.replace("without a pose", "without the person") for word in words]
+            reasons = ", ".join(f"{count} {word}" for word, count in Counter(words).most_common())
+            parts.append(f"{left_out} left out ({reasons})")
+        return f"{self.read} frames read: {', '.join(parts)}."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -260,6 +285,13 @@ class ForgettingStats:
     psnr_before: float | None
     psnr_after: float | None
     largest_drop: float | None
+
+    def sentence(self) -> str:
+        """Tell what was forgotten, for the console."""
+        return (
+            f"Held-out frames of the earlier video: {format_psnr(self.psnr_before, None)} before, "
+            f"{format_psnr(self.psnr_after, None)} now."
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 from avatar.evaluation.image_metrics import (
     MAX_MEASURABLE_BLUR,
@@ -35,6 +35,7 @@ from instant_avatar.report.report_schema import (
 )
 from instant_avatar.run.final_scoring import TrainingResult
 from instant_avatar.run.run_folder import RunFolder
+from instant_avatar.run.session_events import Ended, PackageWritten, SessionEvent
 from preprocess.body.body_pose import Motion
 from preprocess.capture_session import Capture
 
@@ -51,15 +52,27 @@ def diagnose_failure(report: Report) -> str | None:
     held = report.held_out_refined or report.held_out
     what = f"The result is no usable avatar: {_describe_scores(held)}."
     if report.training.steps < MIN_STEPS_TO_JUDGE:
+        option = "--steps" if report.recipe.get("steps") else "--seconds"
         return (
             f"{what} Only {report.training.steps} steps were made: train longer (the same command "
-            "with --resume and more --seconds)."
+            f"with --resume and more {option})."
         )
     return (
         f"{what} The model did not converge to the person. Usual causes: masks that include "
         "background, or poses from another video. Compare video and avatar in report.html"
         + _check_advice(report.command)
     )
+
+
+def describe_verdict(report: Report, refusal: str | None, *, is_final: bool) -> str:
+    """Return the verdict on an avatar as a sentence, and what would make it better."""
+    if (failure := refusal or diagnose_failure(report)) is not None:
+        return failure
+    if report.verdict is None:
+        return "Not scored." if is_final else "The avatar is there. Its scores are being made."
+    if report.all_round.advice is None:
+        return f"The avatar is {report.verdict} from all sides."
+    return f"The avatar is {report.verdict}. {report.all_round.advice}"
 
 
 def _describe_scores(held: HeldOutStats) -> str:
@@ -86,97 +99,157 @@ ANIMATION_PX = 480
 """Width and height of the animation on the page."""
 ANIMATION_FPS = 16.0
 """Images per second of the animation on the page."""
+FIRST_ANIMATION_FPS = 8.0
+"""Images per second while the user waits for the page."""
 ANIMATION_FRAMES = 96
 """Largest number of images of an animation."""
+USUAL_NAMES = frozenset({"video", "movie", "film", "clip", "images", "frames"})
+"""Names of videos that say nothing about what they show."""
 
 
-def write_report(
-    result: TrainingResult,
-    capture: Capture,
-    run: RunFolder,
-    console: Console,
-    *,
-    command: dict[str, Any],
-    startup_seconds: float,
-    threads: int,
-) -> Report:
-    """Write report.json, turning.webp and report.html; each appears whole or not at all.
+@final
+class ReportWriter:
+    """A reader of a session: writes the report once there is a package, and whole at the end.
 
-    `result` is baked and scored; `command` holds the arguments of ia-ingest as given;
-    `startup_seconds` last until the first frame.
+    Attributes:
+        report: The report as it was last written; None before.
     """
-    package = _package_stats(result, run, console)
-    report = _build_report(
-        result, capture, package,
-        command=command, startup_seconds=startup_seconds, threads=threads,
-    )  # fmt: skip
-    write_text_atomically(run.report_json, report.to_json())
-    with console.status("drawing the report"):
-        animation = None
-        if package is not None:
-            animation = demo_animation(Player.load(run.package))
-            with atomic_file(run.animation) as part:
-                part.write_bytes(animation)
+
+    def __init__(
+        self,
+        capture: Capture,
+        run: RunFolder,
+        console: Console,
+        *,
+        command: dict[str, Any],
+        started_at: float,
+        threads: int,
+        copy: tuple[Path, bool] | None = None,
+    ) -> None:
+        """Write nothing yet.
+
+        `command` holds the arguments of ia-ingest as given, which was `started_at` on
+        `time.perf_counter`'s clock; `copy` is another path for report.json, and whether a file
+        there may be replaced.
+        """
+        self._capture, self._run, self._console, self._copy = capture, run, console, copy
+        self._command, self._started_at, self._threads = command, started_at, threads
+        self._animation: bytes | None = None
+        self._result: TrainingResult | None = None
+        self.report: Report | None = None
+
+    def __call__(self, event: SessionEvent) -> None:
+        """Write report.json, turning.webp and report.html; each appears whole or not at all."""
+        match event:
+            case PackageWritten(result=result, is_final=is_final):
+                if not is_final:
+                    self._console.print_artifact("package", self._run.package)
+                    self._console.print_artifact("play it", self._play_command())
+                with self._console.status("drawing the report"):
+                    player = Player.load(self._run.package)
+                    fps = ANIMATION_FPS if is_final else FIRST_ANIMATION_FPS
+                    self._animation = demo_animation(player, fps=fps)
+                    with atomic_file(self._run.animation) as part:
+                        part.write_bytes(self._animation)
+                    if not is_final:
+                        self._write(result, is_final=False)
+                if not is_final:
+                    self._console.print_artifact("look at it", self._run.report_html)
+                    self._console.info("Finer detail and scores follow; Ctrl-C leaves them out.")
+            case Ended(result=result):
+                self._write(result, is_final=True)
+                self._print(result)
+
+    def exit_code(self) -> int:
+        """Return the exit code of a session that has ended.
+
+        Raises:
+            CommandExit: If there is no package, or its avatar has failed.
+        """
+        assert self._result is not None
+        assert self.report is not None
+        is_interrupted = self._result.interrupted
+        unusable = _refusal(self._result) or diagnose_failure(self.report)
+        if unusable is not None:
+            raise CommandExit(unusable, INTERRUPTED if is_interrupted else NO_AVATAR)
+        return INTERRUPTED if is_interrupted else DONE
+
+    def _write(self, result: TrainingResult, *, is_final: bool) -> None:
+        self._result = result
+        package = _package_stats(result, self._run)
+        started_at = self._started_at
+        self.report = report = _build_report(
+            result, self._capture, package, command=self._command, threads=self._threads,
+            startup_seconds=(result.meter.first_frame_at or started_at) - started_at,
+        )  # fmt: skip
+        write_text_atomically(self._run.report_json, report.to_json())
+        if self._copy is not None and is_final:
+            path, may_replace = self._copy
+            write_text_atomically(path, report.to_json(), replace=may_replace)
         page = report_page(
             report,
-            name=capture.paths.video.name,
-            body_map=CoverageMap(capture.shaped, result.coverage).svg(),
+            name=display_name(self._capture.paths.video),
+            verdict=describe_verdict(report, _refusal(result), is_final=is_final),
+            body_map=CoverageMap(self._capture.shaped, result.coverage).svg(),
             pairs=comparison_pairs(result),
-            animation=None if animation is None else data_uri(animation),
-            warnings=[*console.warnings, *filter(None, [_refusal(result)])],
-            failure=diagnose_failure(report),
-            present_files=[path.name for path in (run.cameras, run.poses) if path.exists()],
-            play_command=None
-            if package is None
-            else play_command(run.package, capture.paths.poses),
+            animation=None if self._animation is None else data_uri(self._animation),
+            warnings=self._console.warnings,
+            notes=self._console.notes,
+            present_files=[p.name for p in (self._run.cameras, self._run.poses) if p.exists()],
+            next_steps={} if package is None else self._next_steps(),
         )
-    write_text_atomically(run.report_html, page)
-    return report
+        write_text_atomically(self._run.report_html, page)
 
+    def _play_command(self) -> str:
+        """Return the command that plays the package in the poses it was learnt from."""
+        return quote_command("ia-play", self._run.package, "--poses", self._capture.paths.poses)
 
-def print_results(
-    report: Report, result: TrainingResult, run: RunFolder, console: Console, *, interrupted: bool
-) -> int:
-    """Print scores and files; return the exit code.
+    def _next_steps(self) -> dict[str, str]:
+        """Return commands by what they do."""
+        package, mesh = self._run.package, self._run.path / "avatar.glb"
+        return {
+            "Play it as a video": self._play_command(),
+            "Turn it in your browser": quote_command("ia-play", package, "--web"),
+            "Take it into Blender, Unity or a page of your own": quote_command(
+                "ia-export", package, "--to", "glb", "--out", mesh
+            ),
+        }
 
-    Raises:
-        CommandExit: If there is no package, or its avatar has failed.
-    """
-    held_out, fitted = report.held_out, report.held_out_refined
-    score = "no frame was held out"
-    if held_out.psnr is not None:
-        score = f"held-out PSNR {format_psnr(held_out.psnr, held_out.verdict)}"
-    if fitted is not None and fitted.psnr is not None:
-        some = "" if len(fitted.frames) == len(held_out.frames) else f"{len(fitted.frames)} of "
-        fitted_score = format_psnr(fitted.psnr, fitted.verdict)
-        score += f", with poses fitted to {some}those frames {fitted_score}"
-    training = report.training
-    console.info(f"Trained for {training.wall_seconds:.1f} s ({training.steps} steps); {score}.")
-    found = report.all_round
-    if found.verdict is not None and found.verdict != "failed":
+    def _print(self, result: TrainingResult) -> None:
+        """Print frames, scores, verdict and files."""
+        report, run, console = self.report, self._run, self._console
+        assert report is not None
+        held_out, fitted = report.held_out, report.held_out_refined
+        score = "no frame was scored"
+        if held_out.psnr is not None:
+            score = f"held-out PSNR {format_psnr(held_out.psnr, held_out.verdict)}"
+        if fitted is not None and fitted.psnr is not None:
+            some = "" if len(fitted.frames) == len(held_out.frames) else f"{len(fitted.frames)} of "
+            fitted_score = format_psnr(fitted.psnr, fitted.verdict)
+            score += f", with poses fitted to {some}those frames {fitted_score}"
+        training = report.training
+        console.info(report.frames.sentence(tracked=report.tracking is not None))
         console.info(
-            f"From all sides the avatar is {found.verdict}."
-            + (f" {found.advice}" if found.advice else "")
+            f"Trained for {training.wall_seconds:.1f} s ({training.steps} steps); {score}."
         )
-    if report.package is not None:
-        console.print_artifact("package", run.package)
-    console.print_artifact("report", run.report_json)
-    console.print_artifact("look at it", run.report_html)
-    console.print_artifact("checkpoint", run.checkpoint)
-    unusable = _refusal(result) or diagnose_failure(report)
-    if unusable is not None:
-        raise CommandExit(unusable, INTERRUPTED if interrupted else NO_AVATAR)
-    return INTERRUPTED if interrupted else DONE
+        if _refusal(result) is None and diagnose_failure(report) is None:
+            console.info(describe_verdict(report, None, is_final=True))
+        if report.package is not None:
+            console.print_artifact("package", run.package)
+            console.print_artifact("play it", self._play_command())
+        console.print_artifact("look at it", run.report_html)
+        console.print_artifact("report", run.report_json)
+        console.print_artifact("checkpoint", run.checkpoint)
+
+
+def display_name(video: Path) -> str:
+    """Return the name of a video, or of its folder if its own says nothing."""
+    return video.absolute().parent.name if video.stem.lower() in USUAL_NAMES else video.name
 
 
 def _refusal(result: TrainingResult) -> str | None:
     """Return why no package was written; None if one was."""
     return None if result.package is None else result.package.refusal
-
-
-def play_command(package: Path, poses: Path) -> str:
-    """Return the command that plays a package in the poses it was learnt from, for a shell."""
-    return quote_command("ia-play", package, "--poses", poses)
 
 
 def comparison_pairs(result: TrainingResult) -> list[ComparisonPair]:
@@ -200,17 +273,17 @@ def comparison_pairs(result: TrainingResult) -> list[ComparisonPair]:
     return shown
 
 
-def demo_animation(player: Player) -> bytes:
+def demo_animation(player: Player, *, fps: float = ANIMATION_FPS) -> bytes:
     """The avatar in a motion of our own, drawn by the player, as an animated WebP."""
-    return motion_animation(player, demo_motion())
+    return motion_animation(player, demo_motion(), fps=fps)
 
 
-def motion_animation(player: Player, motion: Motion) -> bytes:
+def motion_animation(player: Player, motion: Motion, *, fps: float = ANIMATION_FPS) -> bytes:
     """Draw the first seconds of a motion by the player, as an animated WebP."""
     camera = FollowingCamera.of(player, motion, ANIMATION_PX)
-    frames = ResampledMotion.of(motion, fps=ANIMATION_FPS)
+    frames = ResampledMotion.of(motion, fps=fps)
     poses = [frames.pose(frame) for frame in range(min(len(frames), ANIMATION_FRAMES))]
-    return encode_webp([player.render(p, camera.camera_for(p)) for p in poses], fps=ANIMATION_FPS)
+    return encode_webp([player.render(p, camera.camera_for(p)) for p in poses], fps=fps)
 
 
 def _fitted_pose_stats(result: TrainingResult) -> HeldOutStats | None:
@@ -220,15 +293,13 @@ def _fitted_pose_stats(result: TrainingResult) -> HeldOutStats | None:
     return replace(HeldOutStats.of(result.scores.fitted, result.meter.size_px), poses="fitted")
 
 
-def _package_stats(result: TrainingResult, run: RunFolder, console: Console) -> PackageStats | None:
+def _package_stats(result: TrainingResult, run: RunFolder) -> PackageStats | None:
     """Describe the package, or remove a resumed run's older one if none was written."""
     exported = None if result.package is None else result.package.export_report
     if exported is None:
         run.remove(run.package)
         run.remove(run.animation)
         return None
-    for warning in exported.warnings:
-        console.warning(warning)
     return PackageStats(
         path=run.package.name,
         bytes=exported.bytes,

@@ -9,6 +9,7 @@ theirs are replayed against it.
 import math
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple, final
@@ -46,7 +47,6 @@ from instant_avatar.report.report_schema import (
     CurvePoint,
     ForgettingStats,
     finite_mean,
-    format_psnr,
 )
 from instant_avatar.run.run_folder import RunFolder
 from instant_avatar.run.snapshot_writer import PackageSnapshot
@@ -108,8 +108,8 @@ class TrainingResult:
     Attributes:
         curve: Learning curve, up to the final scores.
         frames_added: Frames of this capture that were trained on.
-        package: Outcome of packaging; None before `TrainingSession.bake`.
-        scores: Final scores of the held-out frames; empty before `bake`.
+        package: Outcome of packaging; None before it.
+        scores: Final scores of the held-out frames; empty before they are scored.
     """
 
     trainer: Trainer
@@ -129,7 +129,7 @@ class TrainingResult:
         return self.trainer.steps > 0 and self.frames_added > 0
 
     def all_round_verdict(self) -> AllRoundVerdict:
-        """The verdict on the avatar from all sides, after `bake`."""
+        """The verdict on the avatar from all sides, by what is known of it so far."""
         scores, exported = self.scores, self.package and self.package.export_report
         return AllRoundVerdict.of(
             better_verdict(overall_verdict(scores.given), overall_verdict(scores.fitted)),
@@ -150,26 +150,34 @@ class _ScoredFrame(NamedTuple):
 
 
 def score_finally(
-    trainer: Trainer, held_out: list[HeldOutFrame], console: Console, *, fit_poses: bool
+    trainer: Trainer,
+    held_out: list[HeldOutFrame],
+    *,
+    fit_poses: bool,
+    report_progress: Callable[[str, float], object] = lambda *_: None,
+    is_left_out: Callable[[], bool] = lambda: False,
 ) -> FinalScores:
     """Score the held-out frames in about `SCORING_LIMIT_S`; with `fit_poses` in fitted poses, too.
 
     After a given number of steps all are scored, whatever the time: the results of such a run do
-    not depend on the machine.
+    not depend on the machine. `report_progress` receives the stage and its share that is done; once
+    `is_left_out` is true, what was scored until then is returned.
     """
     if not held_out:
         return FinalScores()
     limit_s = math.inf if trainer.config.steps else SCORING_LIMIT_S
-    began, scored = time.perf_counter(), list[_ScoredFrame]()
-    with console.progress(f"scoring {len(held_out)} held-out frames", float(len(held_out))) as bar:
-        whole_until = began + WHOLE_IMAGES_SHARE * limit_s
-        for one in _score_in_given_poses(trainer.avatar, held_out, whole_until):
-            scored.append(one)
-            bar.set_count(len(scored))
-    fitted = list[HeldOutScore]()
+    began, scored, fitted = time.perf_counter(), list[_ScoredFrame](), list[HeldOutScore]()
+    whole_until = began + WHOLE_IMAGES_SHARE * limit_s
+    given = _score_in_given_poses(trainer.avatar, held_out, whole_until)
+    while not is_left_out() and (one := next(given, None)) is not None:
+        scored.append(one)
+        report_progress(f"scoring {len(held_out)} held-out frames", len(scored) / len(held_out))
     if fit_poses:
-        with console.progress("fitting poses to the held-out frames", 1.0) as bar:
-            fitted += _score_in_fitted_poses(trainer, scored, began + limit_s, bar.set_share)
+        with suppress(KeyboardInterrupt):
+            for score in _score_in_fitted_poses(
+                trainer, scored, began + limit_s, report_progress, is_left_out
+            ):
+                fitted.append(score)
     order = np.argsort([one.given.frame for one in scored])
     shown = [one for one in scored if one.rendering is not None][:KEPT_RENDERINGS]
     return FinalScores(
@@ -177,7 +185,9 @@ def score_finally(
         sampled=tuple(scored[i].sampled for i in order),
         fitted=tuple(sorted(fitted, key=lambda score: score.frame)),
         renderings={one.given.frame: one.rendering for one in shown if one.rendering is not None},
-        half_transparent=half_transparent_share(
+        half_transparent=None
+        if is_left_out()
+        else half_transparent_share(
             render_unfilmed_views(trainer.avatar, reduction=UNFILMED_REDUCTION)
         ),
     )
@@ -205,19 +215,30 @@ def _score_in_fitted_poses(
     trainer: Trainer,
     scored: list[_ScoredFrame],
     until: float,
-    progress: Callable[[float], None],
+    report_progress: Callable[[str, float], object],
+    is_left_out: Callable[[], bool],
 ) -> Iterator[HeldOutScore]:
-    """Fit frames, a few at a time, and score them as they were in the given poses."""
+    """Fit frames, a few at a time, and score them as they were in the given poses.
+
+    Raises:
+        KeyboardInterrupt: Once `is_left_out`, also amid a fit.
+    """
+
+    def check(share: float) -> None:
+        if is_left_out():
+            raise KeyboardInterrupt
+        done = (first + share * FRAMES_PER_FIT) / len(scored)
+        report_progress("fitting poses to the held-out frames", min(done, 1.0))
+
     for first in range(0, len(scored), FRAMES_PER_FIT):
         if first and time.perf_counter() > until:
             return
         some = scored[first : first + FRAMES_PER_FIT]
-        fitted = fit_test_poses(trainer, [one.frame for one in some])
-        for done, (one, frame) in enumerate(zip(some, fitted, strict=True), start=first + 1):
+        fitted = fit_test_poses(trainer, [one.frame for one in some], progress=check)
+        for one, frame in zip(some, fitted, strict=True):
             score = score_fine_sample if one.rendering is None else score_frame
             after = score(trainer.avatar, frame)
             yield after if after.psnr >= one.given.psnr else one.given
-            progress(done / len(scored))
 
 
 @final
@@ -281,22 +302,20 @@ class EarlierVideos:
             for frame in self._kept.training_frames(trainer.avatar.rig):
                 trainer.add_frame(frame, is_restored=True)
 
-    def measure_forgetting(
-        self, trainer: Trainer, held_out: list[HeldOutFrame], console: Console
-    ) -> ForgettingStats | None:
-        """Save frames for the next video; compare scores of earlier videos, if there are any.
-
-        Call it after the last step; `held_out` are frames of the current video.
-        """
+    def save_frames(self, trainer: Trainer, held_out: list[HeldOutFrame]) -> None:
+        """Save frames for the next video; `held_out` are those of the current one."""
         kept = SavedFrames.of(trainer.replay, [*self.held_out, *held_out])
         kept.save(self._run.checkpoint / LAST_RUN_FILE)
+
+    def measure_forgetting(self, trainer: Trainer) -> ForgettingStats | None:
+        """Compare scores of earlier videos, if there are any, after the last step."""
         if "before" not in self._notes:
             return None
         history = self._notes["before"]
         before = [each["psnr"] for each in history["scores"]]
         after, videos = self._score_earlier_videos(trainer), earlier_video_names(self._notes)
         drops = [was - now.psnr for was, now in zip(before, after, strict=True)]
-        note = ForgettingStats(
+        return ForgettingStats(
             videos=videos,
             frames_trained=history["frames"],
             wall_seconds=history["seconds"],
@@ -309,12 +328,6 @@ class EarlierVideos:
             psnr_after=finite_mean([score.psnr for score in after]),
             largest_drop=max([0.0, *drops]) if drops else None,
         )
-        if note.psnr_after is not None:
-            console.info(
-                f"Held-out frames of the earlier video: {format_psnr(note.psnr_before, None)} "
-                f"before, {format_psnr(note.psnr_after, None)} now."
-            )
-        return note
 
     def _previous_video_name(self) -> str:
         """Return the file name of the previous video."""

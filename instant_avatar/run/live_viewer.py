@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 from avatar.avatar_model import Avatar
 from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.coverage import coverage_advice
-from avatar.events import Evaluated, Finished, TrainEvent
+from avatar.events import Evaluated, Finished
 from avatar.render import render
 from capture.camera import Camera
 from instant_avatar.cli.command_line import stop_on_interrupt
@@ -18,7 +18,7 @@ from instant_avatar.cli.console import Console
 from instant_avatar.report.report_figures import CoverageMap
 from instant_avatar.report.report_schema import format_percent, provisional_verdict
 from instant_avatar.run.run_folder import RunFolder
-from instant_avatar.run.snapshot_writer import validation_views, write_package_snapshot
+from instant_avatar.run.session_events import EventReader, SessionEvent
 from instant_avatar.run.training_session import TrainingSession
 from instant_avatar.run.viser_page import (
     BACKGROUND_RGB,
@@ -54,14 +54,13 @@ MAP_INTERVAL_S = 1.0
 
 @final
 class LiveViewer:
-    """A `TrainingObserver` that shows training in browsers."""
+    """A reader of a session's events that shows training in browsers."""
 
     def __init__(self, recording: Capture, run: RunFolder, console: Console, port: int) -> None:
         """Open the page, at `port` or a free one after it, and print its address."""
         self._recording, self._run, self._console = recording, run, console
         self._poser = PreviewPoses(recording)
         self.page = ViserPage(recording.paths.video.name, port)
-        self._newest_observation: Observation | None = None
         self._cells: tuple[BodyPose, CorrespondenceGrid] | None = None
         self._shown: dict[int, tuple[object, ...]] = {}
         self._body_map: CoverageMap | None = None
@@ -72,26 +71,25 @@ class LiveViewer:
         self._finished, self._note = False, ""
         console.info(f"Live viewer: {self.page.address}")
 
-    def on_frame(self, observation: Observation, *, held_out: bool) -> None:
-        """Keep the newest frame for the next update."""
-        self._newest_observation = observation
+    def watch(self, session: TrainingSession) -> EventReader:
+        """Return a reader of the session's events, which updates the page between them."""
 
-    def on_event(self, event: TrainEvent) -> None:
-        """Update the panel at once for scores and for the end of training."""
-        if isinstance(event, Evaluated | Finished):
-            self._next_panel = 0.0
-        self._finished = isinstance(event, Finished)
+        def read(event: SessionEvent) -> None:
+            if isinstance(event, Evaluated | Finished):
+                self._next_panel = 0.0
+            self._finished = self._finished or isinstance(event, Finished)
+            what = "Writing the package, after" if self._finished else "Training,"
+            self._update_page(session, f"{what} {_progress_text(session)}", idle=False)
+            if self._finished:
+                return
+            if self.page.save_requested:
+                with session.trainer.paused():
+                    self._save_package(session)
+            if self.page.paused:
+                with session.trainer.paused():
+                    self._wait_while_paused(session)
 
-    def between_steps(self, session: TrainingSession) -> None:
-        """Update the page within its share of the time; pause or save if requested."""
-        what = "Writing the package, after" if self._finished else "Training,"
-        self._update_page(session, f"{what} {self._progress_text(session)}", idle=False)
-        if self.page.save_requested:
-            with session.trainer.paused():
-                self._save_package(session)
-        if self.page.paused:
-            with session.trainer.paused():
-                self._wait_while_paused(session)
+        return read
 
     def serve_until_interrupt(self, session: TrainingSession) -> None:
         """Keep the page open after training, until Ctrl-C."""
@@ -107,15 +105,11 @@ class LiveViewer:
         """Close the page."""
         self.page.close()
 
-    def _progress_text(self, session: TrainingSession) -> str:
-        trainer = session.trainer
-        return f"{trainer.wall_seconds:.0f} of {trainer.config.seconds:.0f} s"
-
     def _wait_while_paused(self, session: TrainingSession) -> None:
         """Wait until the user resumes training, or presses Ctrl-C."""
         self._next_panel = 0.0
-        status = f"Paused after {self._progress_text(session)}"
-        while self.page.paused and not session.stop_requested:
+        status = f"Paused after {_progress_text(session)}"
+        while self.page.paused and not session.stop.is_set():
             self._update_page(session, status, idle=True)
             if self.page.save_requested:
                 self._save_package(session)
@@ -125,15 +119,11 @@ class LiveViewer:
     def _save_package(self, session: TrainingSession) -> None:
         """Write the avatar in its current state as a package."""
         self.page.save_requested = False
-        trainer, mark = session.trainer, session.curve[-1] if session.curve else None
-        if not trainer.steps:
+        if not session.trainer.steps:
             self.page.notify("Not yet", "Training has not started.")
             return
         try:
-            views = validation_views(session.held_out, self._recording)
-            taken = write_package_snapshot(
-                trainer, self._run.package, views, curve_point=mark, fine_tune=False
-            )
+            taken = session.save_package()
         except OSError as error:
             self.page.notify("The package could not be written", str(error))
             return
@@ -141,7 +131,9 @@ class LiveViewer:
             self.page.notify("No package yet", taken.refusal or "")
             return
         exported = taken.export_report
-        size = f"{exported.bytes / 1e6:.1f} MB after {trainer.wall_seconds:.0f} s of training"
+        size = (
+            f"{exported.bytes / 1e6:.1f} MB after {session.trainer.wall_seconds:.0f} s of training"
+        )
         notes = " ".join([f"{self._run.package}: {size}.", *exported.warnings])
         self.page.notify("Package saved", notes)
         self._console.info(f"Saved from the live viewer: {self._run.package}, {size}.")
@@ -180,7 +172,7 @@ class LiveViewer:
         )
         self.page.show_curve(session.curve)
         if self.page.pose_choice != NEWEST or not trainer.steps:
-            self._show_frame(self._newest_observation)  # otherwise shown with its rendering
+            self._show_frame(session.newest_observation)  # otherwise shown with its rendering
 
     def _show_frame(self, newest: Observation | None) -> None:
         if newest is not None and newest is not self._shown_observation:
@@ -202,7 +194,7 @@ class LiveViewer:
         looks = self.page.browser_cameras()
         for gone in self._shown.keys() - looks.keys():
             del self._shown[gone]
-        newest = self._newest_observation
+        newest = session.newest_observation
         pose = self._poser.pose_at(self.page.pose_choice, now - self.page.chosen_at, newest)
         cells = self._correspondence_grid(session, pose, now)
         plays = self.page.pose_choice in (FILMED, DANCE) or now - self._posed_at < REST_DELAY_S
@@ -238,6 +230,11 @@ class LiveViewer:
             cells = CorrespondenceGrid.solve(session.trainer.avatar.rig, pose.joint_rotations)
             self._cells, self._posed_at = (pose, cells), now
         return self._cells[1]
+
+
+def _progress_text(session: TrainingSession) -> str:
+    trainer = session.trainer
+    return f"{trainer.wall_seconds:.0f} of {trainer.config.seconds:.0f} s"
 
 
 def render_preview(

@@ -1,7 +1,7 @@
 """Start of a training session: threads, kernels, a new, resumed or extended trainer, the viewer."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -21,10 +21,12 @@ from export.bake import proxy_surface
 from instant_avatar.cli.command_line import exit_on_interrupt, stop_on_interrupt
 from instant_avatar.cli.console import Console
 from instant_avatar.cli.hardware import usable_cores
+from instant_avatar.run.console_reader import ConsoleReader
 from instant_avatar.run.final_scoring import EarlierVideos
 from instant_avatar.run.ingest_arguments import PROGRAM, IngestArguments
 from instant_avatar.run.missing_inputs import remove_unused_tracking
 from instant_avatar.run.run_folder import RunFolder
+from instant_avatar.run.session_events import EventReader, SessionEvent
 from instant_avatar.run.training_session import TrainingSession
 from preprocess.capture_session import Capture
 
@@ -81,26 +83,34 @@ def prepare_trainer(
     return prepared
 
 
-@contextmanager
-def start_session(
-    arguments: IngestArguments, capture: Capture, run: RunFolder, console: Console
-) -> Iterator[TrainingSession]:
-    """Prepare trainer and viewer, start the run, and yield its session.
+def run_session(
+    arguments: IngestArguments,
+    capture: Capture,
+    run: RunFolder,
+    console: Console,
+    readers: Sequence[EventReader],
+    *,
+    on_start: Callable[[], object] = lambda: None,
+) -> None:
+    """Prepare trainer and viewer, and run a session to its end; console and `readers` read it.
 
-    Ctrl-C asks the session to stop. A viewer stays open after the block until Ctrl-C.
+    `on_start` is called once an older run has been removed. Ctrl-C asks the session to stop. A
+    viewer stays open until Ctrl-C.
     """
     with exit_on_interrupt(console, PROGRAM, run.release):
         start = prepare_trainer(arguments, capture, run, console)
         viewer = _open_viewer(arguments, capture, run, console)
     run.start_run(resume=arguments.resume)
     remove_unused_tracking(arguments, run)
+    on_start()
     try:
         with stop_on_interrupt(console) as stop:
             session = TrainingSession(
-                start.trainer, capture, run, console, stop, start.notes,
-                observers=() if viewer is None else (viewer,), restore_count=start.restore_count,
-            )  # fmt: skip
-            yield session
+                start.trainer, capture, run, stop, start.notes, restore_count=start.restore_count
+            )
+            watching = () if viewer is None else (viewer.watch(session),)
+            with ConsoleReader(session, console) as shown:
+                _show_events(session, [shown, *watching, *readers])
         if viewer is not None and not stop.is_set():
             console.info(f"The viewer stays open at {viewer.page.address}. Ctrl-C closes it.")
             viewer.serve_until_interrupt(session)
@@ -110,6 +120,18 @@ def start_session(
     finally:
         if viewer is not None:
             viewer.close()
+
+
+def _show_events(session: TrainingSession, readers: Sequence[EventReader]) -> None:
+    """Run a session to its end, and let each of the readers see every event."""
+
+    def show(event: SessionEvent) -> None:
+        for reader in readers:
+            reader(event)
+
+    with closing(session.run(show)) as events:
+        for event in events:
+            show(event)
 
 
 def _open_viewer(
@@ -273,6 +295,6 @@ def _announce_duration(arguments: IngestArguments, trainer: Trainer, console: Co
     if config.steps:
         duration = f"{config.steps - trainer.steps} steps"
     console.info(
-        f"Training for {duration}, then about half a minute for packaging and evaluation on an "
-        "otherwise idle machine."
+        f"Training for {duration}; the avatar can be played some seconds later, and half a minute "
+        "of finer detail and scores follows, on an otherwise idle machine."
     )

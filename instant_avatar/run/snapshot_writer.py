@@ -1,7 +1,7 @@
 """Write the avatar in its current state: checkpoints while it is trained, and packages."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -15,7 +15,7 @@ from avatar.training.trainer import Trainer
 from capture.atomic_files import atomic_file
 from export.bake.bake_tables import ExportRefused
 from export.bake.fine_tuning import PosedView
-from export.build import ExportReport, export_avatar
+from export.build import ExportReport, export_in_stages
 from export.package.package_file import update_metrics
 from instant_avatar.report.report_schema import CurvePoint
 from instant_avatar.run.run_folder import RunFolder
@@ -43,6 +43,7 @@ class CheckpointWriter:
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="checkpoint")
         self._pending: Future[float] | None = None
         self._copy_cost_s = self._cpu_interval_s = 0.0
+        self._writing, self._saved = 0, list[int]()
         self.restart_interval()
 
     def restart_interval(self) -> None:
@@ -68,7 +69,7 @@ class CheckpointWriter:
         began = time.thread_time()
         get_state = checkpoint.detached_state if trains_on else checkpoint.current_state
         state = get_state(trainer, notes=notes)
-        self._copy_cost_s = time.thread_time() - began
+        self._copy_cost_s, self._writing = time.thread_time() - began, trainer.steps
         self._pending = self._thread.submit(self._write, state)
         self.restart_interval()
 
@@ -81,6 +82,11 @@ class CheckpointWriter:
         if self._pending is not None:
             self._take_result()
 
+    def take_saved(self) -> list[int]:
+        """Return the steps of the checkpoints that were written since the last call."""
+        saved, self._saved = self._saved, []
+        return saved
+
     def settle(self) -> None:
         """Wait until nothing is being written; `wait` raises the error, if there was one."""
         if self._pending is not None:
@@ -91,6 +97,7 @@ class CheckpointWriter:
         done, self._pending = self._pending, None
         # cost / interval = share
         self._cpu_interval_s = (self._copy_cost_s + done.result()) / CHECKPOINT_COST_SHARE
+        self._saved.append(self._writing)
 
     def _write(self, state: dict[str, Any]) -> float:
         """Write a state, and body and fit beside the first; return the CPU time it took."""
@@ -107,8 +114,6 @@ class CheckpointWriter:
 
 VALIDATION_VIEWS = 4
 """Views that a package is validated with."""
-QUICK_VALIDATION_VIEWS = 2
-"""Views that a quick package is validated with."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,43 +131,40 @@ class PackageSnapshot:
     ready_at: float
 
 
-def write_package_snapshot(
+def write_packages(
     trainer: Trainer,
     path: Path,
     views: Sequence[PosedView],
     *,
     curve_point: CurvePoint | None,
-    quick: bool = False,
+    baked_first: bool = False,
     fine_tune: bool = True,
     progress: Callable[[float], None] = lambda _: None,
-) -> PackageSnapshot:
-    """Write the package, whole or not at all; training may continue afterwards.
+) -> Iterator[PackageSnapshot]:
+    """Write the package, whole or not at all, and yield it; training may continue afterwards.
 
     Args:
         trainer: Holds the avatar; not in the middle of a step.
         path: The `.iavatar` file; an existing one is kept if the package is refused.
         views: Poses and cameras to validate the package with (`validation_views`).
-        quick: Whether to skip the finest detail because the user waits (`prefer_final`).
+        baked_first: Whether to write and yield the package before it is fine-tuned, too.
         fine_tune: Whether to spend about ten seconds on fine-tuning the bricks.
-        progress: Called with the fraction done, from 0 to 1.
+        progress: Called with the fraction done, from 0 to 1, while bricks are fine-tuned.
     """
     metrics = {
         "held_out": None if curve_point is None else asdict(curve_point),
         "recipe": asdict(trainer.config),
     }
     try:
-        exported = export_avatar(
-            trainer.avatar,
-            path,
-            views=views[:QUICK_VALIDATION_VIEWS] if quick else views,
-            metrics=metrics,
-            quick=quick,
-            fine_tune_bricks=fine_tune,
-            progress=progress,
-        )
+        for exported in export_in_stages(
+            trainer.avatar, path, views=views, metrics=metrics, baked_first=baked_first,
+            fine_tune_bricks=fine_tune, progress=progress,
+        ):  # fmt: skip
+            yield PackageSnapshot(
+                export_report=exported, refusal=None, ready_at=time.perf_counter()
+            )
     except ExportRefused as error:
-        return PackageSnapshot(export_report=None, refusal=str(error), ready_at=time.perf_counter())
-    return PackageSnapshot(export_report=exported, refusal=None, ready_at=time.perf_counter())
+        yield PackageSnapshot(export_report=None, refusal=str(error), ready_at=time.perf_counter())
 
 
 def store_scores(snapshot: PackageSnapshot, scores: CurvePoint) -> PackageSnapshot:
@@ -174,11 +176,11 @@ def store_scores(snapshot: PackageSnapshot, scores: CurvePoint) -> PackageSnapsh
     return replace(snapshot, export_report=replace(exported, bytes=size))
 
 
-def prefer_final(quick: PackageSnapshot, final: PackageSnapshot) -> PackageSnapshot:
-    """Return the package on disk after a quick one; it was ready when the quick one was."""
-    if quick.export_report is None:
+def prefer_final(first: PackageSnapshot | None, final: PackageSnapshot) -> PackageSnapshot:
+    """Return the package on disk after a first one; it was ready when the first one was."""
+    if first is None:
         return final
-    return quick if final.export_report is None else replace(final, ready_at=quick.ready_at)
+    return first if final.export_report is None else replace(final, ready_at=first.ready_at)
 
 
 def validation_views(held_out: list[HeldOutFrame], recording: Capture) -> Sequence[PosedView]:

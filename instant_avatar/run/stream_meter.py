@@ -53,6 +53,11 @@ class StreamMeter:
         self._first_time_s = self._clip_started_at = 0.0
         self._available_at: deque[tuple[int, float]] = deque()
 
+    @property
+    def is_paced(self) -> bool:
+        """True if frames come at their own times, which may be faster than training takes them."""
+        return self._source.paced
+
     def measure_arrival(self, frames: Iterable[Frame]) -> Iterator[Frame]:
         """Pass frames on and record when each was available."""
         for frame in frames:

@@ -190,7 +190,7 @@ def exported(stand_in: StandIn, coarse: BakeConfig, views, truth, tmp_path_facto
     def renderer(pose, camera):
         return truth["bent" if pose is views["bent"][0] else "canonical"]
 
-    report = export_field(
+    (report,) = export_field(
         stand_in.field_at,
         stand_in.rig,
         stand_in.occupied,

@@ -135,17 +135,17 @@ def without_baking(monkeypatch) -> None:
     Nor is it about how good the avatar is, for which half a second may not be enough.
     """
 
-    def export_nothing(avatar, path, *, views, metrics, quick, fine_tune_bricks, progress):
+    def export_nothing(avatar, path, **options):
         write_text_atomically(path, "stand-in")
-        return ExportReport(
+        yield ExportReport(
             path=path, bytes=8, seconds=0.0, psnr_to_renderer={"hq": 40.0},
             largest_difference=0.0, fine_tuning_psnr=None, warnings=(),
         )  # fmt: skip
 
-    monkeypatch.setattr(snapshot_writer, "export_avatar", export_nothing)
+    monkeypatch.setattr(snapshot_writer, "export_in_stages", export_nothing)
     monkeypatch.setattr(snapshot_writer, "update_metrics", lambda path, metrics: 8)
     monkeypatch.setattr(report_writer, "diagnose_failure", lambda report: None)
-    monkeypatch.setattr(report_writer, "demo_animation", lambda player: b"")
+    monkeypatch.setattr(report_writer, "demo_animation", lambda player, fps: b"")
     monkeypatch.setattr(report_writer.Player, "load", lambda path: None)
 
 

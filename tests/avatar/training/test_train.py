@@ -12,7 +12,7 @@ import torch
 
 from avatar.config import NOMINAL_STEPS_PER_S, TrainConfig
 from avatar.evaluation.held_out import HeldOutFrame
-from avatar.events import Evaluated, Finished, FrameArrived, Stepped, WaitingForFrame, Warned
+from avatar.events import Evaluated, Finished, FrameArrived, FrameLeftOut, Stepped, WaitingForFrame
 from avatar.render import render
 from avatar.training import train as train_module
 from avatar.training.frame_stream import prepare_frame, prepare_stream
@@ -125,10 +125,8 @@ def test_every_usable_frame_is_taken_in_and_the_others_are_kept_out(rig, ready):
     assert trainer.frames_seen == 5
     assert trainer.replay.frame_indices == [0, 1, 3, 6, 7]
     assert [frame.observation.frame.index for frame in held] == [2, 5]
-    warnings = [event.message for event in events if isinstance(event, Warned)]
-    assert len(warnings) == 1
-    assert "4" in warnings[0]
-    assert "empty mask" in warnings[0]
+    left_out = [event for event in events if isinstance(event, FrameLeftOut)]
+    assert left_out == [FrameLeftOut(index=4, reason="empty mask")]
 
 
 def test_events_come_in_order_and_end_with_the_last_step(rig, ready):
@@ -208,7 +206,7 @@ def test_a_stream_without_a_usable_frame_ends_without_a_step(rig):
     nothing = [DroppedFrame(index=index, reason="pose invalid") for index in range(3)]
     trainer, _, events = taught(rig, nothing, QUICK)
     assert [type(event) for event in events if not isinstance(event, WaitingForFrame)] == [
-        Warned
+        FrameLeftOut
     ] * 3
     assert trainer.steps == 0
 

@@ -175,13 +175,14 @@ def test_progress_only_grows(tuned):
     assert len(told) == 13  # four judge, six are learnt from, and three rounds
 
 
+@pytest.mark.parametrize("baked_first", [False, True])
 def test_ctrl_c_while_tuning_leaves_the_package_as_baked(
-    stand_in, renderer, coarse, views, tables, tmp_path
+    stand_in, renderer, coarse, views, tables, tmp_path, baked_first
 ):
     def interrupted(share):
         raise KeyboardInterrupt
 
-    report = export_field(
+    (report,) = export_field(
         stand_in.field_at,
         stand_in.rig,
         stand_in.occupied,
@@ -191,9 +192,10 @@ def test_ctrl_c_while_tuning_leaves_the_package_as_baked(
         renderer=renderer,
         config=replace(coarse, fine_tuning_pictures=4),
         progress=interrupted,
+        baked_first=baked_first,
     )
     assert report.fine_tuning_psnr is None
-    assert any("interrupted" in warning for warning in report.warnings)
+    assert any("interrupted" in warning for warning in report.warnings) is not baked_first
     package = read_package(report.path)
     assert np.array_equal(package.tables["hq"].bricks.voxels, tables.bricks.voxels)
 
@@ -256,7 +258,7 @@ def test_where_the_player_is_far_from_the_renderer_bytes_choose_the_voxels(
         return picture
 
     def exported(exact):
-        report = export_field(
+        (report,) = export_field(
             stand_in.field_at,
             stand_in.rig,
             stand_in.occupied,

@@ -27,7 +27,7 @@ from instant_avatar.report.report_schema import (
     StreamStats,
     TrainingStats,
 )
-from instant_avatar.report.report_writer import diagnose_failure, play_command
+from instant_avatar.report.report_writer import describe_verdict, diagnose_failure, display_name
 from preprocess.observation import DroppedFrame
 
 
@@ -124,7 +124,7 @@ def test_the_page_reports_forgetting():
         replayed_key_frames=40, frames=(9, 19), psnr_before=21.0, psnr_after=21.25,
         largest_drop=0.5,
     )  # fmt: skip
-    page = report_page(report(earlier_videos=earlier, curve=marks), name="second.mp4")
+    page = report_page(report(earlier_videos=earlier, curve=marks), name="second.mp4", verdict="")
     assert "first &lt;1&gt;.mp4" in page
     assert "21.00 dB" in page
     assert "21.25 dB" in page
@@ -165,9 +165,10 @@ def test_the_page_is_whole_and_asks_for_no_other_file():
     page = report_page(
         report(),
         name="a <b> & c.mp4",
+        verdict="Sharp, <b>.",
         pairs=[ComparisonPair(frame=9, psnr=30.0, verdict="soft", truth=white, render=white)],
         animation=data_uri(encode_webp([np.zeros((4, 4, 4), np.uint8)] * 3, fps=10.0)),
-        warnings=["masks <turned>", "Frame 7 is left out: pose invalid."],
+        warnings=["masks <turned>"],
     )
     tags = Tags(page)
     assert len(tags.addresses) == 3
@@ -179,7 +180,7 @@ def test_the_page_is_whole_and_asks_for_no_other_file():
 
 
 def test_a_page_without_pictures_or_scores_is_whole_too():
-    page = report_page(report(curve=()), name="clip")
+    page = report_page(report(curve=()), name="clip", verdict="Sharp.")
     assert Tags(page).addresses == []
     assert "<svg" not in page
 
@@ -189,7 +190,9 @@ def test_every_psnr_on_the_page_has_its_verdict():
         HeldOutStats.of(scores((22.78, 16.4)), (64, 48)), verdict="blurred", blur=0.016, overlap=0.9
     )
     pair = ComparisonPair(frame=9, psnr=22.78, verdict="blurred", truth="data:,", render="data:,")
-    page = report_page(replace(report(), held_out=note), name="clip", pairs=[pair])
+    page = report_page(
+        replace(report(), held_out=note), name="clip", verdict="Sharp.", pairs=[pair]
+    )
     assert "22.78 dB (blurred)" in page
 
 
@@ -216,6 +219,32 @@ def test_a_failure_names_what_was_seen_and_what_to_do():
     assert diagnose_failure(report()) is None
 
 
+def test_advice_of_a_run_that_counts_steps_names_steps():
+    counted = replace(failed(steps=26), recipe={"steps": 26})
+    assert "--steps" in diagnose_failure(counted)
+    assert "--seconds" not in diagnose_failure(counted)
+
+
+def test_frames_add_up_in_a_sentence():
+    stats = replace(
+        report().frames, read=23, near_duplicates=1,
+        dropped=tuple(
+            DroppedFrame(index=i, reason=reason)
+            for i, reason in enumerate(["pose invalid", "no pose", "mask empty"])
+        ),
+    )  # fmt: skip
+    assert stats.sentence(tracked=False) == (
+        "23 frames read: 17 learnt from, 2 held out for scores, 1 almost like the one before, "
+        "3 left out (2 without a pose, 1 with an empty mask)."
+    )
+    assert "2 without the person" in stats.sentence(tracked=True)
+
+
+def test_a_video_whose_name_says_nothing_is_called_by_its_folder():
+    assert display_name(Path("films/anna/video.MP4")) == "anna"
+    assert display_name(Path("films/anna turning.mov")) == "anna turning.mov"
+
+
 def test_an_avatar_of_one_side_is_not_called_sharp():
     one_sided = AllRoundVerdict.of(
         "sharp", seen=0.45, half_transparent=0.11, player_psnr=40.0, film_advice="Turn round."
@@ -223,8 +252,10 @@ def test_an_avatar_of_one_side_is_not_called_sharp():
     kept = replace(report(), all_round=one_sided)
     assert kept.verdict == "blurred"
     assert json.loads(kept.to_json())["all_round"]["limit"] == "filmed"
-    page = report_page(kept, name="clip")
-    assert "Turn round." in page
+    verdict = describe_verdict(kept, None, is_final=True)
+    assert verdict.startswith("The avatar is blurred. ")
+    assert verdict.endswith("Turn round.")
+    assert verdict in report_page(kept, name="clip", verdict=verdict)
     assert diagnose_failure(kept) is None
 
 
@@ -236,12 +267,17 @@ SOLVED = {
 
 def test_the_page_names_no_file_that_is_not_there():
     solved = replace(report(), cameras=SOLVED)
-    assert "cameras.npz" not in report_page(solved, name="clip", present_files=["cameras.npz"])
+    assert "cameras.npz" not in report_page(
+        solved, name="clip", verdict="Sharp.", present_files=["cameras.npz"]
+    )
     both = ["cameras.npz", "poses.npz"]
-    assert "poses.npz hold" in report_page(solved, name="clip", present_files=both)
-    command = play_command(Path("a run/avatar.iavatar"), Path("clip/poses.npz"))
-    page = report_page(solved, name="clip", play_command=command)
-    assert "ia-play &#39;a run/avatar.iavatar&#39; --poses clip/poses.npz" in page
+    assert "poses.npz hold" in report_page(
+        solved, name="clip", verdict="Sharp.", present_files=both
+    )
+    page = report_page(
+        solved, name="clip", verdict="Sharp.", next_steps={"Play": "ia-play 'a run/x.iavatar'"}
+    )
+    assert "ia-play &#39;a run/x.iavatar&#39;" in page
 
 
 def test_the_curve_goes_up_when_the_score_does():

@@ -12,6 +12,7 @@ from instant_avatar.run.snapshot_writer import CheckpointWriter
 from preprocess.capture_session import Capture
 
 TRAINER = Trainer.__new__(Trainer)
+TRAINER.steps = 7
 
 
 @pytest.fixture
@@ -36,9 +37,11 @@ def test_training_goes_on_while_a_checkpoint_is_written(writer, monkeypatch):
     assert writer.is_due()
     writer.begin(TRAINER, {"step": 1})
     assert not writer.is_due()  # the first is not yet written
+    assert writer.take_saved() == []
     gate.set()
     writer.settle()
     assert writer.is_due()
+    assert writer.take_saved() == [7]
     ((kept, thread),) = written
     assert kept == {"step": 1}
     assert thread is not threading.main_thread()

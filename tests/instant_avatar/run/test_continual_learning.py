@@ -43,7 +43,7 @@ def test_another_video_is_added_and_forgetting_is_reported(
     for point in after["curve"]:  # numbers in the video, whichever it was
         assert {number for number, _ in point["frames"]} <= set(held[point["video"]])
     page = (out / "report.html").read_text()
-    assert "of capture, trained for" in page
+    assert "frames of capture)" in page
     assert "Earlier videos" in page
     assert "earlier video" in outcome.err
     assert after["frames"] == {**before["frames"], "dropped": []}  # of the new video alone

@@ -11,7 +11,6 @@ from avatar.evaluation.held_out import HeldOutFrame, PixelSample, score_renderin
 from avatar.training.trainer import Trainer
 from capture.camera import Camera
 from capture.source import Frame
-from instant_avatar.cli.console import Console
 from instant_avatar.run import final_scoring
 from instant_avatar.run.final_scoring import (
     FRAMES_PER_FIT,
@@ -58,12 +57,14 @@ def score(held_out, monkeypatch):
         monkeypatch.setattr(final_scoring, "render", lambda *_, **__: black)
         monkeypatch.setattr(final_scoring, "render_unfilmed_views", lambda *_, **__: [black])
         monkeypatch.setattr(PixelSample, "score", lambda sample, _: sample.score_rendering(black))
-        monkeypatch.setattr(final_scoring, "fit_test_poses", lambda trainer, frames: iter(frames))
+        monkeypatch.setattr(
+            final_scoring, "fit_test_poses", lambda trainer, frames, progress: iter(frames)
+        )
         monkeypatch.setattr(final_scoring, "score_frame", lambda *_: worse)
         monkeypatch.setattr(final_scoring, "SCORING_LIMIT_S", limit_s)
         trainer = Trainer.__new__(Trainer)
         trainer.config, trainer.avatar = TrainConfig(steps=steps), Avatar.__new__(Avatar)
-        return score_finally(trainer, held_out, Console(), fit_poses=fit_poses)
+        return score_finally(trainer, held_out, fit_poses=fit_poses)
 
     return scored
 

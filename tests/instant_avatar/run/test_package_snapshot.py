@@ -1,4 +1,4 @@
-"""Packages that cannot wait, and the finer ones that follow."""
+"""The package as baked, and the fine-tuned one that follows."""
 
 import dataclasses
 from pathlib import Path
@@ -25,7 +25,3 @@ def test_the_finer_package_stands_and_was_ready_with_the_hasty_one():
 
 def test_if_the_finer_one_is_refused_the_hasty_one_stays():
     assert prefer_final(HASTY, REFUSED) is HASTY
-
-
-def test_if_the_hasty_one_was_refused_the_finer_one_counts_from_when_it_was_there():
-    assert prefer_final(REFUSED, LATER) is LATER

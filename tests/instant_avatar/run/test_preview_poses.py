@@ -7,12 +7,9 @@ import pytest
 
 from avatar.config import TrainConfig
 from avatar.correspondence_grid import CorrespondenceGrid
-from avatar.evaluation.coverage import Coverage
 from avatar.render import render
-from avatar.training.frame_stream import separate_held_out
 from avatar.training.trainer import Trainer
 from instant_avatar.run.live_viewer import render_preview
-from instant_avatar.run.training_session import notify_observers
 from instant_avatar.run.viser_page import (
     BACKGROUND_RGB,
     DANCE,
@@ -109,29 +106,3 @@ def test_the_avatar_stands_on_paper(recording, rig):
     assert np.all((picture[fog] != BACKGROUND_RGB).any(axis=1))
     rows = np.flatnonzero(fog.any(axis=1))
     assert 0.7 < len(rows) / 60.0 <= 1.0  # the first look shows the whole person
-
-
-def test_watchers_see_every_frame_and_coverage_those_that_are_learnt(recording, observations):
-    class Seen:
-        def __init__(self):
-            self.frames = []
-
-        def on_frame(self, observation, *, held_out):
-            self.frames.append((observation.frame.index, held_out))
-
-        def on_event(self, event): ...
-
-        def between_steps(self, session): ...
-
-    stream = [*observations[:4], DroppedFrame(index=4, reason="lost"), *observations[5:24]]
-    watcher, coverage = Seen(), Coverage(recording.shaped)
-    split = list(separate_held_out(stream, stride=10, total=24))
-    assert list(notify_observers(iter(split), coverage, [watcher])) == split
-    held = [index for index, held_out in watcher.frames if held_out]
-    assert held == [9, 19]
-    assert len(watcher.frames) == 23
-    alone = Coverage(recording.shaped)
-    for item in stream:
-        if not isinstance(item, DroppedFrame) and item.frame.index not in held:
-            alone.add(item)
-    assert np.array_equal(coverage.cosines, alone.cosines)

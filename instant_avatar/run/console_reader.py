@@ -1,0 +1,91 @@
+"""The console's reader of a session: a progress line, scores as they are made, and messages."""
+
+from types import TracebackType
+from typing import final
+
+from avatar.events import Evaluated, FrameArrived, FrameLeftOut, Stepped, Warned
+from instant_avatar.cli.console import Console, ProgressBar
+from instant_avatar.report.report_schema import format_percent, format_psnr
+from instant_avatar.run.session_events import (
+    Ended,
+    Noted,
+    PackageWritten,
+    Progressed,
+    Scored,
+    SessionEvent,
+)
+from instant_avatar.run.training_session import TrainingSession
+
+
+@final
+class ConsoleReader:
+    """Shows a session's events on a console, within a `with` block."""
+
+    def __init__(self, session: TrainingSession, console: Console) -> None:
+        """Show nothing yet."""
+        self._session, self._console = session, console
+        self._bar: ProgressBar | None = None
+        self._stage = ""
+
+    def __enter__(self) -> "ConsoleReader":
+        """Return the reader."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Remove the progress line."""
+        self._show_stage("")
+
+    def __call__(self, event: SessionEvent) -> None:
+        """Show an event."""
+        trainer = self._session.trainer
+        match event:
+            case FrameArrived() | FrameLeftOut() | Stepped():
+                share = trainer.scheduled_seconds / trainer.config.seconds
+                self._show_stage("training").update(share, self._training_text())
+            case Evaluated(wall_seconds=seconds) if (point := self._session.curve[-1]).psnr:
+                score = format_psnr(point.psnr, point.verdict, provisional=True)
+                self._console.info(f"{seconds:6.1f} s   {score}")
+            case Progressed(stage=stage, share=share):
+                self._show_stage(stage).set_share(share)
+            case PackageWritten() | Scored() | Ended():
+                self._show_stage("")  # other readers have the line now
+            case Noted(message=message):
+                self._console.note(message)
+            case Warned(message=message):
+                self._console.warning(message)
+
+    def _show_stage(self, stage: str) -> ProgressBar:
+        """Return the bar of a stage, which replaces that of another one."""
+        if stage != self._stage or self._bar is None:
+            if self._bar is not None:
+                self._bar.stop()
+            self._stage, self._bar = stage, self._console.progress(stage, 1.0)
+            if stage:
+                self._bar.start()
+        return self._bar
+
+    def _training_text(self) -> str:
+        """Return time, quality and coverage; terminals cut off the end of a long line."""
+        session, trainer = self._session, self._session.trainer
+        elapsed_s, budget_s = trainer.wall_seconds, trainer.config.seconds
+        if trainer.config.steps:
+            position = f"step {trainer.steps} of {trainer.config.steps}, {elapsed_s:.0f} s"
+        elif elapsed_s <= budget_s:
+            position = f"{elapsed_s:.0f} of {budget_s:g} s"
+        else:
+            position = f"{elapsed_s:.0f} s: the first pass over the video goes on"
+        parts = [position]
+        if session.curve and (last := session.curve[-1]).psnr is not None:
+            score = format_psnr(last.psnr, last.verdict, digits=1, provisional=True)
+            parts.append(f"held-out PSNR {score}")
+        parts += [
+            f"{format_percent(session.coverage.seen_share)} seen", f"{trainer.frames_seen} frames"
+        ]  # fmt: skip
+        if session.meter.is_paced:
+            parts.append(f"{1000.0 * session.meter.current_latency_s:.0f} ms behind")
+        return " · ".join(parts)

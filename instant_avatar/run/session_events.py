@@ -1,0 +1,64 @@
+"""Events of a session: all that console, viewer, report, batch and other readers learn of a run.
+
+for event in session.run():
+    match event:
+        case Stepped(step=step): ...
+        case PackageWritten(result=result): ...
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from avatar.events import TrainEvent
+from instant_avatar.run.final_scoring import TrainingResult
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progressed:
+    """A stage before or after training has come to `share`, from 0 to 1."""
+
+    stage: str
+    share: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Noted:
+    """A message that asks for nothing."""
+
+    message: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckpointSaved:
+    """A checkpoint is on the disk, from which training can continue after `step` steps."""
+
+    step: int
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PackageWritten:
+    """The package can be played; `is_final` once it is fine-tuned."""
+
+    path: Path
+    result: TrainingResult
+    is_final: bool
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Scored:
+    """The held-out frames have been scored, all or as many as the user has waited for."""
+
+    result: TrainingResult
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Ended:
+    """Nothing more will be written; the last event."""
+
+    result: TrainingResult
+
+
+SessionEvent = TrainEvent | Progressed | Noted | CheckpointSaved | PackageWritten | Scored | Ended
+EventReader = Callable[[SessionEvent], object]
+"""Reads every event of a session, on the thread that trains: what it takes is not trained."""

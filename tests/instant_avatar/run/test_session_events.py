@@ -1,0 +1,144 @@
+"""A run as a stream of events: their order, readers of them, and Ctrl-C after the package."""
+
+import json
+import signal
+import threading
+from collections import Counter
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+
+from avatar.evaluation.coverage import Coverage
+from avatar.events import FrameArrived, FrameLeftOut, Stepped
+from avatar.training.frame_stream import separate_held_out
+from avatar.training.trainer import Trainer
+from export.build import ExportReport
+from instant_avatar import train
+from instant_avatar.run import snapshot_writer
+from instant_avatar.run.run_folder import RunFolder
+from instant_avatar.run.session_events import Ended, PackageWritten, Scored, SessionEvent
+from instant_avatar.run.training_session import TrainingSession
+from preprocess.capture_session import CaptureInputs
+from preprocess.observation import DroppedFrame
+from preprocess.open_capture import open_capture
+
+
+class EventLog:
+    """A face of its own: writes every step and frame as a line of JSON."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __call__(self, event: SessionEvent) -> None:
+        match event:
+            case Stepped() | FrameArrived() | FrameLeftOut():
+                content = asdict(event)
+            case PackageWritten(path=path, is_final=is_final):
+                content = {"path": path.name, "is_final": is_final}
+            case _:
+                content = {}
+        with self.path.open("a", encoding="utf-8") as log:
+            log.write(json.dumps({"event": type(event).__name__, **content}) + "\n")
+
+
+@pytest.fixture
+def learn(capture, call_ingest, without_baking, tmp_path):
+    """Learns for a few steps with readers; call_ingest makes that fast."""
+
+    def learn(*readers, **options):
+        return train(
+            capture, tmp_path / "run", frames="0:12", steps=10, quiet=True, readers=readers,
+            **options,
+        )  # fmt: skip
+
+    return learn
+
+
+def test_a_reader_of_a_few_lines_learns_all_about_a_run(learn, tmp_path):
+    learn(EventLog(tmp_path / "events.jsonl"))
+    events = [json.loads(line) for line in (tmp_path / "events.jsonl").read_text().splitlines()]
+    counts = Counter(event["event"] for event in events)
+    assert counts["Stepped"] == 10
+    assert counts["FrameArrived"] == 12
+    names = [event["event"] for event in events]
+    ends = ["Finished", "PackageWritten", "Scored", "Ended"]
+    assert [name for name in names if name in ends] == ends
+    (package,) = (event for event in events if event["event"] == "PackageWritten")
+    assert package["path"] == "avatar.iavatar"
+
+
+def test_package_and_page_are_there_before_scores_are_made(learn, tmp_path):
+    pages = {}
+
+    def read(event):
+        page = tmp_path / "run" / "report.html"
+        if isinstance(event, PackageWritten | Scored | Ended):
+            pages[type(event).__name__] = page.read_text() if page.exists() else ""
+
+    avatar = learn(read)
+    assert "ia-play" in pages["PackageWritten"]
+    assert "scores are being made" in pages["PackageWritten"]
+    assert "not learnt from" not in pages["PackageWritten"]  # no frame is scored yet
+    assert "not learnt from" in pages["Ended"]
+    assert avatar.report["held_out"]["psnr"] is not None
+
+
+def write_twice(avatar, path, *, progress, **options):
+    """Writes a package, and then one that is fine-tuned, as `export_in_stages` does."""
+    for number, psnr in enumerate((None, (1.0, 2.0))):
+        if number:
+            try:
+                progress(0.5)
+            except KeyboardInterrupt:
+                return
+        path.write_bytes(b"a" * (number + 1))
+        yield ExportReport(
+            path=path, bytes=number + 1, seconds=0.0, psnr_to_renderer={"hq": 40.0},
+            largest_difference=0.0, fine_tuning_psnr=psnr, warnings=(),
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("when", [None, "first", "final"])
+def test_ctrl_c_after_the_package_leaves_out_the_rest_and_keeps_everything(
+    learn, tmp_path, monkeypatch, when
+):
+    monkeypatch.setattr(snapshot_writer, "export_in_stages", write_twice)
+
+    def read(event):
+        if isinstance(event, PackageWritten) and when == ("final" if event.is_final else "first"):
+            signal.raise_signal(signal.SIGINT)
+
+    if when is None:
+        learn(read)
+    else:
+        with pytest.raises(KeyboardInterrupt):
+            learn(read)
+    out = tmp_path / "run"
+    report = json.loads((out / "report.json").read_text())
+    assert (report["verdict"] is None) is (when is not None)
+    size = {None: 8, "first": 1, "final": 2}[when]  # scores would be stored in 8 bytes
+    assert report["package"]["bytes"] == size
+    assert "ia-play" in (out / "report.html").read_text()
+    assert (out / "checkpoint" / "frames.tensors").exists()
+    assert (out / "checkpoint" / "state.pt").exists()
+
+
+def test_the_newest_frame_is_shown_and_coverage_counts_those_that_are_learnt(film, tmp_path):
+    capture = open_capture(CaptureInputs(video=film))
+    session = TrainingSession(
+        Trainer.__new__(Trainer), capture, RunFolder(path=tmp_path / "run"), threading.Event(), {}
+    )
+    observations = list(capture.observations())
+    stream = [*observations[:4], DroppedFrame(index=4, reason="lost"), *observations[5:24]]
+    newest = [
+        session.newest_observation.frame.index
+        for item in session._watch(separate_held_out(iter(stream), stride=10, total=24))
+        if not isinstance(item, DroppedFrame)
+    ]
+    assert newest == [index for index in range(24) if index != 4]
+    alone = Coverage(capture.shaped)
+    for item in stream:
+        if not isinstance(item, DroppedFrame) and item.frame.index not in (9, 19):
+            alone.add(item)
+    assert np.array_equal(session.coverage.cosines, alone.cosines)
