@@ -141,7 +141,7 @@ def _evaluate_subject(
     )
     frames = capture_frames(inputs, run.body_file, arguments.size or subject.size_px)
     yield session.evaluate_run(
-        subject.name, run, frames, backgrounds=tuple(BACKGROUNDS), paper=subject.paper or None
+        subject.name, run, frames, backgrounds=tuple(BACKGROUNDS), paper=subject.paper
     )
 
 

@@ -30,8 +30,8 @@ class EvaluateArguments:
     training frames for --seconds and scored on its test frames, on white and black, next to the
     paper's scores (docs/evaluation.md). Subjects that were trained before are not trained again.
 
-    Images are compared on white, in the capture's poses ("given") and in poses fitted to each frame
-    with the avatar frozen ("fitted", as in the paper).
+    Images are compared on white, in the capture's poses ("given" in a file, or "tracked") and in
+    poses fitted to each frame with the avatar frozen ("fitted", as in the paper).
 
     LPIPS needs the extra [lpips] and torchvision's weights of AlexNet and VGG-16, which are not
     downloaded here; without them the table says n/a.

@@ -6,13 +6,18 @@ from importlib.metadata import version
 from avatar.evaluation.perceptual import Lpips
 from instant_avatar.cli.hardware import Hardware
 from instant_avatar.evaluation.frame_scoring import LARGEST_SHOWN_ERROR, choose_shown
-from instant_avatar.evaluation.score_table import AvatarEvaluation, table_cells
+from instant_avatar.evaluation.score_table import (
+    AvatarEvaluation,
+    compare_avatars,
+    table_cells,
+)
 from instant_avatar.report.page_rendering import render_template
 from instant_avatar.report.report_figures import curve_svg
 from instant_avatar.report.report_schema import CurvePoint
 
 POSES = {
-    "given": "given (of the capture, as fitted before training)",
+    "given": "given (in a file, fitted before training)",
+    "tracked": "tracked (by ia-ingest in the video, fitted before training)",
     "fitted": "fitted (to each scored frame, with its exposure; the avatar is frozen)",
 }
 """Kinds of poses, for the reader of the page."""
@@ -49,6 +54,7 @@ def evaluation_page(evaluations: Sequence[AvatarEvaluation], conditions: dict[st
         title=f"Evaluation of {', '.join(each.name for each in evaluations)}",
         conditions=conditions,
         table=table_cells(evaluations),
+        comparison=compare_avatars(evaluations),
         evaluations=[
             {
                 "name": each.name,

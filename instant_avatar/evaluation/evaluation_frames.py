@@ -23,10 +23,15 @@ PATH_ARGUMENTS = ("video", "poses", "masks", "body", "out", "json")
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class EvaluationFrames:
-    """Frames of a capture: those numbered in `frame_indices`, or all if it is None."""
+    """Frames of a capture: those numbered in `frame_indices`, or all if it is None.
+
+    Attributes:
+        poses: "tracked" by ia-ingest, or "given".
+    """
 
     recording: Capture
     frame_indices: frozenset[int] | None = None
+    poses: str = "given"
 
     @property
     def count(self) -> int | None:
@@ -88,7 +93,9 @@ def held_out_frames(run: RunFolder, size_px: int | None) -> EvaluationFrames:
             f"{run.path} has no held-out frames. Pass another capture of the same person with --on."
         )
     return EvaluationFrames(
-        recording=replace(recording, size_px=size_px or own_px), frame_indices=frozenset(numbers)
+        recording=replace(recording, size_px=size_px or own_px),
+        frame_indices=frozenset(numbers),
+        poses="tracked" if given.poses == run.tracked_poses else "given",
     )
 
 

@@ -68,7 +68,8 @@ class EvaluationSession:
     ) -> AvatarEvaluation:
         """Score renderer and player of a run.
 
-        `backgrounds` apply if the user names none; `paper` holds a paper's scores of this subject.
+        `backgrounds` apply if the user names none; `paper` holds the published scores of a
+        dataset's subject, which may be none; None for the runs of a user.
         """
         with self.console.status(f"loading {run.checkpoint}"):
             trainer = checkpoint.load(run.checkpoint)[0]
@@ -101,6 +102,7 @@ class EvaluationSession:
             trainer if self.arguments.fitted else None,
             self.arguments.background or backgrounds,
             self.lpips,
+            poses=frames.poses,
             keeps_pictures=self.arguments.card is not None,
         )
         with self.console.progress(f"scoring {name}", float(frames.count or 0)) as bar:
@@ -131,7 +133,7 @@ class EvaluationSession:
     def _renderers(
         self, frames: EvaluationFrames, trainer: Trainer | None, package: Path | None
     ) -> dict[str, FrameRenderer]:
-        """Return what draws given poses, by name: the volume renderer, and a player per tier."""
+        """Return what draws the capture's poses, by name: volume renderer and player's tiers."""
         renderers: dict[str, FrameRenderer] = {}
         if trainer is not None:
             renderers[VOLUME_RENDERER] = partial(_render_volume, trainer)
@@ -176,18 +178,21 @@ class FrameScorer:
         backgrounds: tuple[str, ...],
         lpips: Lpips | None = None,
         *,
+        poses: str = "given",
         keeps_pictures: bool = False,
     ) -> None:
         """Prepare the rows of the table.
 
         Args:
-            renderers: What draws given poses, by name.
+            renderers: What draws the capture's poses, by name.
             fitted: Holds the avatar to which poses are fitted; None not to fit any.
             backgrounds: Names of `BACKGROUNDS`.
+            poses: Where the capture's poses come from: "tracked" or "given".
             keeps_pictures: Whether `shown` is filled.
         """
         self._renderers, self._trainer, self._lpips = renderers, fitted, lpips
-        ways = [(name, "given") for name in renderers]
+        self._poses = poses
+        ways = [(name, poses) for name in renderers]
         if fitted is not None:
             ways.insert(1, (VOLUME_RENDERER, "fitted"))
         self._rows = {
@@ -207,10 +212,10 @@ class FrameScorer:
         return self._trainer is not None
 
     def score_frame(self, observation: Observation) -> None:
-        """Score all renderers in a frame's given pose."""
+        """Score all renderers in a frame's own pose."""
         self.size_px = observation.camera.size_px
         for name, draw in self._renderers.items():
-            self._score((name, "given"), observation, draw)
+            self._score((name, self._poses), observation, draw)
 
     def score_fitted(self, observations: Sequence[Observation]) -> None:
         """Score the volume renderer in poses and exposures that are fitted to frames."""

@@ -6,6 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
 from avatar.evaluation.image_metrics import SharpnessVerdict, overall_verdict
 from avatar.evaluation.perceptual import LPIPS_CONVENTIONS
 from instant_avatar.evaluation.frame_scoring import METRICS, FrameScore, ShownFrame
@@ -18,7 +21,7 @@ class ScoreRow:
 
     Attributes:
         renderer: "renderer", "player hq" or "player lite".
-        poses: "given" or "fitted".
+        poses: "given" or "tracked", and fitted before training; or "fitted" to each frame.
         background: "white" or "black".
     """
 
@@ -31,6 +34,17 @@ class ScoreRow:
     def way(self) -> tuple[str, str, str]:
         """Renderer, poses and background."""
         return self.renderer, self.poses, self.background
+
+    @property
+    def kind(self) -> tuple[str, bool, str]:
+        """Renderer, whether poses are fitted to each frame, and background."""
+        return self.renderer, self.poses == "fitted", self.background
+
+    @property
+    def mask_psnr(self) -> dict[int, float]:
+        """PSNR in the mask by frame, as far as it is finite."""
+        values = {score.frame: score.psnr_mask for score in self.scores}
+        return {frame: value for frame, value in values.items() if math.isfinite(value)}
 
     def mean_of(self, name: str) -> float | None:
         """Return the mean of one of `METRICS` over the frames; None without finite values."""
@@ -59,7 +73,8 @@ class AvatarEvaluation:
 
     Attributes:
         size: Width and height of the images; None without any.
-        paper: Scores in the paper, if the subject is in it.
+        paper: Scores in the paper of a dataset's subject, empty if it is not in it; None for other
+            runs.
         dances: Animations of novel poses as data URIs, by name.
     """
 
@@ -79,7 +94,7 @@ class AvatarEvaluation:
             "capture": self.capture,
             "size": self.size,
             "rows": [row.as_json() for row in self.rows],
-            "paper": self.paper,
+            "paper": self.paper or None,
         }
 
 
@@ -107,7 +122,7 @@ NOT_MEASURED = "n/a"
 
 
 def table_cells(evaluations: Sequence[AvatarEvaluation]) -> list[list[str]]:
-    """Return the header, all rows of all avatars, and their means over several avatars."""
+    """Return the header, all rows of all avatars, and the means over the subjects of a dataset."""
     rows = [row for each in evaluations for row in each.rows]
     lpips = {
         f"lpips_{name}": (convention.label, ".4f")
@@ -131,10 +146,11 @@ def table_cells(evaluations: Sequence[AvatarEvaluation]) -> list[list[str]]:
         for row in each.rows:
             add(each.name, str(len(row.scores)), row.way, means_of(row))
             lines[-1].append(row.verdict or "")
-        if each.paper is not None:
+        if each.paper:
             add(each.name, "", (PAPER_ROW_NAME, "fitted", "white"), each.paper)
             lines[-1].append("")
-    for first in evaluations[0].rows if len(evaluations) > 1 else ():
+    is_dataset = len(evaluations) > 1 and all(each.paper is not None for each in evaluations)
+    for first in evaluations[0].rows if is_dataset else ():
         alike = [row for row in rows if row.way == first.way]
         if len(alike) == len(evaluations):  # all avatars have such a row
             means = [means_of(row) for row in alike]
@@ -148,7 +164,7 @@ def table_cells(evaluations: Sequence[AvatarEvaluation]) -> list[list[str]]:
 
 
 def markdown_table(evaluations: Sequence[AvatarEvaluation]) -> str:
-    """Return `table_cells` as aligned Markdown."""
+    """Return `table_cells` as aligned Markdown, and `compare_avatars` below."""
     header, *lines = table_cells(evaluations)
     columns = list(zip(header, *lines, strict=True))
     widths = [max(3, *map(len, column)) for column in columns]
@@ -164,7 +180,50 @@ def markdown_table(evaluations: Sequence[AvatarEvaluation]) -> str:
         ]
         for line in (header, rule, *lines)
     ]
-    return "\n".join(f"| {' | '.join(line)} |" for line in padded) + "\n"
+    comparison = compare_avatars(evaluations)
+    below = [] if comparison is None else ["", comparison]
+    return "\n".join([*(f"| {' | '.join(line)} |" for line in padded), *below]) + "\n"
+
+
+def compare_avatars(evaluations: Sequence[AvatarEvaluation]) -> str | None:
+    """Say which avatar is better, by how much, and if that is more than chance.
+
+    Return None for subjects of a dataset, who differ, and for avatars without scores of one kind.
+    Frames that both have drawn are compared in pairs.
+    """
+    if len(evaluations) < 2 or any(each.paper is not None for each in evaluations):
+        return None
+    scored = [{row.kind: row for row in each.rows if row.mask_psnr} for each in evaluations]
+    kinds = [kind for kind in scored[0] if all(kind in each for each in scored)]
+    if not kinds:
+        return None
+    kind = min(kinds, key=lambda kind: not kind[1])  # poses fitted to each frame, if there are any
+    means = [float(np.mean([*each[kind].mask_psnr.values()])) for each in scored]
+    first, second = np.argsort(means)[::-1][:2]
+    rows, (best, other) = [each[kind] for each in scored], (evaluations[first], evaluations[second])
+    ours, theirs = rows[first].mask_psnr, rows[second].mask_psnr
+    shared = sorted(ours.keys() & theirs.keys()) if best.capture == other.capture else []
+    if len(shared) > 1:
+        gains = np.array([ours[frame] - theirs[frame] for frame in shared])
+        gain, error = float(gains.mean()), float(gains.std(ddof=1) / np.sqrt(len(gains)))
+        frames = f"on the same {len(shared)} frames"
+    else:
+        parts = [np.array([*each.values()]) for each in (ours, theirs)]
+        gain, error = means[first] - means[second], float(np.hypot(*map(_standard_error, parts)))
+        frames = "on frames of different captures or moments"
+    if gain < 0.0:
+        best, other, gain = other, best, -gain
+    how = f"{gain:.2f} dB in the mask ({rows[first].renderer}, {rows[first].poses} poses, {frames}"
+    if gain > 2.0 * error:
+        return f"{best.name} is better than {other.name} by {how}; standard error {error:.2f} dB)."
+    return (
+        f"No clear difference: {best.name} is above {other.name} by {how}; standard error "
+        f"{error:.2f} dB)."
+    )
+
+
+def _standard_error(values: Float[np.ndarray, "frames"]) -> float:
+    return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else math.inf
 
 
 def _format_cell(metric: str, value: float | None, form: str) -> str:

@@ -1,6 +1,7 @@
 """ia-evaluate: the same figures as the report's, and the paper's protocol."""
 
 import json
+import re
 import shutil
 
 import numpy as np
@@ -12,7 +13,8 @@ from instant_avatar import evaluate
 from instant_avatar.cli.command_line import INTERRUPTED
 from instant_avatar.evaluation import datasets
 from instant_avatar.evaluation.evaluation_session import FrameScorer
-from instant_avatar.evaluation.frame_scoring import SHOWN_FRAMES, score_picture
+from instant_avatar.evaluation.frame_scoring import SHOWN_FRAMES, FrameScore, score_picture
+from instant_avatar.evaluation.score_table import AvatarEvaluation, ScoreRow, markdown_table
 from preprocess.capture_session import CaptureInputs
 from preprocess.open_capture import open_capture
 from tests.instant_avatar.conftest import Outcome
@@ -245,3 +247,39 @@ def test_what_cannot_be_scored_is_refused_with_the_reason(
     assert ended.code == 2
     assert told in ended.complaint("ia-evaluate")
     assert ended.out == ""
+
+
+def evaluation(name, *, capture="video.mp4", poses="given", frames=range(8), gain=0.0, paper=None):
+    """Scores as of a run: 28 dB in the mask, changing from frame to frame, plus a gain."""
+    scores = [
+        FrameScore(
+            frame=frame, psnr=30.0, psnr_mask=28.0 + frame % 3 + gain, psnr_box=29.0, ssim=0.9,
+            cpu_ms=1.0,
+        )
+        for frame in frames
+    ]  # fmt: skip
+    rows = [ScoreRow(renderer="renderer", poses=each, scores=scores) for each in (poses, "fitted")]
+    return AvatarEvaluation(name=name, capture=capture, size=(64, 64), rows=rows, paper=paper)
+
+
+@pytest.mark.parametrize(
+    ("other", "said"),
+    [
+        ({"gain": 0.5}, "better is better than run by 0.50 dB .* on the same 8 frames"),
+        ({"gain": -0.5, "poses": "tracked"}, "run is better than better by 0.50 dB"),
+        ({"gain": 0.0}, "No clear difference"),
+        ({"gain": 0.2, "capture": "other.mp4"}, "No clear difference.* frames of different capt"),
+        ({"gain": 4.0, "capture": "other.mp4"}, "better is better than run by 4.00 dB"),
+    ],
+)
+def test_the_better_of_two_runs_is_named_and_no_mean_is_made(other, said):
+    table = markdown_table([evaluation("run"), evaluation("better", **other)])
+    assert re.search(said, table)
+    assert "| mean" not in table
+    assert f"| {other.get('poses', 'given')} " in table
+
+
+def test_subjects_of_a_dataset_have_a_mean_and_are_not_compared():
+    table = markdown_table([evaluation("one", paper={}), evaluation("two", paper={}, gain=1.0)])
+    assert "| mean" in table
+    assert "better" not in table

@@ -72,6 +72,7 @@ def test_a_video_alone_is_tracked_and_learnt(ingest_video, monkeypatch):
     assert again.code == 0, again.err
     frames = held_out_frames(RunFolder(path=out), None)
     assert frames.recording.paths.poses == out / "tracking" / "poses.npz"
+    assert frames.poses == "tracked"
 
 
 class CountingTracker(BlazePoseTracker):
