@@ -149,12 +149,13 @@ def measure_film(capture: Path) -> tuple[str, bool | None]:
         return f"refused: {str(refusal).split(';')[0]}", None
     errors = CameraErrors.of(recording.cameras.cameras, truth(capture, recording).cameras)
     costs = solved.costs
-    assert recording.camera_report is not None
-    frames = recording.camera_report["frames"]
+    report = recording.figures("cameras")
+    assert report is not None
+    frames = report["frames"]
     return (
         f"{errors}; {solved.keyframe_count} key frames + {frames['placed']}; "
         f"{costs['cpu_seconds']:.0f} core-s, {costs['peak_memory_mb']:.0f} MB; "
-        f"by {recording.camera_report['scale']['cues']}",
+        f"by {report['scale']['cues']}",
         errors.good,
     )
 

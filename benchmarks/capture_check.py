@@ -19,6 +19,7 @@ from benchmarks.hardware import Hardware
 from instant_avatar.capture_validation import check_capture
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.capture_session import CaptureInputs
+from preprocess.open_capture import read_capture
 
 CAPTURES = {
     "turn": ShootConfig(frames=120, size=256),
@@ -109,7 +110,7 @@ def shoot_captures(folder: Path) -> Path:
 def check_case(case: CorruptedCapture, folder: Path) -> tuple[bool, bool, float, str]:
     """Whether the first cause is right, whether all are, core seconds, and a line of text."""
     began, core = time.perf_counter(), time.process_time()
-    examined = check_capture(CaptureInputs(video=folder))
+    examined = check_capture(read_capture(CaptureInputs(video=folder)))
     seconds, wall = time.process_time() - core, time.perf_counter() - began
     named = examined.causes
     right = named[:1] == () if not case.causes - {""} else bool(set(named[:1]) & case.causes)

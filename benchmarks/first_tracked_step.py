@@ -17,6 +17,7 @@ from avatar.events import Stepped
 from instant_avatar.cli.command_line import parse_arguments
 from instant_avatar.cli.console import Console
 from instant_avatar.run.ingest_arguments import IngestArguments
+from instant_avatar.run.run_capture import open_observations
 from instant_avatar.run.session_start import prepare_trainer, set_threads
 from instant_avatar.run.training_session import TrainingSession
 
@@ -26,10 +27,10 @@ def time_first_step(arguments: IngestArguments) -> tuple[float, float]:
     run, console = arguments.run_folder(), Console()
     set_threads(arguments.threads)
     began_cpu_s = time.process_time()
-    capture = arguments.open_capture()
-    start = prepare_trainer(arguments, capture, run, console)
+    observations, _ = open_observations(arguments, arguments.capture_inputs(), run, console)
+    start = prepare_trainer(arguments, observations.capture, run, console)
     run.start_run(resume=False)
-    session = TrainingSession(start.trainer, capture, run, threading.Event(), start.notes)
+    session = TrainingSession(start.trainer, observations, run, threading.Event(), start.notes)
     with closing(session.run()) as events:
         next(event for event in events if isinstance(event, Stepped))
         wall_s = time.perf_counter() - (session.meter.first_frame_at or float("nan"))

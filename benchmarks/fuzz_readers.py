@@ -102,7 +102,7 @@ def readers(seeds: Path) -> dict[str, Callable[[Path], object]]:
     from preprocess.capture_session import CaptureInputs
     from preprocess.file_content import read_untrusted_file
     from preprocess.masks.mask_files import open_masks, read_mask
-    from preprocess.open_capture import open_capture
+    from preprocess.open_capture import open_capture, read_capture
     from preprocess.poses.pose_format_registry import read_poses
 
     embedded, film = load_body_model(), open_source(seeds / "captures" / "film")
@@ -118,7 +118,7 @@ def readers(seeds: Path) -> dict[str, Callable[[Path], object]]:
 
     def captures(path: Path) -> object:
         if len(path.read_bytes() if path.is_file() else path.name) % 7 == 0:
-            check_capture(CaptureInputs(video=path))
+            check_capture(read_capture(CaptureInputs(video=path)))
         recording = open_capture(CaptureInputs(video=path))
         return list(recording.observations())
 

@@ -89,6 +89,7 @@ def main() -> None:
     from instant_avatar.run.session_events import PackageWritten
     from instant_avatar.run.session_start import new_trainer
     from instant_avatar.run.training_session import TrainingSession
+    from preprocess.observation_source import RecordedObservations
 
     capture, run = Path(sys.argv[1]), RunFolder(path=Path(sys.argv[2]))
     recording = open_sample(capture)
@@ -102,7 +103,7 @@ def main() -> None:
         at[lesson.meter.frames_read] = resident_bytes()
 
     trainer.add_frame = counted
-    lesson = TrainingSession(trainer, recording, run, threading.Event(), {})
+    lesson = TrainingSession(trainer, RecordedObservations(recording), run, threading.Event(), {})
     with closing(lesson.run()) as events:
         next(event for event in events if isinstance(event, PackageWritten))
     shutil.rmtree(run.path, ignore_errors=True)

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from torch import Tensor
@@ -20,6 +20,7 @@ from benchmarks.sample_training import load_trainer, open_sample, training_confi
 from benchmarks.stopwatch import limit_threads
 from benchmarks.training_quality import mean_psnr
 from capture.inbox import Inbox
+from capture.source import PacingClock, RealtimePlayback
 from preprocess.capture_session import Capture
 from preprocess.observation import DroppedFrame
 
@@ -103,7 +104,9 @@ def measure_streaming_quality(capture: Path) -> Iterator[Measurement]:
     limit_threads(Hardware.here().cores)
     trainer = Trainer(rig, config)
     warm_up(trainer)
-    copies, held = train_with_copies(trainer, recording.in_real_time())
+    copies, held = train_with_copies(
+        trainer, replace(recording, source=RealtimePlayback(recording.source, PacingClock()))
+    )
     streamed = mean_psnr(trainer.avatar, held)
     yield _first_usable(trainer.avatar, recording, rig, copies, config.held_out_stride)
     yield _forgetting(trainer.avatar, recording, rig, copies, config.held_out_stride)

@@ -58,7 +58,10 @@ def measure_costs(video: Path, frames: slice | None = None) -> dict[str, float]:
     with TemporaryDirectory() as folder:
         tracked = track_video(source, networks, masks, Path(folder))
         fit = CpuTimed(fit_tracked_video)
-        fit(source, tracked, CaptureInputs(video=video, frames=frames), Path(folder))
+        inputs = CaptureInputs(
+            video=video, frames=frames, poses=Path(folder) / "poses.npz", masks=Path(folder)
+        )
+        fit(source, tracked, inputs)
     count = len(tracked.frame_times_s)
     parts = {"networks": networks, "masks": masks, "fit": fit}
     each = {name: 1000.0 * part.cpu_s / count for name, part in parts.items()}

@@ -17,7 +17,6 @@ from preprocess.alignment.silhouette_objective import spaced_indices
 from preprocess.body.body_surface import MeshSilhouette, soft_iou
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.masks.mask_files import open_masks
-from preprocess.observation import associate_masks
 from preprocess.open_capture import open_capture
 
 SIDES = ((1, 2), (16, 17))
@@ -138,16 +137,14 @@ def body_iou(recording: Capture) -> float:
     product's grades compare small silhouettes of skin points with soft masks, quickly: there a body
     scores 0.90 against its own masks, here 0.99.)
     """
-    source, motion, masks = recording.source, recording.motion, recording.masks
+    source, motion, body = recording.source, recording.motion, MeshSilhouette(recording.shaped)
     assert motion.frames is not None
-    assert masks is not None
-    row_of, body = associate_masks(masks, source), MeshSilhouette(recording.shaped)
     poses = {int(motion.frames[row]): int(row) for row in np.flatnonzero(motion.valid)}
     ious = []
     for place in spaced_indices(source.frame_count or 0, COMPARED_FRAMES):
         number = source.selection.start + source.selection.step * place
         try:
-            mask = masks.alpha(row_of(number), source.size_px) > 0.5
+            mask = recording.masks.read(number, source.size_px) > 0.5
         except InputError:  # a frame that was not looked at
             continue
         ious.append(0.0)

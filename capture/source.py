@@ -107,8 +107,8 @@ class FrameSource(Protocol):
         frame_count: Number of selected frames; fewer may come, see `warnings`. None for a live
             source.
         duration_s: Duration of the selected frames, as the container claims; None if unknown.
-        has_alpha: Whether the frames' own alpha channel is their mask: it cuts the person out of
-            one of the sampled images, and no segmenter was named instead.
+        has_alpha: Whether the frames' own alpha channel cuts the person out of one of the sampled
+            images.
         quarter_turns: Counter-clockwise quarter turns that make stored images upright.
         rotate: Degrees by which the user had frames turned clockwise, after `quarter_turns`.
         is_hdr: Whether frames are tone mapped from HDR.
@@ -176,10 +176,11 @@ class Recording:
             self.warnings.append(message)
 
 
-class _WrappedSource:
-    """A source whose size or times are changed; all else is the source's own."""
+class WrappedSource:
+    """A source of which something is changed; all else is the source's own."""
 
     def __init__(self, source: FrameSource) -> None:
+        """Wrap a source; nothing is read yet."""
         self._source = source
         self.path = source.path
         self.size_px = source.size_px
@@ -195,29 +196,29 @@ class _WrappedSource:
 
     @property
     def waited_s(self) -> float:
-        """The recording's own."""
+        """The source's own."""
         return self._source.waited_s
 
     @property
     def dropped(self) -> int:
-        """The recording's own."""
+        """The source's own."""
         return self._source.dropped
 
     def frames(self) -> Iterator[Frame]:
-        """The recording's frames."""
+        """The source's frames."""
         return self._source.frames()
 
     def count_frames(self) -> int:
-        """The recording's true number of frames, found by decoding."""
+        """The source's true number of frames, found by decoding."""
         return self._source.count_frames()
 
     def close(self) -> None:
-        """Close the recording."""
+        """Close the source."""
         self._source.close()
 
 
 @final
-class RotatedSource(_WrappedSource):
+class RotatedSource(WrappedSource):
     """A source whose frames are turned clockwise by 90, 180 or 270 degrees."""
 
     def __init__(self, source: FrameSource, degrees: int) -> None:
@@ -238,7 +239,7 @@ class RotatedSource(_WrappedSource):
 
 
 @final
-class TransposedSource(_WrappedSource):
+class TransposedSource(WrappedSource):
     """A recording that reports its width as its height and its height as its width.
 
     With it masks and cameras of upright images can be opened for a video that was rotated by a
@@ -293,24 +294,19 @@ class PacingClock:
 
 
 @final
-class RealtimePlayback(_WrappedSource):
+class RealtimePlayback(WrappedSource):
     """A source whose frames are handed over no earlier than their timestamps say.
 
     The first frame is at 0; the intervals between frames are the container's, whatever its rate.
     Nothing is lost: where frames are not taken in time, the playback falls behind and catches up as
-    soon as it can.
-
-    Attributes:
-        catch_up: Whether frames come as fast as they are taken, as those do that an interrupted run
-            has seen before. Where it ends, the video plays on from there at its own speed.
+    soon as it can. While `catch_up` is set, frames come as fast as they are taken; where it ends,
+    the video plays on from there at its own speed.
     """
 
     def __init__(self, source: FrameSource, pace: PacingClock) -> None:
         """Wrap a recording; stopping the clock ends the playback, also in the middle of a wait."""
         super().__init__(source)
-        self.paced = True
-        self._pace = pace
-        self.catch_up = False
+        self._pace, self.paced, self.catch_up = pace, True, False
 
     @property
     def waited_s(self) -> float:

@@ -1,15 +1,9 @@
 """Validation of a capture, for ia-check, and in part before a run starts: IoU, mistakes, advice."""
 
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
-import numpy as np
-from jaxtyping import Float32
-
-from capture.camera import same_aspect_ratio
 from capture.input_error import InputError, quote_command
-from capture.live_sources import camera_address
 from instant_avatar.cli.console import Console
 from instant_avatar.cli.shared_options import (
     capture_name,
@@ -42,8 +36,9 @@ from preprocess.alignment.silhouette_objective import (
 from preprocess.body.body_surface import SkinPoints
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.masks.mask_files import Masks
-from preprocess.observation import associate_cameras, associate_masks
-from preprocess.open_capture import open_capture
+from preprocess.masks.mask_sources import StoredMasks
+from preprocess.observation import associate_cameras
+from preprocess.open_capture import ImportedCapture, align_capture
 from preprocess.poses.plausibility import implausibility_reason
 
 QUICK_FRAMES = 8
@@ -71,7 +66,7 @@ class CaptureValidation:
     """Outcome of validating a capture.
 
     Attributes:
-        hypothesis: Its poses and cameras as stored.
+        geometry: Its poses and cameras as stored.
         images: Images in which the person was tracked.
         objective: Masks of some frames and key points of some images.
         refusal: Why ia-ingest would refuse the capture; None if it would not.
@@ -79,8 +74,8 @@ class CaptureValidation:
         mask_iou: Mean IoU of body and masks as ia-ingest would read them; None without masks.
     """
 
-    recording: Capture
-    hypothesis: CaptureGeometry
+    capture: Capture
+    geometry: CaptureGeometry
     images: tuple[TrackedImage, ...]
     objective: CaptureObjective
     diagnosis: CorrectionResult
@@ -99,7 +94,7 @@ class CaptureValidation:
         if self.refusal is not None or (self.mask_iou is not None and self.mask_iou < USABLE_IOU):
             return "unusable"
         if self.mask_iou is None:
-            well = (self.keypoint_score(self.hypothesis) or 0.0) >= GOOD_KEYPOINT_SCORE
+            well = (self.keypoint_score(self.geometry) or 0.0) >= GOOD_KEYPOINT_SCORE
         else:
             well = self.mask_iou >= GOOD_IOU
         explained = not self.causes or self.is_auto_corrected
@@ -118,7 +113,7 @@ class CaptureValidation:
         masks = self.objective.masks
         if masks is None or masks.are_boxes:
             return NO_KNOWN_MISTAKE
-        covered, areas = masks.excess(self.hypothesis)
+        covered, areas = masks.excess(self.geometry)
         if covered < MIN_COVERED or areas < MIN_EXCESS:
             return NO_KNOWN_MISTAKE
         return (
@@ -130,13 +125,13 @@ class CaptureValidation:
     @property
     def is_auto_corrected(self) -> bool:
         """True if ia-ingest corrects everything that is wrong automatically."""
-        masks = self.recording.masks
-        return self.causes == ("mask_polarity",) and masks is not None and masks.inverted
+        files = mask_files(self.capture)
+        return self.causes == ("mask_polarity",) and files is not None and files.inverted
 
     @property
     def agreement(self) -> str:
         """Sentences on how masks, key points and body agree as stored."""
-        score = self.keypoint_score(self.hypothesis)
+        score = self.keypoint_score(self.geometry)
         if self.objective.masks is None:
             return (
                 "There are no masks, and no person was found in the images."
@@ -156,7 +151,7 @@ class CaptureValidation:
         scores, of_video = [], [each.is_of_video for each in self.diagnosis.corrections]
         if self.objective.masks is not None and not all(of_video):
             scores.append(f"IoU after correction: {self.corrected_iou:.2f}")
-        now, after = map(self.keypoint_score, (self.hypothesis, self.diagnosis.corrected))
+        now, after = map(self.keypoint_score, (self.geometry, self.diagnosis.corrected))
         if now is not None and (any(of_video) or not scores):
             scores.append(f"Score of the tracked key points: {after:.2f} instead of {now:.2f}")
         return f"{'. '.join(scores)}."
@@ -164,7 +159,7 @@ class CaptureValidation:
     @property
     def stored_iou(self) -> float:
         """IoU of body and masks as stored; NaN without masks."""
-        return self._iou(self.hypothesis)
+        return self._iou(self.geometry)
 
     @property
     def corrected_iou(self) -> float:
@@ -181,130 +176,89 @@ class CaptureValidation:
         return None if keypoints is None else mean_score(keypoints.frame_scores(geometry))
 
 
-def check_capture(inputs: CaptureInputs) -> CaptureValidation:
-    """Open a capture, with its video rotated if that explains an error, and validate it."""
+def check_capture(imported: ImportedCapture) -> CaptureValidation:
+    """Align a capture, with its video rotated if that explains an error, and validate it."""
     try:
-        return check_opened_capture(*_open_inputs(inputs))
+        capture = align_capture(imported, skip_checks=True)
+        return check_aligned_capture(capture, imported.polarity_error or None)
     except InputError as error:
         with suppress(InputError):
-            rotated = open_capture(replace(inputs, transposed=True), skip_checks=True)
-            found = check_opened_capture(rotated, str(error))
+            rotated = align_capture(imported.transposed(), skip_checks=True)
+            found = check_aligned_capture(rotated, str(error))
             if any(each.is_of_video for each in found.diagnosis.corrections):
                 return found
         raise
 
 
-def check_opened_capture(
-    recording: Capture, polarity_error: str | None = None
-) -> CaptureValidation:
-    """Validate an opened capture; `polarity_error` says why the masks' polarity is unknown."""
-    hypothesis = _stored_hypothesis(recording)
-    source, masks = recording.source, recording.masks
-    refused = implausibility_reason(recording.motion) or polarity_error
+def check_aligned_capture(capture: Capture, refused: str | None = None) -> CaptureValidation:
+    """Validate an aligned capture; `refused` says why ia-ingest would not have opened it."""
+    geometry, source, files = _stored_geometry(capture), capture.source, mask_files(capture)
+    refused = implausibility_reason(capture.motion) or refused
     try:
-        recording.check()
+        capture.check()
     except InputError as error:
         refused = refused or str(error)
-    sampled = _sample_masks(recording) if masks is not None or source.has_alpha else None
+    sampled = _sample_masks(capture) if capture.masks.is_given else None
     images = track_images(source)
     objective = CaptureObjective(
-        masks=sampled, keypoints=KeypointObjective.of(images, recording.shaped)
+        masks=sampled, keypoints=KeypointObjective.of(images, capture.shaped)
     )
-    count = source.frame_count or len(recording.motion)
+    count = source.frame_count or len(capture.motion)
     chosen = source.selection
     frames = [chosen.start + chosen.step * number for number in range(count)]
     diagnosis = find_corrections(
-        hypothesis, objective, recording.shaped.joints[0],
-        frames=count, mask_count=0 if masks is None else masks.count,
+        geometry, objective, capture.shaped.joints[0],
+        frames=count, mask_count=0 if files is None else files.count,
     )  # fmt: skip
-    upright = replace(hypothesis, masks_inverted=False)
+    upright = replace(geometry, masks_inverted=False)
     return CaptureValidation(
-        recording=recording, hypothesis=hypothesis, images=images, objective=objective,
+        capture=capture, geometry=geometry, images=images, objective=objective,
         diagnosis=diagnosis, refusal=refused,
         mask_iou=None if sampled is None else mean_score(sampled.frame_scores(upright)),
         anomalies=(
-            *sanity_warnings(hypothesis, frames), *mask_warnings(sampled, source.size_px[1])
+            *sanity_warnings(geometry, frames), *mask_warnings(sampled, source.size_px[1])
         ),
     )  # fmt: skip
 
 
-def passes_quick_check(recording: Capture) -> bool:
+def passes_quick_check(capture: Capture) -> bool:
     """Check a few masks in a few hundredths of a second, also for poses a frame or two late."""
-    if recording.live is not None or not (recording.masks or recording.source.has_alpha):
+    if not capture.masks.is_given:
         return True  # nothing to compare with
     try:
-        masks = _sample_masks(recording, QUICK_FRAMES)
+        masks = _sample_masks(capture, QUICK_FRAMES)
     except InputError:  # these masks are empty; reading all of them reports that
         return True
-    hypothesis = replace(_stored_hypothesis(recording), masks_inverted=False)
-    now = mean_score(masks.frame_scores(hypothesis))
+    geometry = replace(_stored_geometry(capture), masks_inverted=False)
+    now = mean_score(masks.frame_scores(geometry))
     shifts = [
-        mean_score(masks.frame_scores(undo_pose_delay(offset).apply(hypothesis)))
+        mean_score(masks.frame_scores(undo_pose_delay(offset).apply(geometry)))
         for offset in QUICK_OFFSETS
     ]
     return now >= GOOD_IOU and now >= max(shifts) - QUICK_GAIN
 
 
-def mask_lookup(
-    recording: Capture, masks: Masks
-) -> Callable[[int, tuple[int, int]], Float32[np.ndarray, "height width"]]:
-    """Return a function from a frame number, also beyond the video's, and a size to the mask.
-
-    The function raises InputError where there is no such mask.
-    """
-    row_of = _mask_row_lookup(recording)
-
-    def alpha(number: int, size_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
-        row = row_of(number)
-        if not 0 <= row < masks.count:
-            raise InputError(f"There is no mask for frame {number} in {masks.path}.")
-        return masks.alpha(row, size_px)
-
-    return alpha
+def mask_files(capture: Capture) -> Masks | None:
+    """Return the masks of a file or a folder; None if they come from elsewhere."""
+    return capture.masks.files if isinstance(capture.masks, StoredMasks) else None
 
 
-def _mask_row_lookup(recording: Capture) -> Callable[[int], int]:
-    """Return a function from a frame number to its mask; in order if counts differ."""
-    masks = recording.masks
-    try:
-        return associate_masks(masks, recording.source)
-    except InputError:
-        if masks is None or not same_aspect_ratio(masks.size_px, recording.source.size_px):
-            raise
-        count, path = masks.count, masks.path
-
-    def in_order(index: int) -> int:
-        if index >= count:
-            raise InputError(f"There is no mask for frame {index} in {path}.")
-        return index
-
-    return in_order
-
-
-def _sample_masks(recording: Capture, count: int = SAMPLED_FRAMES) -> SilhouetteObjective:
-    mask_row = _mask_row_lookup(recording)
-    camera_row = associate_cameras(recording.cameras, recording.source)
+def _sample_masks(capture: Capture, count: int = SAMPLED_FRAMES) -> SilhouetteObjective:
+    masks = capture.masks
     return sample_masks(
-        recording.source, recording.masks, mask_row, camera_row, SkinPoints.of(recording.shaped),
-        count=count, excluded_frames=recording.cameras.frames_without_camera,
-    )  # fmt: skip
+        capture.source,
+        masks.in_order_at_worst() if isinstance(masks, StoredMasks) else masks,
+        associate_cameras(capture.cameras, capture.source),
+        SkinPoints.of(capture.shaped),
+        count=count,
+        excluded_frames=capture.cameras.frames_without_camera,
+    )
 
 
-def _stored_hypothesis(recording: Capture) -> CaptureGeometry:
+def _stored_geometry(capture: Capture) -> CaptureGeometry:
     """Return poses, cameras and mask polarity as stored in the files."""
-    hypothesis = CaptureGeometry.of(recording.motion, recording.cameras, recording.source)
-    turned = recording.masks is not None and recording.masks.inverted
-    return replace(hypothesis, masks_inverted=turned)
-
-
-def _open_inputs(inputs: CaptureInputs) -> tuple[Capture, str | None]:
-    """Open the capture; also return why the masks' polarity is unknown, if it is."""
-    try:
-        return open_capture(inputs, skip_checks=True), None
-    except InputError as error:
-        if inputs.invert_masks is not None:
-            raise
-        return open_capture(replace(inputs, invert_masks=False), skip_checks=True), str(error)
+    files = mask_files(capture)
+    return replace(capture.geometry(), masks_inverted=files is not None and files.inverted)
 
 
 def check_command(inputs: CaptureInputs, *, fix: bool = True) -> str:
@@ -324,7 +278,7 @@ def check_command(inputs: CaptureInputs, *, fix: bool = True) -> str:
 
 
 def preflight_check(
-    recording: Capture, inputs: CaptureInputs, console: Console, *, force: bool
+    capture: Capture, inputs: CaptureInputs, console: Console, *, force: bool
 ) -> None:
     """Check a few masks; diagnose the capture only if they and the poses disagree.
 
@@ -333,10 +287,10 @@ def preflight_check(
     Raises:
         InputError: If the capture is unusable; with `force` the user is only warned.
     """
-    if passes_quick_check(recording):
+    if passes_quick_check(capture):
         return
     with console.status("poses and masks disagree; diagnosing"):
-        found = check_opened_capture(recording)
+        found = check_aligned_capture(capture)
     causes, iou = set(found.causes) - {"mask_polarity"}, found.mask_iou or 0.0
     unusable = found.verdict == "unusable"
     if not (unusable or causes or iou < GOOD_IOU):
@@ -348,13 +302,13 @@ def preflight_check(
     console.warning(message)
 
 
-def correction_hint(inputs: CaptureInputs) -> str:
-    """Suggest a correction for a capture that could not be opened; empty if none is known."""
-    if inputs.live or camera_address(inputs.video) is not None:
-        return ""
+def correction_hint(imported: ImportedCapture) -> str:
+    """Suggest a correction for a capture that could not be aligned; empty if none is known."""
     with suppress(InputError):
-        found = check_capture(inputs)
-        return f"{_explain(found)} {_suggest_command(found, inputs)}" if found.causes else ""
+        found = check_capture(imported)
+        return (
+            f"{_explain(found)} {_suggest_command(found, imported.inputs)}" if found.causes else ""
+        )
     return ""
 
 

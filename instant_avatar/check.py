@@ -3,7 +3,7 @@
 import json
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,15 +26,11 @@ from instant_avatar.cli.shared_options import (
 )
 from instant_avatar.contact_sheet import write_contact_sheet
 from instant_avatar.corrected_capture import check_new_or_empty, write_corrected_capture
-from instant_avatar.run.person_tracking import (
-    grade_capture,
-    needs_tracking,
-    print_grade,
-    track_person,
-)
+from instant_avatar.run.person_tracking import grade_capture, print_grade, track_person
 from preprocess.alignment.correction_search import CorrectionCandidate
 from preprocess.alignment.silhouette_objective import GOOD_IOU, mean_score
-from preprocess.capture_session import CaptureInputs
+from preprocess.capture_session import CaptureInputs, InputKind
+from preprocess.open_capture import ImportedCapture, read_capture
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 """Formats of the contact sheet that --sheet names."""
@@ -118,18 +114,19 @@ def check(arguments: CheckArguments, console: Console) -> int:
     """Diagnose a capture, draw the contact sheet, and write a corrected copy for --fix."""
     inputs = arguments.capture_inputs()
     arguments.check_outputs()
-    if not needs_tracking(inputs):
-        return _check_inputs(arguments, inputs, console)
-    with TemporaryDirectory() as folder:
+    if inputs.kind is InputKind.POSED:
+        return _check(arguments, lambda: read_capture(inputs), console)
+    with TemporaryDirectory() as folder:  # of the tracked masks
         tracking = track_person(inputs, Path(folder) / "poses.npz", console)
-        return _check_inputs(arguments, tracking.inputs, console)
+        return _check(arguments, lambda: tracking.imported, console)
 
 
-def _check_inputs(arguments: CheckArguments, inputs: CaptureInputs, console: Console) -> int:
+def _check(arguments: CheckArguments, read: Callable[[], ImportedCapture], console: Console) -> int:
     try:
         with console.status("comparing poses, masks and cameras"):
-            check_result = check_capture(inputs)
-            grade = grade_capture(check_result.recording)
+            imported = read()
+            check_result = check_capture(imported)
+            grade = grade_capture(check_result.capture)
     except InputError as error:
         if arguments.json is not None:
             write_text_atomically(
@@ -154,7 +151,7 @@ def _check_inputs(arguments: CheckArguments, inputs: CaptureInputs, console: Con
         console.print_artifact("corrected", arguments.fix)
         return DONE if check_result.is_usable_after_fix else BAD_INPUT
     if check_result.causes and not check_result.is_auto_corrected:
-        console.info(f"To correct it:  {check_command(inputs)}")
+        console.info(f"To correct it:  {check_command(imported.inputs)}")
     good = grade is None or grade.is_good_enough
     return DONE if good and check_result.verdict != "unusable" else BAD_INPUT
 
@@ -168,7 +165,7 @@ def check_to_json(check_result: CaptureValidation) -> dict[str, Any]:
     """Convert a diagnosis to JSON; IoUs are null without masks, `film` without key points."""
     diagnosis, masks = check_result.diagnosis, check_result.objective.masks
     of_masks = 0 if masks is None else len(masks.samples)
-    now, after = map(check_result.keypoint_score, (check_result.hypothesis, diagnosis.corrected))
+    now, after = map(check_result.keypoint_score, (check_result.geometry, diagnosis.corrected))
 
     def tried(key: str, rows: slice, *, of_video: bool) -> list[dict[str, Any]]:
         def entry(guess: CorrectionCandidate) -> dict[str, Any]:
@@ -218,9 +215,9 @@ def unreadable_to_json(reason: str) -> dict[str, Any]:
 
 
 def _print_findings(check_result: CaptureValidation, console: Console) -> None:
-    for note in check_result.recording.notes:
+    for note in check_result.capture.notes:
         console.warning(note)
-    for sentence in (*check_result.recording.source.warnings, *check_result.anomalies):
+    for sentence in (*check_result.capture.source.warnings, *check_result.anomalies):
         console.warning(sentence)
     if check_result.refusal is not None:
         console.info(f"ia-ingest would refuse this capture: {check_result.refusal}")

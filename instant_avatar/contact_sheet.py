@@ -10,11 +10,12 @@ from jaxtyping import Float32, UInt8
 from capture.atomic_files import OutputFileList, atomic_file
 from capture.camera import same_aspect_ratio
 from capture.input_error import InputError
-from instant_avatar.capture_validation import CaptureValidation, mask_lookup
+from instant_avatar.capture_validation import CaptureValidation
 from preprocess.alignment.capture_geometry import FULL_WINDOW, CaptureGeometry
 from preprocess.alignment.keypoint_objective import TrackedImage
 from preprocess.alignment.silhouette_objective import components_touching, spaced_indices
 from preprocess.body.body_surface import MeshSilhouette, soft_iou
+from preprocess.masks.mask_sources import StoredMasks
 
 COLUMNS = 6
 """Frames per row."""
@@ -41,7 +42,7 @@ def write_contact_sheet(
     """
     if not check.images:
         return False
-    rows = [_draw_row(check, check.hypothesis, "as stored", check.stored_iou)]
+    rows = [_draw_row(check, check.geometry, "as stored", check.stored_iou)]
     if check.causes:
         corrected = check.diagnosis.corrected
         rows.append(_draw_row(check, corrected, "corrected", check.corrected_iou))
@@ -58,11 +59,11 @@ def write_contact_sheet(
 
 
 def _draw_row(check: CaptureValidation, geometry: CaptureGeometry, title: str, iou: float) -> Rgb:
-    body = MeshSilhouette(check.recording.shaped)
-    masks = check.recording.masks
-    mask_of = None if masks is None else mask_lookup(check.recording, masks)
+    body = MeshSilhouette(check.capture.shaped)
+    masks = check.capture.masks
+    mask_of = masks.in_order_at_worst().read if isinstance(masks, StoredMasks) else None
     chosen = [check.images[place] for place in spaced_indices(len(check.images), COLUMNS)]
-    seen = geometry.in_video_frames(check.recording.source.frames_in_file)
+    seen = geometry.in_video_frames(check.capture.source.frames_in_file)
     cells = [_draw_cell(image, geometry, seen, body, mask_of) for image in chosen]
     label = np.full((LABEL_PX, sum(c.shape[1] for c in cells), 3), PAPER_COLOR, np.uint8)
     score = "body outline (no masks)" if np.isnan(iou) else f"IoU {iou:.2f}"

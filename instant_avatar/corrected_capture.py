@@ -13,7 +13,7 @@ from capture.image_folder import list_images, write_png
 from capture.input_error import InputError
 from capture.source import FrameSource
 from capture.source_opening import reopen
-from instant_avatar.capture_validation import CaptureValidation, mask_lookup
+from instant_avatar.capture_validation import CaptureValidation
 from instant_avatar.cli.shared_options import check_writable
 from preprocess.alignment.capture_geometry import (
     FULL_WINDOW,
@@ -22,7 +22,7 @@ from preprocess.alignment.capture_geometry import (
     frame_step,
 )
 from preprocess.body.body_pose import Motion
-from preprocess.masks.mask_files import Masks
+from preprocess.masks.mask_sources import StoredMasks
 from preprocess.poses.pose_file import write_motion
 
 INTEGER_TOLERANCE = 1e-6
@@ -51,7 +51,7 @@ def write_corrected_capture(check: CaptureValidation, out: Path) -> None:
     if not check.causes:
         raise InputError("No correctable mistake was found; --fix wrote nothing.")
     check_new_or_empty(out)
-    source, corrected = check.recording.source, check.diagnosis.corrected
+    source, corrected = check.capture.source, check.diagnosis.corrected
     video, frames, missing = corrected.video_transform, source.frames_in_file, set[int]()
     with atomic_folder(out) as part:
         if video.reorients:
@@ -63,8 +63,9 @@ def write_corrected_capture(check: CaptureValidation, out: Path) -> None:
         else:
             shutil.copyfile(source.path, part / f"video{source.path.suffix}")
         # without masks, ia-ingest estimates them
-        if check.recording.masks is not None and video.window == FULL_WINDOW:
-            _write_masks(check, check.recording.masks, part / "masks")
+        masks = check.capture.masks
+        if isinstance(masks, StoredMasks) and video.window == FULL_WINDOW:
+            _write_masks(check, masks.in_order_at_worst(), part / "masks")
         geometry = corrected.in_video_frames(frames)
         motion = renumber_motion(geometry, frames, resampled="frame_rate" in check.causes)
         if missing and motion.frames is not None:
@@ -100,20 +101,20 @@ def _write_images(source: FrameSource, video: VideoTransform, folder: Path) -> s
     return missing
 
 
-def _write_masks(check: CaptureValidation, masks: Masks, folder: Path) -> None:
+def _write_masks(check: CaptureValidation, masks: StoredMasks, folder: Path) -> None:
     """Write the mask of each video frame that has one."""
-    source, corrected = check.recording.source, check.diagnosis.corrected
+    source, corrected = check.capture.source, check.diagnosis.corrected
     video, sampled = corrected.video_transform, check.objective.masks
     by_name = source.path.is_dir() and not video.reorients
     names = [file.stem for file in list_images(source.path)] if by_name else []
-    mask_of = mask_lookup(check.recording, masks)
+    size_px = masks.files.size_px
     folder.mkdir()
     for frame in range(source.frames_in_file):
         number = video.first_frame + frame
         try:
-            alpha = mask_of(number, masks.size_px)
+            alpha = masks.read(number, size_px)
         except InputError:  # this frame is skipped then
-            alpha = np.zeros(masks.size_px[::-1], dtype=np.float32)
+            alpha = np.zeros(size_px[::-1], dtype=np.float32)
         else:
             alpha = np.float32(1.0) - alpha if corrected.masks_inverted else alpha
         if corrected.keeps_person_only and sampled is not None:
@@ -122,7 +123,7 @@ def _write_masks(check: CaptureValidation, masks: Masks, folder: Path) -> None:
         write_png(folder / f"{name}.png", (alpha * 255.0 + 0.5).astype(np.uint8))
 
 
-def renumber_motion(hypothesis: CaptureGeometry, frames: int, *, resampled: bool) -> Motion:
+def renumber_motion(geometry: CaptureGeometry, frames: int, *, resampled: bool) -> Motion:
     """Assign the frame numbers of the video to poses, after all corrections.
 
     If poses are `resampled` (have another rate than the video), and where rows fall between frames,
@@ -130,19 +131,19 @@ def renumber_motion(hypothesis: CaptureGeometry, frames: int, *, resampled: bool
     """
     if (
         not resampled
-        and np.abs(hypothesis.row_frames - hypothesis.row_frames.round()).max() < INTEGER_TOLERANCE
+        and np.abs(geometry.row_frames - geometry.row_frames.round()).max() < INTEGER_TOLERANCE
     ):
-        numbers = hypothesis.row_frames.round().astype(np.int64)
+        numbers = geometry.row_frames.round().astype(np.int64)
         inside = np.flatnonzero((numbers >= 0) & (numbers < frames))
-        return hypothesis.motion.select_rows(inside, numbers[inside])
-    return _interpolate_motion(hypothesis, frames)
+        return geometry.motion.select_rows(inside, numbers[inside])
+    return _interpolate_motion(geometry, frames)
 
 
-def _interpolate_motion(hypothesis: CaptureGeometry, frames: int) -> Motion:
-    order = np.argsort(hypothesis.row_frames, kind="stable")
-    order = order[hypothesis.motion.valid[order]]
-    order = order[np.unique(hypothesis.row_frames[order], return_index=True)[1]]
-    places, motion = hypothesis.row_frames[order], hypothesis.motion
+def _interpolate_motion(geometry: CaptureGeometry, frames: int) -> Motion:
+    order = np.argsort(geometry.row_frames, kind="stable")
+    order = order[geometry.motion.valid[order]]
+    order = order[np.unique(geometry.row_frames[order], return_index=True)[1]]
+    places, motion = geometry.row_frames[order], geometry.motion
     numbers = np.arange(max(0, int(np.ceil(places[0]))), min(frames, int(places[-1]) + 1))
     right = np.searchsorted(places, numbers).clip(1, len(places) - 1)
     near = places[right] - places[right - 1] <= 1.5 * frame_step(places)

@@ -212,7 +212,8 @@ def track(arguments: TrackArguments, console: Console) -> int:
     print_grade(tracking.grade, console)
     if tracking.grade.is_good_enough:
         console.info("Next:")
-        console.info(f"  {quote_command(*next_command(arguments, tracking.inputs.frames))}")
+        command = next_command(arguments, tracking.imported.inputs.frames)
+        console.info(f"  {quote_command(*command)}")
     if tracking.interrupted:
         return INTERRUPTED
     return DONE if tracking.grade.is_good_enough else NOT_GOOD_ENOUGH

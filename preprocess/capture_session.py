@@ -1,7 +1,9 @@
 """A capture: the inputs of the user, and everything opened and aligned before its first frame."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -10,19 +12,28 @@ import numpy as np
 from capture.camera import Camera
 from capture.input_error import InputError
 from capture.live_sources import IDLE_TIMEOUT_S, camera_address
-from capture.source import Frame, FrameSource, PacingClock, RealtimePlayback
+from capture.source import Frame, FrameSource
 from preprocess.alignment.capture_geometry import CaptureGeometry
-from preprocess.alignment.mask_alignment import BodyPlacement
-from preprocess.body.body_pose import BodyPose, Motion
+from preprocess.body.body_pose import Motion
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.cameras.camera_file import CameraTrack
-from preprocess.capture_paths import CapturePaths, find_parts
+from preprocess.capture_paths import CapturePaths, find_own_poses, find_parts
 from preprocess.fitting.capture_fit import CaptureFit
-from preprocess.masks.mask_files import Masks
-from preprocess.masks.mask_refinement import GivenMaskRefiner
+from preprocess.masks.mask_sources import MaskSource
 from preprocess.observation import DroppedFrame, Observation, observation_builder
-from preprocess.plugins import Segmenter, segmenter_name
-from preprocess.tracked_stream import LiveTracking
+from preprocess.plugins import segmenter_name
+
+
+class InputKind(Enum):
+    """What the input of a command is: a recording with poses or without, or a stream.
+
+    A stream without poses is tracked while it comes: a live source, or a recording that is played
+    at its own speed.
+    """
+
+    POSED = "recorded, with poses"
+    UNTRACKED = "recorded, to be tracked first"
+    STREAMED = "tracked while it comes"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,8 +55,7 @@ class CaptureInputs:
         refine_masks: Whether given masks are refined where their borders miss the images' edges.
         rotate: Degrees by which frames are turned clockwise; masks, poses and cameras are those of
             turned frames.
-        transposed: Whether the video's width and height are exchanged before masks and cameras are
-            compared with it; only to find out whether it was rotated.
+        realtime: Whether a recording is played at its own speed, as a camera would.
     """
 
     video: Path
@@ -63,17 +73,31 @@ class CaptureInputs:
     tracker: str | None = None
     refine_masks: bool = True
     rotate: int = 0
-    transposed: bool = False
+    realtime: bool = False
+
+    @property
+    def camera(self) -> str | None:
+        """Number or address of the camera, if the video is one."""
+        return camera_address(self.video)
 
     @property
     def is_live(self) -> bool:
         """Return whether frames come from a camera, or from a folder that still grows."""
-        return self.live or camera_address(self.video) is not None
+        return self.live or self.camera is not None
+
+    @cached_property
+    def kind(self) -> InputKind:
+        """What the input is; a video that does not exist counts as posed."""
+        if self.is_live:
+            return InputKind.STREAMED
+        if self.poses or find_own_poses(self.video) or not self.video.exists():
+            return InputKind.POSED
+        return InputKind.STREAMED if self.realtime else InputKind.UNTRACKED
 
     def input_paths(self) -> list[Path]:
         """Paths that no output may touch: those that were named, and those that may be found."""
         named = [self.poses, self.body]
-        if camera_address(self.video) is None:
+        if self.camera is None:
             named.append(self.video)
         if segmenter_name(self.masks) is None:
             named.append(self.masks)
@@ -84,48 +108,63 @@ class CaptureInputs:
         return [*given, *find_parts(sorted(near))]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Capture:
-    """A video of one person, with everything that belongs to it.
+def video_identity(source: FrameSource) -> str:
+    """Name of a video in a checkpoint; each recording of a camera is a new one."""
+    if camera_address(source.path) is not None:
+        return f"{source.path} {source.started_at:.3f}"
+    return str(source.path.resolve())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Provenance:
+    """Where a part of a capture comes from, and how sure it is.
 
     Attributes:
-        masks: None if the images' alpha channel is the mask, `segment` estimates them, or `live`
-            makes them.
+        part: "poses", "body", "cameras", "masks", "tracking" or "fit".
+        origin: A file's name, or what made it.
+        uncertainty: Degree to which it is an estimate, in [0, 1]; 0 if it counts as exact.
+        notes: Messages for the user about how it was read or made.
+        figures: The part's entry in the report; empty without one.
+    """
+
+    part: str
+    origin: str
+    uncertainty: float = 0.0
+    notes: tuple[str, ...] = ()
+    figures: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Capture:
+    """A video of one person, with everything that belongs to it, in metres and in one world.
+
+    Attributes:
+        motion: The poses; of a stream that is tracked while it comes, those of its first frames.
         cameras: The cameras, of the frames' size.
-        size_px: Longer side of the training images; None for the frames' own.
-        notes: Messages for the user about how the parts were read.
-        live: Tracks the person while the frames come; `motion` is that of the first frames.
-        segment: Estimates the masks, if no file or alpha channel holds them.
-        mask_refiner: Refines given masks; None if they stay as they are.
-        camera_report: Entry of the report about solved cameras.
-        tracking_report: Entry of the report about poses that were tracked in the video.
-        refit: The fit of the poses to the masks, if they were made for another body.
-        fit: The result of fitting to the masks before training (`preprocess.fitting`).
+        size_px: Longer side of the training images.
+        provenance: Where the parts come from, in the order in which they were made.
+        fits: Changes that were fitted to masks and key points, for a run that is resumed.
     """
 
     paths: CapturePaths
     source: FrameSource
     motion: Motion
-    masks: Masks | None
+    masks: MaskSource
     cameras: CameraTrack
     shaped: ShapedBody
-    size_px: int | None
-    notes: tuple[str, ...]
-    live: LiveTracking | None = None
-    segment: Segmenter | None = None
-    mask_refiner: GivenMaskRefiner | None = None
-    camera_report: dict[str, Any] | None = None
-    tracking_report: dict[str, Any] | None = None
-    refit: BodyPlacement | None = None
-    fit: CaptureFit | None = None
+    size_px: int
+    provenance: tuple[Provenance, ...]
+    fits: tuple[CaptureFit, ...] = ()
 
     @property
     def identity(self) -> str:
         """Name of the video in a checkpoint; each recording of a camera is a new one."""
-        source = self.source
-        if camera_address(source.path) is not None:
-            return f"{source.path} {source.started_at:.3f}"
-        return str(source.path.resolve())
+        return video_identity(self.source)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Messages for the user about how the parts were read or made."""
+        return tuple(note for each in self.provenance for note in each.notes)
 
     @property
     def pose_uncertainty(self) -> float:
@@ -133,9 +172,16 @@ class Capture:
 
         Given poses are as uncertain as the fit to the masks had to change them beyond its noise.
         """
-        if self.live is not None or self.motion.proportions is not None:
-            return 1.0
-        return 0.0 if self.fit is None else self.fit.share
+        return max(each.uncertainty for each in self.provenance if each.part in ("poses", "fit"))
+
+    def figures(self, part: str) -> dict[str, Any] | None:
+        """The newest figures of a part for the report; None if there are none."""
+        found = [each.figures for each in self.provenance if each.part == part and each.figures]
+        return found[-1] if found else None
+
+    def with_part(self, made: Provenance, **parts: Any) -> "Capture":
+        """The capture with some parts replaced, and where they come from."""
+        return replace(self, provenance=(*self.provenance, made), **parts)
 
     def check(self) -> None:
         """Raise an InputError if the parts do not fit together; no frame is read."""
@@ -148,42 +194,17 @@ class Capture:
 
     def observation_builder(self) -> Callable[[Frame], Observation | DroppedFrame]:
         """Make the function that joins a frame with its pose, mask and camera."""
-        if self.live is not None:
-            return self.live.observation_builder(
-                self.source, self.cameras, self.size_px, segment=self.segment,
-                refine=self.mask_refiner,
-            )  # fmt: skip
         return observation_builder(
-            self.source, self.motion, self.masks, self.cameras, size_px=self.size_px,
-            segment=self.segment, refine=self.mask_refiner,
-        )  # fmt: skip
-
-    def take_revised_poses(self) -> dict[int, BodyPose]:
-        """Poses of a stream's earlier frames that later ones have improved since the last call."""
-        return {} if self.live is None else self.live.take_revised_poses()
+            self.source, self.motion, self.masks, self.cameras, size_px=self.size_px
+        )
 
     def mask_report(self) -> dict[str, str | float | None]:
         """Origin of the masks, and the agreement of estimated ones with the posed body."""
-        if self.segment is not None:
-            agreement = getattr(self.segment, "agreement", None)
-            name = getattr(self.segment, "name", type(self.segment).__name__)
-            return {"masks": f"estimated by {name}", "mask_agreement": agreement}
-        if self.live is not None and self.live.given_masks is None:
-            return {"masks": "tracked", "mask_agreement": None}
-        source = "alpha channel" if self.paths.masks is None else self.paths.masks.name
-        refined = self.mask_refiner is not None and self.mask_refiner.is_needed
-        return {"masks": f"{source}, refined" if refined else source, "mask_agreement": None}
-
-    def final_notes(self) -> Iterator[str]:
-        """Messages for the user that need the frames to have come."""
-        if self.live is not None:
-            yield from self.live.final_notes()
-        if self.mask_refiner is not None and self.mask_refiner.note is not None:
-            yield self.mask_refiner.note
-
-    def body_fit_report(self) -> dict[str, float | bool] | None:
-        """The fit of the poses to the body that is used; None if none was needed."""
-        return None if self.refit is None else self.refit.as_json()
+        origin = self.masks.origin
+        return {
+            "masks": f"{origin}, refined" if self.masks.is_refined else origin,
+            "mask_agreement": self.masks.agreement,
+        }
 
     def geometry(self) -> CaptureGeometry:
         """Poses and cameras of the capture as `CaptureGeometry`."""
@@ -192,10 +213,6 @@ class Capture:
     def camera_of_pose(self, row: int) -> Camera:
         """The camera that sees one of the poses."""
         return self.cameras[int(self.geometry().camera_rows()[row])]
-
-    def in_real_time(self) -> "Capture":
-        """Replay the capture: each frame comes at its own time."""
-        return replace(self, source=RealtimePlayback(self.source, PacingClock()))
 
     def pixel_footprint_m(self, *, as_filmed: bool = False) -> float:
         """Size of one pixel on the body: the dial of the field's resolution.
@@ -220,5 +237,5 @@ class Capture:
                 "in each frame's own camera."
             )
         longer = max(camera.size_px)
-        shrinking = 1.0 if as_filmed else min(1.0, (self.size_px or longer) / longer)
+        shrinking = 1.0 if as_filmed else min(1.0, self.size_px / longer)
         return depth / (max(camera.focal_px) * shrinking)

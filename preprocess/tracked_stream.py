@@ -18,10 +18,11 @@ from jaxtyping import Float32
 
 from capture.camera import Camera
 from capture.input_error import InputError
-from capture.source import Frame, FrameSource
+from capture.source import Frame, FrameSource, WrappedSource
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.cameras.camera_file import CameraTrack
+from preprocess.capture_session import Capture
 from preprocess.fitting.clip_fitting import SIGMA_LOG_ASSUMED_FOCAL, SIGMA_LOG_FOCAL
 from preprocess.fitting.tracked_frames import (
     LAG_FRAMES,
@@ -31,14 +32,13 @@ from preprocess.fitting.tracked_frames import (
     fit_first_frames,
     reduced_size_px,
 )
-from preprocess.masks.mask_refinement import GivenMaskRefiner
 from preprocess.observation import (
     DroppedFrame,
     Observation,
-    compose_observation_builder,
+    join_frame,
     shrink_to_longer_side,
 )
-from preprocess.plugins import PersonTracker, Segmenter
+from preprocess.plugins import PersonTracker
 from preprocess.tracking.video_tracking import MaskRefinement
 
 START_FRAMES = 8
@@ -54,38 +54,24 @@ own speed falls behind instead."""
 NOT_FOUND = "person not found"
 """Reason for which a frame without the person is not used."""
 
-MaskReader = Callable[[Frame, tuple[int, int]], Float32[np.ndarray, "rows columns"]]
-"""From a frame, and a width and height, to its given mask at that size; raises InputError."""
-
 
 @final
-class TrackedStream:
+class TrackedStream(WrappedSource):
     """A source of frames at their own times, of which only those are taken that can be tracked.
 
     Frames are handed over `LAG_FRAMES` after they came, so that their poses are fitted together
-    with those of later frames. `look` is called with each frame as soon as it is taken, `end` when
-    the last frame has been used.
+    with those of later frames. `on_frame` is called with each frame as soon as it is taken,
+    `on_end` when the last frame has been used.
     """
 
     def __init__(self, source: FrameSource) -> None:
         """Wrap a source whose frames come at their own times, or as fast as they are taken."""
-        self._source = source
+        super().__init__(source)
         self._frames: Iterator[Frame] | None = None
         self._waiting: deque[Frame] = deque()
         self._skipped = 0
-        self.look: Callable[[Frame], None] = lambda frame: None
-        self.end: Callable[[], None] = lambda: None
-        self.path, self.size_px, self.selection = source.path, source.size_px, source.selection
-        self.frames_in_file, self.frame_count = source.frames_in_file, source.frame_count
-        self.duration_s, self.has_alpha = source.duration_s, source.has_alpha
-        self.quarter_turns, self.rotate = source.quarter_turns, source.rotate
-        self.started_at, self.is_hdr = source.started_at, source.is_hdr
-        self.live, self.paced, self.warnings = source.live, source.paced, source.warnings
-
-    @property
-    def waited_s(self) -> float:
-        """Seconds of waiting for frames, in all."""
-        return self._source.waited_s
+        self.on_frame: Callable[[Frame], None] = lambda frame: None
+        self.on_end: Callable[[], None] = lambda: None
 
     @property
     def dropped(self) -> int:
@@ -99,7 +85,7 @@ class TrackedStream:
         frame = next(self._frames, None)
         if frame is not None:
             self._waiting.append(frame)
-            self.look(frame)
+            self.on_frame(frame)
         return frame is not None
 
     def frames(self) -> Iterator[Frame]:
@@ -111,15 +97,7 @@ class TrackedStream:
             going = self.take_next()
         while self._waiting:
             yield self._waiting.popleft()
-        self.end()
-
-    def count_frames(self) -> int:
-        """The source's own number of frames."""
-        return self._source.count_frames()
-
-    def close(self) -> None:
-        """Close the source."""
-        self._source.close()
+        self.on_end()
 
     def _taken(self) -> Iterator[Frame]:
         skipped, last_s = 0, -np.inf  # since the last frame that was taken; its time
@@ -146,34 +124,26 @@ class StreamStart:
 
 @final
 class LiveTracking:
-    """Poses and masks of a stream's frames, tracked as they come.
+    """Poses of a stream's frames, tracked as they come.
 
     Attributes:
         times_s: Time of each frame that was looked at, by its number.
         lost: Numbers of the frames in which the person was not found.
-        given_masks: Reads the masks that are learnt from; None if they are the tracker's.
+        latest: The person in the frame whose pose was asked for last.
     """
 
-    def __init__(
-        self,
-        stream: TrackedStream,
-        tracker: PersonTracker,
-        refine: MaskRefinement,
-        given_masks: MaskReader | None = None,
-    ) -> None:
-        """Connect a stream with its tracker; nothing is read yet.
+    latest: SeenPerson
 
-        `refine` makes masks from the tracker's; `given_masks` replaces them where there are some.
-        """
-        self.stream = stream
+    def __init__(self, stream: TrackedStream, tracker: PersonTracker) -> None:
+        """Connect a stream with its tracker; nothing is read yet."""
+        self.stream, self._tracker = stream, tracker
         self.times_s: dict[int, float] = {}
         self.lost: list[int] = []
-        self._tracker, self._refine, self.given_masks = tracker, refine, given_masks
         self._seen: dict[int, SeenPerson] = {}
         self._mask_px: tuple[int, int] | None = None
         self._fitter: FramePoseFitter | None = None
         self._earlier: EarlierPoses | None = None
-        stream.look = self._look
+        stream.on_frame = self._track
 
     def start(
         self,
@@ -207,7 +177,7 @@ class LiveTracking:
             sigma_log_focal=SIGMA_LOG_FOCAL if stated_focal else SIGMA_LOG_ASSUMED_FOCAL,
         )  # fmt: skip
         self._fitter, self._earlier = FramePoseFitter(person, camera), EarlierPoses(person, camera)
-        self.stream.end = self._earlier.fit_rest
+        self.stream.on_end = self._earlier.fit_rest
         for row, each in enumerate(seen):
             self._fitter.add(each, motion[row])
         source = "focal length fitted to the first frames"
@@ -217,55 +187,25 @@ class LiveTracking:
             cameras=CameraTrack(cameras=(camera,), source=source),
         )
 
-    def observation_builder(
-        self,
-        source: FrameSource,
-        cameras: CameraTrack,
-        size_px: int | None,
-        *,
-        segment: Segmenter | None = None,
-        refine: GivenMaskRefiner | None = None,
-    ) -> Callable[[Frame], Observation | DroppedFrame]:
-        """Make the function from a frame, tracked when it was taken, to its observation.
+    def pose_of(self, frame: Frame) -> BodyPose | str:
+        """The pose of a frame that was tracked when it was taken, or why it has none; once."""
+        if frame.index not in self._seen:
+            return NOT_FOUND
+        assert self._fitter is not None
+        self.latest = self._seen.pop(frame.index)
+        return self._fitter.pose(frame.index)
 
-        `size_px` is the observations' longer side. `segment` estimates masks where the user named a
-        segmenter, `refine` refines given masks; the tracker's are refined already.
-        """
-        target_px = shrink_to_longer_side(source.size_px, size_px)
-        found = deque[SeenPerson](maxlen=1)  # in the frame whose pose was asked for
-
-        def pose_of(frame: Frame) -> BodyPose | str:
-            if frame.index not in self._seen:
-                return NOT_FOUND
-            assert self._fitter is not None
-            found.append(self._seen.pop(frame.index))
-            return self._fitter.pose(frame.index)
-
-        def alpha_of(frame: Frame, size_px: tuple[int, int]) -> Float32[np.ndarray, "rows columns"]:
-            if self.given_masks is not None:
-                return self.given_masks(frame, size_px)
-            return self._refine(frame.rgb, found[-1].keypoints.mask, size_px)
-
-        observe = compose_observation_builder(
-            pose_of, alpha_of, lambda index: cameras[0], target_px, segment=segment,
-            refine=None if self.given_masks is None else refine,
-        )  # fmt: skip
-
-        def observed(frame: Frame) -> Observation | DroppedFrame:
-            item = observe(frame)
-            if isinstance(item, Observation):
-                assert self._earlier is not None
-                mask = cv2.resize(item.alpha, self._mask_px, interpolation=cv2.INTER_AREA)
-                self._earlier.add(replace(found[-1], mask=mask), item.pose)
-            return item
-
-        return observed
+    def add_observation(self, observation: Observation) -> None:
+        """Take the latest frame's pose and mask as evidence for those of earlier frames."""
+        assert self._earlier is not None
+        mask = cv2.resize(observation.alpha, self._mask_px, interpolation=cv2.INTER_AREA)
+        self._earlier.add(replace(self.latest, mask=mask), observation.pose)
 
     def take_revised_poses(self) -> dict[int, BodyPose]:
         """Poses of earlier frames that were fitted again since the last call, by their numbers."""
         return {} if self._earlier is None else self._earlier.take()
 
-    def final_notes(self) -> Iterator[str]:
+    def notes(self) -> Iterator[str]:
         """Messages for the user that need the frames to have come."""
         looked = len(self.times_s)
         if self.lost:
@@ -275,7 +215,7 @@ class LiveTracking:
                 f"{min(times):.1f} and {max(times):.1f} s."
             )
 
-    def _look(self, frame: Frame) -> None:
+    def _track(self, frame: Frame) -> None:
         """Find the person in a frame, and fit its pose once there is a person to fit."""
         self.times_s[frame.index] = frame.time_s
         found = None if "corrupt" in frame.flags else self._tracker(frame.rgb)
@@ -293,3 +233,66 @@ class LiveTracking:
         self._seen[frame.index] = seen
         if self._fitter is not None:
             self._fitter.add(seen)
+
+
+@final
+class TrackedMasks:
+    """The tracker's own masks of a stream's frames, refined (`MaskSource`)."""
+
+    origin, agreement = "tracked", None
+    is_given = is_refined = False
+    needs_all_frames = True
+
+    def __init__(self, tracking: LiveTracking, refine: MaskRefinement) -> None:
+        """Refine nothing yet."""
+        self._tracking, self._refine = tracking, refine
+
+    def check(self) -> None:
+        """Nothing can be wrong before the frames come."""
+
+    def read(self, index: int, size_px: tuple[int, int]) -> Float32[np.ndarray, "rows columns"]:
+        """There is none before the frame is seen."""
+        raise InputError(f"the mask of frame {index} is not known before the frame")
+
+    def alpha(
+        self, frame: Frame, scaled: Frame, pose: BodyPose, camera: Camera
+    ) -> Float32[np.ndarray, "rows columns"]:
+        """Refine the mask of the frame whose pose was asked for last."""
+        return self._refine(frame.rgb, self._tracking.latest.keypoints.mask, scaled.size_px)
+
+    def notes(self) -> Iterator[str]:
+        """Nothing is left to say."""
+        yield from ()
+
+
+@final
+class TrackedObservations:
+    """The observations of a stream whose person is tracked as its frames come."""
+
+    def __init__(self, capture: Capture, tracking: LiveTracking) -> None:
+        """Go on after the frames that tracking has started with."""
+        self.capture, self._tracking = capture, tracking
+        self.frames: FrameSource = tracking.stream
+        target_px = shrink_to_longer_side(self.frames.size_px, capture.size_px)
+        self._camera = capture.cameras[0].resize(target_px)
+
+    def join(self, frame: Frame) -> Observation | DroppedFrame:
+        """Join the next frame with its pose and mask."""
+        item = join_frame(
+            frame, self._tracking.pose_of, lambda index: self._camera, self.capture.masks
+        )
+        if isinstance(item, Observation):
+            self._tracking.add_observation(item)
+        return item
+
+    def set_catch_up(self, catch_up: bool) -> None:
+        """A stream comes once; nothing is read back."""
+
+    def take_revised_poses(self) -> dict[int, BodyPose]:
+        """Poses of earlier frames that were fitted again since the last call, by their numbers."""
+        return self._tracking.take_revised_poses()
+
+    def notes(self) -> Iterator[str]:
+        """What tracking and masks have to say."""
+        yield from self._tracking.notes()
+        yield from self.capture.masks.notes()

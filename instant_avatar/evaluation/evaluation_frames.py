@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from capture.input_error import InputError
-from instant_avatar.run.ingest_arguments import IngestArguments, trainable_longer_side_px
-from instant_avatar.run.missing_inputs import read_tracked_poses
+from instant_avatar.run.ingest_arguments import IngestArguments
+from instant_avatar.run.run_capture import open_as_trained
 from instant_avatar.run.run_folder import RunFolder
-from preprocess.capture_session import Capture, CaptureInputs
-from preprocess.fitting.capture_fit import load_capture_fit
-from preprocess.fitting.capture_fitting import apply_fit
+from instant_avatar.run.run_tracking import inputs_as_tracked
+from preprocess.capture_session import Capture, CaptureInputs, InputKind
 from preprocess.observation import Observation
-from preprocess.open_capture import open_capture
+from preprocess.open_capture import open_capture, read_capture
 
 PATH_ARGUMENTS = ("video", "poses", "masks", "body", "out", "json")
 """Arguments of ia-ingest that are paths in report.json."""
@@ -29,7 +28,7 @@ class EvaluationFrames:
         poses: "tracked" by ia-ingest, or "given".
     """
 
-    recording: Capture
+    capture: Capture
     frame_indices: frozenset[int] | None = None
     poses: str = "given"
 
@@ -37,17 +36,17 @@ class EvaluationFrames:
     def count(self) -> int | None:
         """Number of frames; None if unknown."""
         return (
-            self.recording.source.frame_count
+            self.capture.source.frame_count
             if self.frame_indices is None
             else len(self.frame_indices)
         )
 
     def __iter__(self) -> Iterator[Observation]:
         """Yield the frames that show the person; reading ends after the last one needed."""
-        recording, wanted = self.recording, self.frame_indices
-        sequential = recording.segment is not None or recording.mask_refiner is not None
-        observe, last = recording.observation_builder(), max(wanted, default=-1) if wanted else None
-        for frame in recording.source.frames():
+        capture, wanted = self.capture, self.frame_indices
+        sequential = capture.masks.needs_all_frames
+        observe, last = capture.observation_builder(), max(wanted, default=-1) if wanted else None
+        for frame in capture.source.frames():
             counts = wanted is None or frame.index in wanted
             if counts or sequential:  # masks are estimated and refined in the frames' order
                 seen = observe(frame)
@@ -64,48 +63,39 @@ def capture_frames(
 
     `size_px` is the longer side of the images; None for the original size.
     """
-    return EvaluationFrames(recording=open_capture(inputs, size_px=size_px, avatar_body=body_file))
+    return EvaluationFrames(capture=open_capture(inputs, size_px=size_px, avatar_body=body_file))
 
 
 def held_out_frames(run: RunFolder, size_px: int | None) -> EvaluationFrames:
     """Open the held-out frames of a run from its original capture."""
     report = read_report(run)
     given = _run_arguments(report, run)
-    if given.live or str(given.video).startswith("camera:"):
+    inputs = given.capture_inputs()
+    if inputs.is_live:
         raise InputError(
             f"{run.path} was trained from a live source, which was not recorded. Pass another "
             "capture of the same person with --on."
         )
-    if given.tracks_stream:
+    if inputs.kind is InputKind.STREAMED:
         raise InputError(
             f"{run.path} was trained while its video was tracked, and those poses cannot be "
             "repeated. Run ia-track, and pass --on and --poses."
         )
-    given = read_tracked_poses(given, run)
-    inputs = given.capture_inputs()
+    inputs = inputs_as_tracked(given, inputs, run)
     if given.cameras == "solve" and run.cameras.is_file():
         inputs = replace(inputs, cameras=str(run.cameras), poses=run.poses)
-    recording = _open_as_trained(inputs, run)
-    own_px = given.size or trainable_longer_side_px(given.training_seconds(recording))
+    imported = read_capture(inputs)
+    own_px = given.longer_side_px(imported.source)
     numbers = report["held_out"]["frames"]
     if not numbers:
         raise InputError(
             f"{run.path} has no held-out frames. Pass another capture of the same person with --on."
         )
     return EvaluationFrames(
-        recording=replace(recording, size_px=size_px or own_px),
+        capture=open_as_trained(imported, run, size_px or own_px),
         frame_indices=frozenset(numbers),
-        poses="tracked" if given.poses == run.tracked_poses else "given",
+        poses="tracked" if inputs.poses == run.tracked_poses else "given",
     )
-
-
-def _open_as_trained(inputs: CaptureInputs, run: RunFolder) -> Capture:
-    """Open a run's own capture with the body and the poses that it was trained with."""
-    recording = open_capture(inputs)
-    fit = load_capture_fit(run.fit_file, recording.identity)
-    if run.body_file.is_file() and (fit is None or not fit.fits_body):
-        recording = open_capture(inputs, avatar_body=run.body_file)
-    return recording if fit is None else apply_fit(recording, fit, height_m=inputs.height_m)
 
 
 def trained_longer_side_px(run: RunFolder) -> int | None:
@@ -156,7 +146,7 @@ def _run_arguments(report: dict[str, Any], run: RunFolder) -> IngestArguments:
     near = {key: base / words[key] for key in PATH_ARGUMENTS if words.get(key) is not None}
     if given.cameras is not None and (base / given.cameras).exists():
         near["cameras"] = str(base / given.cameras)
-    return replace(given, **near, realtime=False)
+    return replace(given, **near)
 
 
 def _original_working_folder(arguments: IngestArguments, run: RunFolder) -> Path:

@@ -121,7 +121,7 @@ class EvaluationSession:
                     scorer.score_fitted(group)
         return AvatarEvaluation(
             name=name,
-            capture=str(frames.recording.paths.video),
+            capture=str(frames.capture.paths.video),
             size=scorer.size_px,
             rows=scorer.rows,
             shown=scorer.shown,
@@ -139,7 +139,7 @@ class EvaluationSession:
             renderers[VOLUME_RENDERER] = partial(_render_volume, trainer)
         if package is None or not (self.arguments.player or trainer is None):
             return renderers
-        if frames.recording.cameras[0].distortion:
+        if frames.capture.cameras[0].distortion:
             self.console.warning(
                 "The player renders pinhole images; this lens has distortion, so it is not scored."
             )

@@ -325,8 +325,8 @@ def _build_report(
         "camera": capture.cameras.source,
         "body": capture.shaped.body.family,
         "pose_model": capture.motion.body_model,
-        "body_fit": capture.body_fit_report(),
-        "mask_fit": None if capture.fit is None else capture.fit.as_json(),
+        "body_fit": capture.figures("body"),
+        "mask_fit": capture.figures("fit"),
         **capture.mask_report(),
     }
     return Report(
@@ -343,8 +343,8 @@ def _build_report(
         all_round=result.all_round_verdict(),
         coverage=CoverageStats.of(result.coverage),
         earlier_videos=result.earlier_videos,
-        cameras=capture.camera_report,
-        tracking=capture.tracking_report,
+        cameras=capture.figures("cameras"),
+        tracking=capture.figures("tracking"),
     )
 
 

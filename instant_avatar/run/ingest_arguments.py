@@ -9,7 +9,8 @@ from tyro.conf import Positional, arg
 
 from avatar.config import HELD_OUT_STRIDE, NOMINAL_STEPS_PER_S
 from capture.input_error import InputError
-from capture.live_sources import IDLE_TIMEOUT_S, camera_address
+from capture.live_sources import IDLE_TIMEOUT_S
+from capture.source import FrameSource
 from instant_avatar.cli.command_line import require_packages
 from instant_avatar.cli.shared_options import (
     CaptureArguments,
@@ -17,12 +18,9 @@ from instant_avatar.cli.shared_options import (
     capture_name,
     check_output_file,
 )
-from instant_avatar.run.person_tracking import needs_stream_tracking, open_stream
 from instant_avatar.run.run_folder import RunFolder, is_run_report
 from preprocess.alignment.mask_alignment import MAX_HEIGHT_CM, MIN_HEIGHT_CM
-from preprocess.capture_session import Capture, CaptureInputs
-from preprocess.fitting.capture_fit import load_capture_fit
-from preprocess.open_capture import open_capture
+from preprocess.capture_session import CaptureInputs
 from preprocess.plugins import segmenter_name
 
 PROGRAM = "ia-ingest"
@@ -185,7 +183,7 @@ class IngestArguments(CaptureArguments):
     def run_folder(self) -> RunFolder:
         """Return the folder of the run."""
         own = capture_name(self.video)
-        if camera_address(self.video) is not None:
+        if self.capture_inputs().camera is not None:
             own = re.sub(r"\W+", "-", str(self.video)).strip("-")
         return RunFolder(path=self.out or Path("runs") / own)
 
@@ -194,6 +192,7 @@ class IngestArguments(CaptureArguments):
         return replace(
             super().capture_inputs(),
             live=self.live,
+            realtime=self.realtime,
             tracker=self.tracker,
             idle_s=self.idle_seconds,
             watch_s=self.seconds if self.steps is None else self.steps / NOMINAL_STEPS_PER_S,
@@ -201,30 +200,11 @@ class IngestArguments(CaptureArguments):
             height_m=None if self.height_cm is None else self.height_cm / 100.0,
         )
 
-    def open_capture(self) -> Capture:
-        """Open the capture that the arguments name."""
-        run = self.run_folder()
-        resumes = self.resume and run.has_checkpoint() and run.body_file.is_file()
-        if self.tracks_stream:
-            person = run.body_file if resumes else None
-            recording = open_stream(self.capture_inputs(), run.tracked_poses, person)
-            size_px = self.size or trainable_longer_side_px(self.training_seconds(recording))
-            return replace(recording, size_px=size_px)
-        recording = open_capture(self.capture_inputs())
-        if resumes:
-            fit = load_capture_fit(run.fit_file, recording.identity)
-            if fit is None or not fit.fits_body:
-                recording = open_capture(self.capture_inputs(), avatar_body=run.body_file)
-        size_px = self.size or trainable_longer_side_px(self.training_seconds(recording))
-        recording = replace(recording, size_px=size_px)
-        return recording.in_real_time() if self.realtime else recording
+    def longer_side_px(self, source: FrameSource) -> int:
+        """Return the longer side of the training images of a source."""
+        return self.size or trainable_longer_side_px(self.training_seconds(source))
 
-    @property
-    def tracks_stream(self) -> bool:
-        """True if poses are missing and must be tracked while frames come."""
-        return needs_stream_tracking(self.capture_inputs(), realtime=self.realtime)
-
-    def training_seconds(self, recording: Capture) -> float:
+    def training_seconds(self, source: FrameSource) -> float:
         """Return the training time: as given, else the clip's duration, else a minute.
 
         With --steps it is nominal: it sets the level of detail, not the end of training.
@@ -233,8 +213,7 @@ class IngestArguments(CaptureArguments):
             return self.steps / NOMINAL_STEPS_PER_S
         if self.seconds is not None:
             return self.seconds
-        duration_s = recording.source.duration_s
-        return duration_s if self.realtime and duration_s else DEFAULT_SECONDS
+        return source.duration_s if self.realtime and source.duration_s else DEFAULT_SECONDS
 
     def as_json(self) -> dict[str, Any]:
         """Return the arguments as report.json stores them."""

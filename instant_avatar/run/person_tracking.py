@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -22,15 +21,16 @@ from preprocess.body.body_pose import Motion
 from preprocess.body.body_surface import SkinPoints
 from preprocess.body.parametric_body import load_body_model
 from preprocess.cameras.camera_orientation import assume_camera
-from preprocess.capture_paths import find_own_masks, find_own_poses
+from preprocess.capture_paths import CapturePaths, find_own_masks, find_stream_cameras
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.fitting.capture_fitting import fit_capture, fitted_motion
 from preprocess.masks.mask_files import open_masks
 from preprocess.masks.mask_refinement import MaskRefiner
-from preprocess.observation import associate_cameras, associate_masks
-from preprocess.open_capture import open_capture, open_tracked_stream
+from preprocess.masks.mask_sources import StoredMasks, associate_masks
+from preprocess.observation import associate_cameras
+from preprocess.open_capture import ImportedCapture, align_capture, import_capture
 from preprocess.plugins import DEFAULT_TRACKER, PersonTracker, make_tracker, segmenter_name
-from preprocess.poses.pose_file import read_motion, write_motion
+from preprocess.poses.pose_file import as_stored, read_motion, write_motion
 from preprocess.tracking.first_look import look_at
 from preprocess.tracking.keypoints import KeypointTrack
 from preprocess.tracking.pose_lift import lift_keypoints
@@ -53,33 +53,15 @@ class PersonTracking:
     """The tracked person of a recording.
 
     Attributes:
-        capture: The recording with poses, masks, camera and body, fitted to each other.
-        inputs: What opens the same from the files that were written.
+        imported: The recording with the poses, and with the masks that are learnt from.
+        capture: The recording with poses, tracked masks, camera and body, fitted to each other.
         interrupted: Whether tracking was stopped before the last frame.
     """
 
+    imported: ImportedCapture
     capture: Capture
-    inputs: CaptureInputs
     grade: TrackingGrade
     interrupted: bool
-
-
-def needs_tracking(inputs: CaptureInputs) -> bool:
-    """True if a recording comes without poses, so that its person must be tracked."""
-    if inputs.is_live or inputs.poses is not None:
-        return False
-    return inputs.video.exists() and find_own_poses(inputs.video) is None
-
-
-def needs_stream_tracking(inputs: CaptureInputs, *, realtime: bool) -> bool:
-    """Return whether the person is tracked while frames come, as of a `realtime` recording."""
-    return inputs.is_live or (realtime and needs_tracking(inputs))
-
-
-def open_stream(inputs: CaptureInputs, poses: Path, avatar_body: Path | None = None) -> Capture:
-    """Open a stream without poses with this project's tracker; see `open_tracked_stream`."""
-    tracker = make_tracker(inputs.tracker or DEFAULT_TRACKER, person_number(inputs.person))
-    return open_tracked_stream(inputs, tracker, MaskRefiner, poses, avatar_body=avatar_body)
 
 
 def limit_frames(inputs: CaptureInputs, source: FrameSource) -> CaptureInputs:
@@ -108,23 +90,10 @@ def track_person(
         InputError: If the recording cannot be read, or no person is found in it.
         KeyboardInterrupt: If it was stopped before the person was found.
     """
-    source = open_source(inputs.video, frames=inputs.frames, rotate=inputs.rotate)
-    console.info(describe_recording(source))
-    inputs, step = limit_frames(inputs, source), source.selection.step
-    source = reopen(source, inputs.frames)
-    if inputs.frames is not None and inputs.frames.step != step:
-        console.info(
-            f"One in {inputs.frames.step} frames is used, {source.frame_count} in all (--frames "
-            "names others)."
-        )
-    if not resume:
-        look = look_at(source)
-        console.info(look.describe())
-        for advice in look.advice():
-            console.warning(advice)
+    inputs, source = _open_video(inputs, console, look=not resume)
     folder = poses.parent / "masks"
-    given = masks_to_use(inputs, folder)
-    own_masks = not source.has_alpha and given is None
+    given, names_segmenter = masks_to_use(inputs, folder), segmenter_name(inputs.masks) is not None
+    own_masks = given is None and (names_segmenter or not source.has_alpha)
     if given is not None and inputs.masks is None:
         console.info(f"Using the masks in {given}, which lie beside the video.")
     _check_parts(source, inputs, given)
@@ -137,19 +106,61 @@ def track_person(
             inputs = replace(inputs, frames=_frames_up_to(source, max(tracked.frame_times_s)))
             source = reopen(source, inputs.frames)
         with console.status("fitting body and poses to key points and masks"):
-            capture = fit_tracked_video(source, tracked, inputs, part)
+            there = tracked_inputs(replace(inputs, height_m=None), poses, part)
+            capture = fit_tracked_video(source, tracked, there, given)
             grade = _grade(capture, tracked.frame_times_s)
             capture = replace(capture, motion=_without(capture.motion, grade.left_out))
         with atomic_file(poses) as unfinished:
             write_motion(unfinished, capture.motion)
-    inputs = replace(inputs, poses=poses, person=None)
     if own_masks:
-        capture = replace(capture, masks=open_masks(folder, invert=False))
-        if segmenter_name(inputs.masks) is None:  # else it makes the masks to learn from
-            inputs = replace(inputs, masks=folder, invert_masks=False)
+        masks = StoredMasks(open_masks(folder, invert=False), source)
+        capture = replace(capture, masks=masks)
+    learnt = folder if own_masks and not names_segmenter else None
+    there = tracked_inputs(inputs, poses, learnt)
     return PersonTracking(
-        capture=capture, inputs=inputs, grade=grade, interrupted=tracked.interrupted
+        imported=_import_poses(source, capture.motion, there, given), capture=capture,
+        grade=grade, interrupted=tracked.interrupted,
+    )  # fmt: skip
+
+
+def _open_video(
+    inputs: CaptureInputs, console: Console, *, look: bool
+) -> tuple[CaptureInputs, FrameSource]:
+    """Open the frames that are to be tracked; describe them, and with `look` what a few show."""
+    source = open_source(inputs.video, frames=inputs.frames, rotate=inputs.rotate)
+    console.info(describe_recording(source))
+    inputs, step = limit_frames(inputs, source), source.selection.step
+    source = reopen(source, inputs.frames)
+    if inputs.frames is not None and inputs.frames.step != step:
+        console.info(
+            f"One in {inputs.frames.step} frames is used, {source.frame_count} in all (--frames "
+            "names others)."
+        )
+    if look:
+        seen = look_at(source)
+        console.info(seen.describe())
+        for advice in seen.advice():
+            console.warning(advice)
+    return inputs, source
+
+
+def tracked_inputs(inputs: CaptureInputs, poses: Path, masks: Path | None) -> CaptureInputs:
+    """The inputs with tracked poses; `masks` is the folder of tracked masks, if they are used."""
+    inputs = replace(inputs, poses=poses, person=None)
+    return inputs if masks is None else replace(inputs, masks=masks, invert_masks=False)
+
+
+def _import_poses(
+    source: FrameSource, motion: Motion, inputs: CaptureInputs, masks_beside: Path | None
+) -> ImportedCapture:
+    """The recording with poses as a file would hold them."""
+    assert inputs.poses is not None
+    cameras = find_stream_cameras(inputs.video, inputs.cameras)
+    paths = CapturePaths(
+        video=inputs.video, poses=inputs.poses, masks=masks_beside, cameras=cameras
     )
+    body, motion = load_body_model(inputs.body), as_stored(motion, inputs.poses)
+    return import_capture(inputs, paths, source, body, motion)
 
 
 def _check_parts(source: FrameSource, inputs: CaptureInputs, masks: Path | None) -> None:
@@ -248,25 +259,21 @@ def _finds_again(tracker: PersonTracker, source: FrameSource, keypoints: Keypoin
 
 
 def fit_tracked_video(
-    source: FrameSource, tracked: TrackedVideo, inputs: CaptureInputs, masks: Path | None
+    source: FrameSource,
+    tracked: TrackedVideo,
+    inputs: CaptureInputs,
+    masks_beside: Path | None = None,
 ) -> Capture:
     """The recording with poses lifted from the key points and fitted to them and to the masks.
 
-    `masks` is the folder of tracked masks; None if others are used.
+    `inputs` name the poses' file, which is not read, and the masks, unless they lie beside the
+    video.
     """
-    shaped = load_body_model(inputs.body).with_shape()
-    lifted = lift_keypoints(
-        tracked.keypoints, shaped, assume_camera(inputs.video, inputs.cameras, source)
-    )
-    lifted = replace(lifted, space="camera")
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "poses.npz"
-        write_motion(path, lifted)
-        there = replace(inputs, poses=path, person=None, height_m=None)
-        if masks is not None:
-            there = replace(there, masks=masks, invert_masks=False)
-        capture = open_capture(there, skip_checks=True)
-        fit = fit_capture(capture)
+    camera = assume_camera(inputs.video, inputs.cameras, source)
+    lifted = lift_keypoints(tracked.keypoints, load_body_model(inputs.body).with_shape(), camera)
+    imported = _import_poses(source, replace(lifted, space="camera"), inputs, masks_beside)
+    capture = align_capture(imported, skip_checks=True)
+    fit = fit_capture(capture)
     if fit is None:
         return capture
     return replace(
@@ -295,8 +302,8 @@ def person_number(person: str | None) -> int | None:
 
 
 def grade_capture(capture: Capture) -> TrackingGrade | None:
-    """Grade poses that hold the key points that they were made of; None if they do not."""
-    if capture.motion.keypoints is None:
+    """Grade poses that hold the key points that they were made of, by given masks; else None."""
+    if capture.motion.keypoints is None or not capture.masks.is_given:
         return None
     return _grade(capture, _even_frame_times(capture.source))
 
@@ -308,7 +315,6 @@ def _grade(capture: Capture, frame_times_s: Mapping[int, float]) -> TrackingGrad
     sampled = sample_masks(
         source,
         capture.masks,
-        associate_masks(capture.masks, source),
         associate_cameras(capture.cameras, source),
         SkinPoints.of(capture.shaped),
         count=GRADED_FRAMES,

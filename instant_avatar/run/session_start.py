@@ -24,11 +24,12 @@ from instant_avatar.cli.hardware import usable_cores
 from instant_avatar.run.console_reader import ConsoleReader
 from instant_avatar.run.final_scoring import EarlierVideos
 from instant_avatar.run.ingest_arguments import PROGRAM, IngestArguments
-from instant_avatar.run.missing_inputs import remove_unused_tracking
 from instant_avatar.run.run_folder import RunFolder
+from instant_avatar.run.run_tracking import remove_tracking
 from instant_avatar.run.session_events import EventReader, SessionEvent
 from instant_avatar.run.training_session import TrainingSession
 from preprocess.capture_session import Capture
+from preprocess.observation_source import ObservationSource
 
 
 def set_threads(requested: int | None) -> int:
@@ -85,7 +86,7 @@ def prepare_trainer(
 
 def run_session(
     arguments: IngestArguments,
-    capture: Capture,
+    observations: ObservationSource,
     run: RunFolder,
     console: Console,
     readers: Sequence[EventReader],
@@ -97,17 +98,20 @@ def run_session(
     `on_start` is called once an older run has been removed. Ctrl-C asks the session to stop. A
     viewer stays open until Ctrl-C.
     """
+    capture = observations.capture
     with exit_on_interrupt(console, PROGRAM, run.release):
         start = prepare_trainer(arguments, capture, run, console)
         viewer = _open_viewer(arguments, capture, run, console)
     run.start_run(resume=arguments.resume)
-    remove_unused_tracking(arguments, run)
+    if capture.figures("tracking") is None and not arguments.resume:
+        remove_tracking(run)
     on_start()
     try:
         with stop_on_interrupt(console) as stop:
             session = TrainingSession(
-                start.trainer, capture, run, stop, start.notes, restore_count=start.restore_count
-            )
+                start.trainer, observations, run, stop, start.notes,
+                restore_count=start.restore_count,
+            )  # fmt: skip
             watching = () if viewer is None else (viewer.watch(session),)
             with ConsoleReader(session, console) as shown:
                 _show_events(session, [shown, *watching, *readers])
@@ -146,7 +150,7 @@ def _open_viewer(
 
 
 def new_trainer(
-    recording: Capture,
+    capture: Capture,
     *,
     seconds: float,
     steps: int | None = None,
@@ -158,20 +162,20 @@ def new_trainer(
     config = TrainConfig.for_budget(
         seconds,
         steps=steps,
-        footprint_m=recording.pixel_footprint_m(),
-        filmed_footprint_m=recording.pixel_footprint_m(as_filmed=True),
-        pose_uncertainty=recording.pose_uncertainty,
+        footprint_m=capture.pixel_footprint_m(),
+        filmed_footprint_m=capture.pixel_footprint_m(as_filmed=True),
+        pose_uncertainty=capture.pose_uncertainty,
         held_out_stride=hold_every,
         seed=seed,
     )
     config = replace(config, refine_poses=refine_poses)
-    return Trainer(Rig.from_shaped_body(recording.shaped), config)
+    return Trainer(Rig.from_shaped_body(capture.shaped), config)
 
 
 def _new_run(arguments: IngestArguments, capture: Capture) -> PreparedTrainer:
     trainer = new_trainer(
         capture,
-        seconds=arguments.training_seconds(capture),
+        seconds=arguments.training_seconds(capture.source),
         steps=arguments.steps,
         seed=arguments.seed,
         refine_poses=arguments.refine_poses,
@@ -237,7 +241,7 @@ def _budget(
 ) -> tuple[str, float, float]:
     """Return the unit of the training budget, the budget, and what the trainer has used of it."""
     if arguments.steps is None:
-        return "seconds", arguments.training_seconds(capture), trainer.wall_seconds
+        return "seconds", arguments.training_seconds(capture.source), trainer.wall_seconds
     return "steps", float(arguments.steps), float(trainer.steps)
 
 
@@ -247,7 +251,7 @@ def _extend_budget(
     """Add the budget of this command to what earlier videos have used."""
     trainer.config = replace(
         trainer.config,
-        seconds=arguments.training_seconds(capture) + earlier,
+        seconds=arguments.training_seconds(capture.source) + earlier,
         steps=None if arguments.steps is None else arguments.steps + int(earlier),
         refine_poses=arguments.refine_poses,
     )
@@ -269,7 +273,8 @@ def _announce_coverage(capture: Capture, console: Console) -> None:
     frames, selection = capture.geometry().row_frames, capture.source.selection
     rows = np.flatnonzero(capture.motion.valid & np.isfinite(frames)).tolist()
     wanted = [row for row in rows if selection.contains(round(frames[row]))]
-    if capture.live is not None or not wanted:
+    streamed = capture.source.paced or capture.source.frame_count is None
+    if streamed or not wanted:  # of a stream only the first poses are known
         return
     some = wanted[:: -(-len(wanted) // EXPECTED_POSES)]
     views = ((capture.motion[row], capture.camera_of_pose(row)) for row in some)

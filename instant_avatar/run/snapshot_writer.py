@@ -106,8 +106,8 @@ class CheckpointWriter:
         if not self._body_written:
             with atomic_file(self._run.body_file) as path:
                 write_shaped_body(path, self._capture.shaped)
-            if self._capture.fit is not None:
-                self._capture.fit.save(self._run.fit_file, self._capture.identity)
+            for fit in self._capture.fits[-1:]:
+                fit.save(self._run.fit_file, self._capture.identity)
             self._body_written = True
         return time.thread_time() - began
 

@@ -20,7 +20,6 @@ from avatar.training.frame_stream import (
 from avatar.training.train import train
 from avatar.training.trainer import Trainer
 from capture.inbox import Inbox
-from capture.source import RealtimePlayback
 from export.bake.fine_tuning import PosedView
 from instant_avatar.cli.command_line import BAD_INPUT, INTERRUPTED, CommandExit
 from instant_avatar.report.report_schema import CurvePoint, finite_mean, format_percent
@@ -50,8 +49,8 @@ from instant_avatar.run.snapshot_writer import (
 )
 from instant_avatar.run.stream_meter import StreamMeter
 from preprocess.body.body_pose import BodyPose
-from preprocess.capture_session import Capture
 from preprocess.observation import Observation
+from preprocess.observation_source import ObservationSource
 
 FINE_TUNING = "fine-tuning the package"
 """The stage in which the package is replaced by one with finer detail."""
@@ -71,7 +70,7 @@ class TrainingSession:
     def __init__(
         self,
         trainer: Trainer,
-        recording: Capture,
+        observations: ObservationSource,
         run: RunFolder,
         stop: threading.Event,
         notes: dict[str, Any],
@@ -84,7 +83,8 @@ class TrainingSession:
         was trained on `restore_count` frames of this video before; they are read back into its
         replay buffer before the clock starts.
         """
-        self.trainer, self._recording, self._run = trainer, recording, run
+        self.trainer, self._source, self._run = trainer, observations, run
+        self._capture, self._frames = observations.capture, observations.frames
         self.stop, self._notes, self._restore_count = stop, notes, restore_count
         self.curve: list[CurvePoint] = [
             CurvePoint.from_checkpoint(kept) for kept in notes.get("curve", [])
@@ -92,9 +92,9 @@ class TrainingSession:
         self.held_out: list[HeldOutFrame] = []
         self.newest_observation: Observation | None = None
         self._revised_poses: dict[int, BodyPose] = {}
-        self._checkpoints = CheckpointWriter(run, recording)
-        self.meter = StreamMeter(stop, recording.source)
-        self.coverage = Coverage(recording.shaped)
+        self._checkpoints = CheckpointWriter(run, observations.capture)
+        self.meter = StreamMeter(stop, observations.frames)
+        self.coverage = Coverage(observations.capture.shaped)
         if "coverage" in notes:
             self.coverage.merge_state(notes["coverage"])
         self.is_interrupted = False
@@ -114,7 +114,7 @@ class TrainingSession:
         """
         yield from self._train(report_progress)
         self._check_trained()
-        views = validation_views(self.held_out, self._recording)
+        views = validation_views(self.held_out, self._capture)
         self.trainer.replay.clear_correspondences()  # nothing is learnt from here on
         yield from self._write_packages(views, report_progress)
         EarlierVideos(self._run, self._notes).save_frames(self.trainer, self.held_out)
@@ -124,7 +124,7 @@ class TrainingSession:
     def save_package(self) -> PackageSnapshot:
         """Write the avatar in its current state, between two steps."""
         (taken,) = write_packages(
-            self.trainer, self._run.package, validation_views(self.held_out, self._recording),
+            self.trainer, self._run.package, validation_views(self.held_out, self._capture),
             curve_point=self.curve[-1] if self.curve else None, fine_tune=False,
         )  # fmt: skip
         return taken
@@ -136,13 +136,14 @@ class TrainingSession:
         return self._result
 
     def _train(self, report_progress: Callable[[Progressed], object]) -> Iterator[SessionEvent]:
-        source = self._recording.source
-        self._set_unpaced(self._restore_count > 0)
-        inbox = Inbox(self._frame_stream(), paced=source.paced, live=source.live)
+        source = self._frames
+        self._source.set_catch_up(self._restore_count > 0)
+        grows = source.frame_count is None and not source.live
+        inbox = Inbox(self._frame_stream(), paced=source.paced, live=source.live, ends_run=grows)
         try:
             restored = self._restore_frames(inbox, self._restore_count, report_progress)
             added = restored - self.trainer.frames_seen
-            self._set_unpaced(False)
+            self._source.set_catch_up(False)
             self._checkpoints.restart_interval()
             for event in train(self.trainer, inbox, self.held_out):
                 yield from self._handle_event(event, inbox)
@@ -156,7 +157,7 @@ class TrainingSession:
         self.meter.inbox_dropped, self.is_interrupted = inbox.dropped, self.stop.is_set()
         for message in [*source.warnings, *self.meter.lateness_warnings()]:
             yield Warned(message=message)
-        for message in self._recording.final_notes():
+        for message in self._source.notes():
             yield Noted(message=message)
         if len(self.trainer.replay):
             seen = format_percent(self.coverage.seen_share)
@@ -248,22 +249,17 @@ class TrainingSession:
         reasons = Counter(drop.reason for drop in self.meter.dropped)
         why = ", ".join(f"{count} x {reason}" for reason, count in reasons.most_common(3))
         raise CommandExit(
-            f"no frame of {self._recording.source.path} could be used ({why or 'it has none'}); at "
+            f"no frame of {self._frames.path} could be used ({why or 'it has none'}); at "
             "least two usable frames are needed. No avatar was written.",
             BAD_INPUT,
         )
 
-    def _set_unpaced(self, unpaced: bool) -> None:
-        """Deliver frames without delay while a resumed run reads back what it has seen."""
-        if isinstance(self._recording.source, RealtimePlayback):
-            self._recording.source.catch_up = unpaced
-
     def _frame_stream(self) -> Iterator[StreamItem]:
         """Prepare frames; runs on the inbox's thread."""
-        frames = self.meter.measure_arrival(self._recording.source.frames())
-        found = self.meter.count_observations(map(self._recording.observation_builder(), frames))
+        frames = self.meter.measure_arrival(self._frames.frames())
+        found = self.meter.count_observations(map(self._source.join, frames))
         rig, every = self.trainer.avatar.rig, self.trainer.config.held_out_stride
-        total = self._recording.source.frame_count
+        total = self._frames.frame_count
         items = self._watch(separate_held_out(found, stride=every, total=total))
         return self.meter.measure_preparation(prepare_items(items, rig))
 
@@ -298,7 +294,7 @@ class TrainingSession:
 
     def _revise_poses(self) -> None:
         """Bring along the poses of earlier frames that a stream's later frames have improved."""
-        found = self._recording.take_revised_poses()
+        found = self._source.take_revised_poses()
         for place, frame in enumerate(self.held_out):
             pose = found.get(frame.observation.frame.index)
             if pose is not None:

@@ -30,6 +30,7 @@ from preprocess.body.body_surface import SkinPoints
 from preprocess.body.parametric_body import BodyModel, ShapedBody, read_shaped_body
 from preprocess.body.proportion_space import shape_for_motion
 from preprocess.cameras.camera_file import CameraTrack
+from preprocess.masks.mask_sources import StoredMasks
 from preprocess.poses.motion_builder import place_in_camera_world
 
 FOCAL_SAMPLES = 6
@@ -50,7 +51,8 @@ def estimate_focal_length(
     their size and the focal length are ambiguous.
     """
     cameras, geometry = evidence.cameras, evidence.geometry(motion)
-    if evidence.masks is None or motion.body_model != shaped.body.family:
+    of_files = isinstance(evidence.masks, StoredMasks)
+    if not of_files or motion.body_model != shaped.body.family:
         return cameras
     objective = evidence.silhouettes(SkinPoints.of(shaped), geometry, FOCAL_SAMPLES)
     if objective is None:

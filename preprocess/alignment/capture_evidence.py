@@ -29,8 +29,8 @@ from preprocess.body.body_surface import (
     SkinPoints,
 )
 from preprocess.cameras.camera_file import CameraTrack
-from preprocess.masks.mask_files import Masks
-from preprocess.observation import associate_cameras, associate_masks
+from preprocess.masks.mask_sources import MaskSource
+from preprocess.observation import associate_cameras
 from preprocess.plugins import DEFAULT_SEGMENTER, make_segmenter
 
 IMAGE_PERSON_PX = 130
@@ -138,18 +138,18 @@ class CaptureEvidence(NamedTuple):
 
     Attributes:
         source: The frames; few are decoded, and none if there are mask files.
-        masks: The masks; None if the images have an alpha channel, or there are none.
+        masks: Given masks; None if there are none.
         cameras: Cameras of the frames' size.
     """
 
     source: FrameSource
-    masks: Masks | None
+    masks: MaskSource | None
     cameras: CameraTrack
 
     @property
     def has_masks(self) -> bool:
         """True if there are mask files, or alpha channels in their place."""
-        return self.masks is not None or self.source.has_alpha
+        return self.masks is not None
 
     def geometry(self, motion: Motion) -> CaptureGeometry:
         """The geometry of a motion, as the files state it."""
@@ -168,15 +168,12 @@ class CaptureEvidence(NamedTuple):
         the person in the reduced masks.
         """
         try:
-            if not self.has_masks:
+            if self.masks is None:
                 images = sample_video(geometry, skin, self.cameras, self.source)
                 return estimate_silhouettes(geometry, skin, images)
-            rows = (
-                associate_masks(self.masks, self.source),
-                associate_cameras(self.cameras, self.source),
-            )
+            camera_row = associate_cameras(self.cameras, self.source)
             return sample_masks(
-                self.source, self.masks, *rows, skin, count=count, person_px=person_px,
+                self.source, self.masks, camera_row, skin, count=count, person_px=person_px,
                 excluded_frames=self.cameras.frames_without_camera,
             )  # fmt: skip
         except InputError:

@@ -24,7 +24,7 @@ from preprocess.body.parametric_body import ShapedBody
 from preprocess.fitting.clip_poses import ClipPoses
 from preprocess.fitting.keypoint_rows import KEYPOINT_JOINTS, KEYPOINT_OFFSETS_M, PIXEL_WEIGHTS
 from preprocess.masks.color_models import DarkFilmBrightener
-from preprocess.observation import alpha_channel_mask
+from preprocess.masks.mask_sources import alpha_channel_mask
 from preprocess.tracking.blazepose_networks import (
     BlazePoseDetector,
     BlazePoseLandmarks,

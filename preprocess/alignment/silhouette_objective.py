@@ -7,9 +7,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from capture.image_folder import list_images, read_image
 from capture.input_error import InputError
-from capture.source import Frame, FrameSource
+from capture.source import FrameSource
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.body.body_pose import Motion
 from preprocess.body.body_surface import (
@@ -18,8 +17,7 @@ from preprocess.body.body_surface import (
     soft_iou,
     splat_silhouette,
 )
-from preprocess.masks.mask_files import Masks
-from preprocess.observation import alpha_channel_mask
+from preprocess.masks.mask_sources import MaskSource
 
 GOOD_IOU = 0.7
 """Mean IoU of body and masks from which a capture is good."""
@@ -179,8 +177,7 @@ def spaced_indices(total: int, count: int) -> list[int]:
 
 def sample_masks(
     source: FrameSource,
-    masks: Masks | None,
-    mask_row: Callable[[int], int],
+    masks: MaskSource,
     camera_row: Callable[[int], int],
     skin: SkinPoints,
     *,
@@ -191,8 +188,8 @@ def sample_masks(
     """Read a few masks; images are decoded only where their alpha channel is the mask.
 
     Args:
-        masks: The masks; None if the images have an alpha channel.
-        mask_row, camera_row: From a frame number to its mask, and to its camera.
+        masks: Given masks.
+        camera_row: From a frame number to its camera.
         person_px: Height of the person in the reduced masks, px.
 
     Raises:
@@ -203,10 +200,8 @@ def sample_masks(
     usable = [frame for frame in usable if frame not in excluded_frames] or usable
     frames = [usable[n] for n in spaced_indices(len(usable), count)]
     size_px = _scaled_size(source.size_px, COARSE_MASK_PX)
-    if masks is None:
-        found, refused = _sample_alpha_channels(source, frames, size_px), []
-    else:
-        found, refused = _sample_mask_files(masks, frames, mask_row, size_px)
+    masks.check()
+    found, refused = _read_masks(masks, frames, size_px)
     found = [(index, alpha) for index, alpha in found if (alpha > 0.5).any()]
     if not found:
         raise InputError(
@@ -232,32 +227,17 @@ def reduce_masks(
     return tuple(replace(each, alpha=_resize_alpha(each.alpha, small)) for each in samples)
 
 
-def _sample_mask_files(
-    masks: Masks, frames: Sequence[int], row: Callable[[int], int], size_px: tuple[int, int]
+def _read_masks(
+    masks: MaskSource, frames: Sequence[int], size_px: tuple[int, int]
 ) -> tuple[list[tuple[int, Float32[np.ndarray, "_ _"]]], list[str]]:
     """The usable masks, and why others cannot be used."""
     found, refused = [], []
     for index in frames:
         try:
-            found.append((index, masks.alpha(row(index), size_px)))
+            found.append((index, masks.read(index, size_px)))
         except InputError as cause:
             refused.append(str(cause))
     return found, refused
-
-
-def _sample_alpha_channels(
-    source: FrameSource, frames: Sequence[int], size_px: tuple[int, int]
-) -> list[tuple[int, Float32[np.ndarray, "_ _"]]]:
-    found, paths = [], list_images(source.path)  # only images have alpha channels
-    for index in frames:
-        try:
-            rgb, alpha = read_image(paths[index])
-            if rgb.shape[1::-1] == source.size_px:
-                frame = Frame(index=index, time_s=0.0, rgb=rgb, alpha=alpha)
-                found.append((index, alpha_channel_mask(frame, size_px)))
-        except (InputError, OSError):  # one of many; damaged frames are reported elsewhere
-            continue
-    return found
 
 
 def _scaled_size(size_px: tuple[int, int], longer: float) -> tuple[int, int]:

@@ -24,7 +24,7 @@ from preprocess.body.body_pose import Motion
 from preprocess.body.body_surface import SkinPoints
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.proportion_space import SIGMA_BETA, ProportionSpace
-from preprocess.capture_session import Capture
+from preprocess.capture_session import Capture, Provenance
 from preprocess.fitting.capture_fit import CaptureFit
 from preprocess.fitting.clip_fitting import (
     SIGMA_LOG_ASSUMED_FOCAL,
@@ -75,8 +75,12 @@ def apply_fit(capture: Capture, fit: CaptureFit, *, height_m: float | None = Non
     A static camera shows only the ratio of size and distance: the person keeps its size. A stated
     height stays, and the person of a finished avatar does not change at all.
     """
+    made = Provenance(
+        part="fit", origin="outlines of the masks", uncertainty=fit.share, figures=fit.as_json(),
+        notes=(fit.describe(),) if fit.share else (),
+    )  # fmt: skip
     if not fit.share:
-        return replace(capture, fit=fit)
+        return capture.with_part(made, fits=(*capture.fits, fit))
     geometry = capture.geometry()
     motion, cameras = fit.correct_motion(geometry), fit.scale_focal_lengths(capture.cameras)
     shaped = fit.shape(capture.shaped) if fit.fits_body else capture.shaped
@@ -86,10 +90,9 @@ def apply_fit(capture: Capture, fit: CaptureFit, *, height_m: float | None = Non
         sized = scale_to_height(shaped, height_m)
         there = CaptureGeometry.of(motion, cameras, capture.source)
         motion, shaped = rescale_motion(there, shaped, sized), sized
-    return replace(
-        capture, motion=motion, shaped=shaped, cameras=cameras, fit=fit,
-        notes=(*capture.notes, fit.describe()),
-    )  # fmt: skip
+    return capture.with_part(
+        made, motion=motion, shaped=shaped, cameras=cameras, fits=(*capture.fits, fit)
+    )
 
 
 def _size_ratio(one: ShapedBody, other: ShapedBody) -> float:
@@ -170,13 +173,10 @@ def _iterate_until_settled(fitter: ClipFitter, fitted: FitParameters) -> list[fl
 
 def make_fitter(capture: Capture) -> ClipFitter | None:
     """The problem of a capture's spread masks and key points; None without enough of them."""
-    track, has_masks = capture.motion.keypoints, capture.masks is not None
-    has_masks |= capture.source.has_alpha or capture.segment is not None
-    if capture.live is not None or not (has_masks or track):
-        return None
+    track = capture.motion.keypoints
     geometry, space = capture.geometry(), ProportionSpace.around(capture.shaped)
     count = TRACKED_KEY_FRAMES if track else KEY_FRAMES
-    outlines = _read_outlines(capture, geometry, count) if has_masks else {}
+    outlines = _read_outlines(capture, geometry, count)
     others = _spread_frames(capture.source) if track is None else track.frames.tolist()
     numbers = {*outlines, *others}
     sizes = [each.camera.size_px for each in outlines.values()]
@@ -237,7 +237,7 @@ def _read_outlines(
 ) -> dict[int, OutlineDistances]:
     """Outlines of evenly spread masks, by frame."""
     objective = _observe_silhouettes(capture, count)
-    if objective is None and capture.segment is None:
+    if objective is None and capture.masks.is_given:
         evidence = CaptureEvidence(capture.source, capture.masks, capture.cameras)
         skin = SkinPoints.of(capture.shaped, 1)
         objective = evidence.silhouettes(skin, geometry, count, OUTLINE_PERSON_PX)
@@ -258,9 +258,8 @@ def _observe_silhouettes(capture: Capture, count: int) -> SilhouetteObjective | 
     What refines masks then knows the background from the video's first frame on. None if there is
     no such mask: given ones that stay as they are can be read without frames.
     """
-    estimated, tracked = capture.segment is not None, capture.motion.keypoints is not None
-    refine = None if estimated or tracked else capture.mask_refiner
-    if refine is None and not estimated:
+    masks, tracked = capture.masks, capture.motion.keypoints is not None
+    if masks.is_given and (tracked or not masks.needs_all_frames):
         return None
     source, observe = capture.source, capture.observation_builder()
     chosen, camera_row = source.selection, associate_cameras(capture.cameras, source)
@@ -271,9 +270,9 @@ def _observe_silhouettes(capture: Capture, count: int) -> SilhouetteObjective | 
         if isinstance(each, Observation):
             index = each.frame.index
             samples.append(MaskSample(index=index, camera_row=camera_row(index), alpha=each.alpha))
-        if refine is not None and refine.keeps_given_masks:
+        if not masks.needs_all_frames:
             return None
-    if not samples or (refine is not None and not refine.is_needed):
+    if not samples or (masks.is_given and not masks.is_refined):
         return None
     samples = reduce_masks(samples, source.size_px, OUTLINE_PERSON_PX)
     return SilhouetteObjective(samples=samples, skin=SkinPoints.of(capture.shaped, 1))
@@ -282,7 +281,7 @@ def _observe_silhouettes(capture: Capture, count: int) -> SilhouetteObjective | 
 def _reduction(capture: Capture, fitter: ClipFitter) -> float:
     """Size of a pixel of the reduced masks, in pixels that training sees."""
     longer = max(capture.source.size_px)
-    return min(capture.size_px or longer, longer) / max(fitter.frames[0].camera.size_px)
+    return min(capture.size_px, longer) / max(fitter.frames[0].camera.size_px)
 
 
 def _interpolate_corrections(

@@ -259,8 +259,9 @@ def _color_bins(colors: Float32[np.ndarray, "3 *pixels"]) -> Int[np.ndarray, "*p
 class GivenMaskRefiner:
     """Refines the masks of a recording or a stream, frame by frame in order, if that is needed."""
 
-    def __init__(self) -> None:
-        """Start before the first frame."""
+    def __init__(self, *, enabled: bool = True) -> None:
+        """Start before the first frame; masks stay as they are unless it is `enabled`."""
+        self._enabled = enabled
         self._refiner: MaskRefiner | None = None
         self._size_px = (0, 0)
         self._ratios: list[float] = []
@@ -283,8 +284,9 @@ class GivenMaskRefiner:
 
     @property
     def keeps_given_masks(self) -> bool:
-        """True once enough frames have shown that the given masks need no refinement."""
-        return len(self._ratios) >= COMPARED_FRAMES and not self.is_needed
+        """True once it is known that the given masks need no refinement, or shall have none."""
+        decided = not self._enabled or len(self._ratios) >= COMPARED_FRAMES
+        return decided and not self.is_needed
 
     def __call__(
         self,

@@ -114,7 +114,17 @@ def _read_lines(path: Path) -> Arrays:
 
 
 def write_motion(path: Path, motion: Motion) -> None:
-    """Write a motion in the keys that `read_motion` reads; reading gives the same numbers."""
+    """Write a motion in the keys that `read_motion` reads; reading gives `as_stored`."""
+    arrays: dict[str, Any] = _motion_arrays(motion)
+    np.savez_compressed(path, **arrays)
+
+
+def as_stored(motion: Motion, path: Path) -> Motion:
+    """The motion as a file would give it back: key points rounded, notes left out."""
+    return motion_from_arrays(_motion_arrays(motion), path)
+
+
+def _motion_arrays(motion: Motion) -> Arrays:
     arrays = {
         "betas": motion.betas,
         "global_orient": motion.root_rotations,
@@ -130,8 +140,7 @@ def write_motion(path: Path, motion: Motion) -> None:
         "proportions": motion.proportions,
         **({} if motion.keypoints is None else motion.keypoints.as_arrays()),
     }
-    present: dict[str, Any] = {key: array for key, array in arrays.items() if array is not None}
-    np.savez_compressed(path, **present)
+    return {key: array for key, array in arrays.items() if array is not None}
 
 
 def _read_numbers(arrays: Arrays, key: str, path: Path) -> Float[np.ndarray, "..."]:

@@ -1,7 +1,6 @@
 """Solve the cameras of an opened capture, and bring it into their world."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -13,8 +12,8 @@ from capture.input_error import InputError
 from capture.source import Frame
 from preprocess.body.body_surface import MeshSilhouette
 from preprocess.cameras.camera_file import ASSUMED_CAMERA_SOURCE
-from preprocess.capture_session import Capture
-from preprocess.observation import alpha_channel_mask, associate_masks, associate_poses
+from preprocess.capture_session import Capture, Provenance
+from preprocess.observation import associate_poses
 from preprocess.sfm.camera_solution import CameraSolution
 from preprocess.sfm.camera_solver import SolverSettings, solve_cameras
 from preprocess.sfm.colmap_mapping import PersonMaskFn
@@ -44,14 +43,12 @@ def solve_capture_cameras(
 def make_person_mask(capture: Capture) -> PersonMaskFn:
     """Make the function that finds the person: by the masks, or by the posed body and a margin."""
     source = capture.source
-    if capture.masks is not None or source.has_alpha:
-        row_of = associate_masks(capture.masks, source)
+    if capture.masks.is_given:
+        capture.masks.check()
 
         def by_mask(frame: Frame, size_px: tuple[int, int]) -> Bool[np.ndarray, "_ _"] | None:
             try:
-                if capture.masks is None:
-                    return alpha_channel_mask(frame, size_px) > MASK_THRESHOLD
-                return capture.masks.alpha(row_of(frame.index), size_px) > MASK_THRESHOLD
+                return capture.masks.read(frame.index, size_px) > MASK_THRESHOLD
             except InputError:  # one damaged mask
                 return None
 
@@ -84,17 +81,18 @@ def apply_camera_solution(capture: Capture, solved: CameraSolution) -> Capture:
             f"{solved.background_motion:.2%} of the picture), so there was nothing to solve."
         )
         report = solution_report(solved, None, capture.source)
-        return replace(capture, notes=(*capture.notes, note), camera_report=report)
+        return capture.with_part(
+            Provenance(part="cameras", origin="solved", notes=(note,), figures=report)
+        )
     placement = place_in_metric_world(
         solved, capture.motion, _tracker_camera(capture), capture.shaped, capture.source
     )
     report = solution_report(solved, placement, capture.source)
-    return replace(
-        capture,
+    notes = (_describe_solution(report, placement),)
+    return capture.with_part(
+        Provenance(part="cameras", origin="solved", notes=notes, figures=report),
         cameras=placement.cameras,
         motion=placement.motion,
-        camera_report=report,
-        notes=(*capture.notes, _describe_solution(report, placement)),
     )
 
 

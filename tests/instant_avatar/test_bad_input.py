@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from instant_avatar import ingest
+from instant_avatar.run import run_capture
 from preprocess.capture_session import CaptureInputs
 from preprocess.open_capture import open_capture
 
@@ -20,7 +21,7 @@ def refused(call_ingest, tmp_path, monkeypatch):
 
     What might mend the capture takes ten seconds to find; tests of ia-check ask for that.
     """
-    monkeypatch.setattr(ingest, "correction_hint", lambda inputs: "")
+    monkeypatch.setattr(run_capture, "correction_hint", lambda imported: "")
 
     def check(*arguments, words):
         outcome = call_ingest(*arguments, "--out", tmp_path / "run")

@@ -12,6 +12,7 @@ from capture.source_opening import open_source
 from preprocess.body.body_pose import Motion
 from preprocess.cameras.camera_file import CameraTrack, assume_static_camera
 from preprocess.masks.mask_files import open_masks
+from preprocess.masks.mask_sources import AlphaChannelMasks, StoredMasks
 from preprocess.observation import (
     DroppedFrame,
     Observation,
@@ -64,7 +65,8 @@ def parts(images):
 
 def observe(source, motion, masks, cameras, **options):
     """Observations of the wanted frames in order, lazily."""
-    return map(observation_builder(source, motion, masks, cameras, **options), source.frames())
+    given = AlphaChannelMasks(source) if masks is None else StoredMasks(masks, source)
+    return map(observation_builder(source, motion, given, cameras, **options), source.frames())
 
 
 def rows_of(observations) -> list[int]:
@@ -172,12 +174,6 @@ def test_empty_and_unreadable_masks_are_dropped_and_listed(parts, images):
     assert "mask unusable" in reasons[3]
     assert reasons[5] == "mask empty"
     assert "64x48 px, its image 48x64" in reasons[6]
-
-
-def test_without_masks_and_a_segmenter_there_is_nothing_to_do(parts):
-    source, _, cameras = parts()
-    with pytest.raises(InputError, match=r"--masks.*segmenter:blazepose"):
-        observe(source, moving(COUNT), None, cameras)
 
 
 def test_the_alpha_channel_of_the_pictures_serves_as_mask(tmp_path):

@@ -14,11 +14,19 @@ from preprocess.body.body_surface import splat_silhouette
 from preprocess.body.parametric_body import load_body_model
 from preprocess.cameras.camera_file import CameraTrack, write_cameras
 from preprocess.cameras.camera_orientation import assume_camera
-from preprocess.capture_session import CaptureInputs
+from preprocess.capture_paths import CapturePaths
+from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.fitting.tracked_frames import LAG_FRAMES, EarlierPoses
+from preprocess.masks.mask_sources import EstimatedMasks
 from preprocess.observation import DroppedFrame, Observation
 from preprocess.open_capture import open_tracked_stream
-from preprocess.tracked_stream import NOT_FOUND, LiveTracking, TrackedStream
+from preprocess.tracked_stream import (
+    NOT_FOUND,
+    LiveTracking,
+    TrackedMasks,
+    TrackedObservations,
+    TrackedStream,
+)
 from preprocess.tracking.keypoints import CroppedMask, PersonKeypoints
 
 COUNT = 24
@@ -105,15 +113,24 @@ def plain(rgb, mask, size_px):
 
 def started(tracker, source=None):
     stream = TrackedStream(source or Pictures())
-    tracking = LiveTracking(stream, tracker, plain)
+    tracking = LiveTracking(stream, tracker)
     camera = assume_camera(Path("film.mp4"), "static", stream)
     start = tracking.start(load_body_model(None).with_shape(), camera)
     return stream, tracking, start
 
 
-def observe_all(stream, tracking, start):
-    build = tracking.observation_builder(stream, start.cameras, None)
-    return [build(frame) for frame in stream.frames()]
+def observations(stream, tracking, start, masks=None):
+    capture = Capture(
+        paths=CapturePaths(video=stream.path, poses=stream.path, masks=None, cameras=None),
+        source=stream, motion=start.motion, masks=masks or TrackedMasks(tracking, plain),
+        cameras=start.cameras, shaped=start.shaped, size_px=max(SIZE), provenance=(),
+    )  # fmt: skip
+    return TrackedObservations(capture, tracking)
+
+
+def observe_all(stream, tracking, start, masks=None):
+    source = observations(stream, tracking, start, masks)
+    return [source.join(frame) for frame in stream.frames()]
 
 
 def test_every_frame_has_a_pose_and_a_mask(standing):
@@ -123,15 +140,15 @@ def test_every_frame_has_a_pose_and_a_mask(standing):
     places = np.array([item.pose.root_translation for item in seen])
     assert np.abs(np.diff(places, axis=0)).max() < 0.02
     assert all(item.alpha.max() > 0.9 for item in seen)
-    assert list(tracking.final_notes()) == []
+    assert list(tracking.notes()) == []
 
 
 def test_earlier_poses_are_fitted_to_the_masks_that_are_learnt_from(standing, monkeypatch):
     fitted = []
     monkeypatch.setattr(EarlierPoses, "add", lambda earlier, seen, pose: fitted.append(seen))
     stream, tracking, start = started(Tracker(standing))
-    tracking.given_masks = lambda frame, size_px: np.full(size_px[::-1], 0.9, dtype=np.float32)
-    seen = observe_all(stream, tracking, start)
+    masks = EstimatedMasks(lambda frame, pose, camera: np.full(SIZE[::-1], 0.9, dtype=np.float32))
+    seen = observe_all(stream, tracking, start, masks)
     assert [each.number for each in fitted] == [item.frame.index for item in seen]
     assert all(np.allclose(each.mask, 0.9) for each in fitted)
 
@@ -150,7 +167,7 @@ def test_frames_without_the_person_are_dropped_and_reported(standing):
     seen = observe_all(stream, tracking, start)
     assert seen[10] == DroppedFrame(index=10, reason=NOT_FOUND)
     assert isinstance(seen[12], Observation)
-    assert "not found in 2 of 24 frames, between 0.3 and 0.4 s" in " ".join(tracking.final_notes())
+    assert "not found in 2 of 24 frames, between 0.3 and 0.4 s" in " ".join(tracking.notes())
 
 
 def test_late_frames_are_left_out(standing, monkeypatch):
@@ -176,7 +193,7 @@ def test_a_stream_without_a_person_is_bad_input(standing):
 
 def test_a_finished_avatars_person_keeps_the_body(standing):
     stream = TrackedStream(Pictures())
-    tracking = LiveTracking(stream, Tracker(standing), plain)
+    tracking = LiveTracking(stream, Tracker(standing))
     shaped = load_body_model(None).with_shape()
     person = replace(shaped, joints=1.1 * shaped.joints, vertices=1.1 * shaped.vertices)
     camera = assume_camera(Path("film.mp4"), "static", stream)
@@ -188,7 +205,7 @@ def test_a_stated_focal_length_changes_less_than_an_assumed_one(standing):
     changes = []
     for stated in (False, True):
         stream = TrackedStream(Pictures())
-        tracking = LiveTracking(stream, Tracker(standing), plain)
+        tracking = LiveTracking(stream, Tracker(standing))
         guess = assume_camera(Path("film.mp4"), "static", stream).scale_focal(1.3)
         shaped = load_body_model(None).with_shape()
         start = tracking.start(shaped, guess, stated_focal=stated)
@@ -211,7 +228,7 @@ def test_a_live_folder_takes_the_focal_length_of_a_camera_file(standing, tmp_pat
     def focal_px(cameras: str | None) -> float:
         named = CaptureInputs(video=folder, live=True, cameras=cameras)
         opened = open_tracked_stream(named, Tracker(standing), lambda size: plain, tmp_path / "p")
-        return opened.cameras[0].focal_px[0]
+        return opened.capture.cameras[0].focal_px[0]
 
     told = focal_px(None if beside else str(file))
     unknown = focal_px("static")

@@ -10,7 +10,7 @@ import pytest
 from benchmarks.camera_accuracy import fit_similarity
 from capture.input_error import InputError
 from export.bake.bake_tables import ExportRefused
-from instant_avatar.run import missing_inputs
+from instant_avatar.run import run_capture
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.alignment.mask_alignment import body_height_m
 from preprocess.cameras.camera_file import read_cameras, write_cameras
@@ -61,7 +61,7 @@ def ingest_walk(walkaround, solution, call_ingest, monkeypatch, tmp_path):
                 raise raised
             return solution
 
-        monkeypatch.setattr(missing_inputs, "solve_capture_cameras", solve)
+        monkeypatch.setattr(run_capture, "solve_capture_cameras", solve)
         return call_ingest(
             walkaround / "video.mp4", "--poses", walkaround / "poses.npz", "--cameras", "solve",
             "--out", tmp_path / "run", "--threads", 1,
@@ -93,9 +93,9 @@ def test_a_capture_comes_to_stand_in_a_metric_world(walkaround, solution):
         np.testing.assert_allclose(before, after, atol=1.5)  # the focal length was solved, too
     lenses = [each.cameras[0].focal_px[0] for each in (still, found)]
     assert lenses[1] == pytest.approx(lenses[0], rel=1e-9)  # stated, and near what was solved
-    assert found.camera_report["verdict"] == "solved"
-    assert found.camera_report["frames"]["key"] == FRAMES
-    assert set(found.camera_report["scale"]["cues"]) <= {"ground", "in place"}
+    assert found.figures("cameras")["verdict"] == "solved"
+    assert found.figures("cameras")["frames"]["key"] == FRAMES
+    assert set(found.figures("cameras")["scale"]["cues"]) <= {"ground", "in place"}
 
 
 def test_poses_of_an_unknown_lens_are_right_for_the_solved_one(
@@ -131,8 +131,8 @@ def test_a_stated_height_is_the_size_of_everything(walkaround, solution):
         )
     one, other = (apply_camera_solution(recording, solution) for recording in (plain, taller))
     ratio = (
-        other.camera_report["scale"]["metres_per_unit"]
-        / one.camera_report["scale"]["metres_per_unit"]
+        other.figures("cameras")["scale"]["metres_per_unit"]
+        / one.figures("cameras")["scale"]["metres_per_unit"]
     )
     assert ratio == pytest.approx(1.1, rel=1e-3)
 
@@ -143,7 +143,7 @@ def test_a_camera_that_stood_stays_where_it_is(walkaround, solution):
     found = apply_camera_solution(recording, standing)
     assert found.cameras is recording.cameras
     assert found.motion is recording.motion
-    assert found.camera_report["verdict"] == "still"
+    assert found.figures("cameras")["verdict"] == "still"
     assert "stood still" in found.notes[-1]
 
 

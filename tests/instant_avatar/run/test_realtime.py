@@ -6,9 +6,10 @@ import time
 import pytest
 
 from capture.source import PacingClock
+from capture.source_opening import open_source
 from instant_avatar import ingest
 from instant_avatar.run.ingest_arguments import IngestArguments
-from preprocess import capture_session
+from preprocess import observation_source
 
 
 @pytest.fixture
@@ -50,7 +51,7 @@ def waits(monkeypatch):
     """What is waited for frames from now on, seconds; time stands still but in these waits."""
     found, began = [], time.perf_counter()
     pace = PacingClock(clock=lambda: began + sum(found), wait=found.append)
-    monkeypatch.setattr(capture_session, "PacingClock", lambda: pace)
+    monkeypatch.setattr(observation_source, "PacingClock", lambda: pace)
     return found
 
 
@@ -71,4 +72,6 @@ def test_what_a_resumed_run_saw_before_is_not_played_again(play, film, request):
 )  # fmt: skip
 def test_without_seconds_a_minute_or_the_clip_is_learnt(film, words, seconds):
     given = IngestArguments(video=film, **words)
-    assert given.training_seconds(given.open_capture()) == pytest.approx(seconds)
+    assert given.training_seconds(
+        open_source(film, frames=given.capture_inputs().frames)
+    ) == pytest.approx(seconds)

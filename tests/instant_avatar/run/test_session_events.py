@@ -21,6 +21,7 @@ from instant_avatar.run.session_events import Ended, PackageWritten, Scored, Ses
 from instant_avatar.run.training_session import TrainingSession
 from preprocess.capture_session import CaptureInputs
 from preprocess.observation import DroppedFrame
+from preprocess.observation_source import RecordedObservations
 from preprocess.open_capture import open_capture
 
 
@@ -127,7 +128,11 @@ def test_ctrl_c_after_the_package_leaves_out_the_rest_and_keeps_everything(
 def test_the_newest_frame_is_shown_and_coverage_counts_those_that_are_learnt(film, tmp_path):
     capture = open_capture(CaptureInputs(video=film))
     session = TrainingSession(
-        Trainer.__new__(Trainer), capture, RunFolder(path=tmp_path / "run"), threading.Event(), {}
+        Trainer.__new__(Trainer),
+        RecordedObservations(capture),
+        RunFolder(path=tmp_path / "run"),
+        threading.Event(),
+        {},
     )
     observations = list(capture.observations())
     stream = [*observations[:4], DroppedFrame(index=4, reason="lost"), *observations[5:24]]

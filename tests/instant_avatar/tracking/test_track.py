@@ -70,8 +70,7 @@ def test_a_capture_opens_from_what_was_written(tracked):
     capture = open_capture(
         CaptureInputs(video=tracked / "video.mp4", poses=tracked / "out" / "poses.npz")
     )
-    assert capture.masks is not None
-    assert capture.masks.path == tracked / "out" / "masks"
+    assert capture.masks.files.path == tracked / "out" / "masks"
     assert capture.cameras.source == "K of the poses"
     assert capture.motion.proportions is not None
 
@@ -175,7 +174,7 @@ def test_what_was_found_before_ctrl_c_is_kept(video, tmp_path):
     assert found.grade.frames == 9
     assert len(read_motion(tmp_path / "out" / "poses.npz")) == 9
     assert len(list((tmp_path / "out" / "masks").glob("*.png"))) == 9
-    assert open_capture(found.inputs).source.frame_count == 9
+    assert open_capture(found.imported.inputs).source.frame_count == 9
 
 
 def test_frames_that_had_better_not_be_learnt_from_have_no_valid_pose(video, tmp_path, monkeypatch):

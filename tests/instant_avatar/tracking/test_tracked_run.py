@@ -12,7 +12,7 @@ from avatar.training.trainer import Trainer
 from instant_avatar import ingest
 from instant_avatar.cli.console import Console
 from instant_avatar.evaluation.evaluation_frames import held_out_frames
-from instant_avatar.run import missing_inputs, person_tracking
+from instant_avatar.run import person_tracking, run_tracking
 from instant_avatar.run.run_folder import RunFolder
 from preprocess import tracked_stream
 from preprocess.capture_session import CaptureInputs
@@ -67,11 +67,11 @@ def test_a_video_alone_is_tracked_and_learnt(ingest_video, monkeypatch):
     assert read_motion(out / "tracking" / "poses.npz").proportions is not None
     assert "Good enough for an avatar" in (out / "report.html").read_text()
     # a resumed run reads the poses that it has
-    monkeypatch.setattr(missing_inputs, "track_person", None)
+    monkeypatch.setattr(run_tracking, "track_person", None)
     again, _ = ingest_video("--resume", steps=12)
     assert again.code == 0, again.err
     frames = held_out_frames(RunFolder(path=out), None)
-    assert frames.recording.paths.poses == out / "tracking" / "poses.npz"
+    assert frames.capture.paths.poses == out / "tracking" / "poses.npz"
     assert frames.poses == "tracked"
 
 

@@ -17,6 +17,7 @@ from preprocess.body.parametric_body import load_body_model
 from preprocess.body.proportion_space import shape_for_motion
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.masks.mask_files import open_masks
+from preprocess.masks.mask_sources import StoredMasks
 
 SIZE, FRAMES = (96, 128), 6
 CAMERA = Camera(focal_px=(190.0, 190.0), center_px=(48.0, 64.0), size_px=SIZE,
@@ -67,7 +68,7 @@ def test_masks_determine_an_unstated_body_model(filmed, truth):
     found, _ = place_motion(
         unnamed("body24"),
         load_body_model(),
-        CaptureEvidence(source, masks, CAMERAS),
+        CaptureEvidence(source, StoredMasks(masks, source), CAMERAS),
         cameras_given=True,
     )
     assert found.body_model == truth
@@ -83,7 +84,12 @@ def test_a_stated_model_stays_and_without_masks_images_decide(filmed, truth):
     stated = replace(unnamed("body24"), model_is_stated=True)
     body = load_body_model()
     assert (
-        place_motion(stated, body, CaptureEvidence(source, masks, CAMERAS), cameras_given=True)[0]
+        place_motion(
+            stated,
+            body,
+            CaptureEvidence(source, StoredMasks(masks, source), CAMERAS),
+            cameras_given=True,
+        )[0]
         is stated
     )
     read = unnamed("body24")

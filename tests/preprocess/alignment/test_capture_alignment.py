@@ -23,6 +23,7 @@ from preprocess.body.parametric_body import (
 from preprocess.body.proportion_space import shape_for_motion
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.masks.mask_files import open_masks
+from preprocess.masks.mask_sources import AlphaChannelMasks, StoredMasks
 
 SIZE = (96, 128)
 FRAMES = 8
@@ -104,8 +105,12 @@ def test_an_alpha_channel_aligns_as_masks_do(tmp_path, own, strangers):
     person = taller(own, 1.1)
     source, masks = film(tmp_path, person, strangers)
     assert source.has_alpha
-    by_alpha = align_body(strangers, own, CaptureEvidence(source, None, CAMERAS))
-    by_masks = align_body(strangers, own, CaptureEvidence(source, masks, CAMERAS))
+    by_alpha = align_body(
+        strangers, own, CaptureEvidence(source, AlphaChannelMasks(source), CAMERAS)
+    )
+    by_masks = align_body(
+        strangers, own, CaptureEvidence(source, StoredMasks(masks, source), CAMERAS)
+    )
     assert by_alpha.placement is not None
     assert by_alpha.placement.distance_divisor == pytest.approx(1.1, rel=0.02)
     np.testing.assert_array_equal(
@@ -126,7 +131,9 @@ def test_without_masks_an_unfitted_body_is_reported(tmp_path, own, strangers):
 def test_poses_of_the_bodys_own_model_stay(tmp_path, body):
     motion = motion_of("body24")
     source, masks = film(tmp_path, body.with_shape(), motion)
-    fit = align_body(motion, body.with_shape(), CaptureEvidence(source, masks, CAMERAS))
+    fit = align_body(
+        motion, body.with_shape(), CaptureEvidence(source, StoredMasks(masks, source), CAMERAS)
+    )
     assert fit.motion is motion
     assert not fit.description
 
@@ -152,7 +159,10 @@ def test_an_added_clip_is_aligned_to_the_avatars_person(tmp_path, body, amount):
     assert abs(ratio - 1.0) > 0.02
     pelves = person.joints[0] + motion.root_translations
     claimed = replace(motion, root_translations=ratio * pelves - other.joints[0])
-    for given in (masks, None):  # pictures with alpha channels
+    for given in (
+        StoredMasks(masks, source),
+        AlphaChannelMasks(source),
+    ):  # pictures with alpha channels
         fit = align_to_person(claimed, other, person, CaptureEvidence(source, given, CAMERAS))
         assert fit.shaped is person
         assert f"{100 * body_height_m(other):.0f} cm" in fit.description
@@ -178,7 +188,9 @@ def test_an_added_clip_of_smpls_fits_the_avatars_proportions(tmp_path, body, own
     source, masks = film(tmp_path, person, strangers)
     pelves = person.joints[0] + strangers.root_translations
     nearer = replace(strangers, root_translations=pelves / 1.12 - own.joints[0])
-    fit = align_to_person(nearer, own, person, CaptureEvidence(source, masks, CAMERAS))
+    fit = align_to_person(
+        nearer, own, person, CaptureEvidence(source, StoredMasks(masks, source), CAMERAS)
+    )
     assert fit.placement is not None
     assert fit.placement.distance_divisor == pytest.approx(1.0 / 1.12, rel=0.02)
     assert pixels_off(fit, person, strangers) < 1.2
@@ -190,7 +202,10 @@ def test_the_same_person_again_changes_nothing(tmp_path, body):
     write_shaped_body(tmp_path / "person.npz", body.with_shape())
     person = read_shaped_body(tmp_path / "person.npz", body)
     fit = align_to_person(
-        motion, body.with_shape(), person, CaptureEvidence(source, masks, CAMERAS)
+        motion,
+        body.with_shape(),
+        person,
+        CaptureEvidence(source, StoredMasks(masks, source), CAMERAS),
     )
     assert fit.motion is motion
     assert not fit.description

@@ -61,7 +61,7 @@ def test_proportions_and_focal_length_change_but_not_the_size(capture, fit):
     assert abs(size_of(raw, capture.shaped) - 1.0) > 0.02
     assert size_of(capture.shaped, fitted.shaped) == pytest.approx(1.0, abs=1e-9)
     assert fitted.cameras[0].focal_px[0] == pytest.approx(1.1 * capture.cameras[0].focal_px[0])
-    assert fitted.fit is fit
+    assert fitted.fits == (fit,)
     assert fitted.pose_uncertainty == 1.0
     assert capture.pose_uncertainty == 0.0
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from capture.input_error import InputError
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.body.body_pose import BodyPose, Motion, RelativeFocalLength
 from preprocess.body.parametric_body import ShapedBody, load_body_model
@@ -22,6 +23,7 @@ from preprocess.fitting.tracked_frames import (
     SeenPerson,
     fit_first_frames,
 )
+from preprocess.masks.mask_sources import EstimatedMasks
 from preprocess.open_capture import open_capture
 from preprocess.poses.pose_file import read_motion, write_motion
 from preprocess.tracking.keypoints import CroppedMask, KeypointTrack, PersonKeypoints
@@ -119,7 +121,10 @@ def test_fitted_poses_are_read_as_they_were_written(lifted, fit, tmp_path):
 
 
 def test_a_fit_without_masks_takes_the_key_points_alone(lifted, truth):
-    alone = fit_capture(replace(lifted, masks=None))
+    def find_none(frame, pose, camera):
+        raise InputError("no person is there")
+
+    alone = fit_capture(replace(lifted, masks=EstimatedMasks(find_none)))
     assert alone.share == 1.0
     assert error_mm(apply_fit(lifted, alone), truth) < 0.95 * error_mm(lifted, truth)
 

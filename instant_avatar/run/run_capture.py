@@ -1,0 +1,165 @@
+"""The capture of a run: read, tracked or streamed, aligned, in the world of its cameras, fitted."""
+
+import os
+from dataclasses import replace
+
+from capture.atomic_files import atomic_file
+from capture.input_error import InputError
+from instant_avatar.capture_validation import correction_hint, preflight_check
+from instant_avatar.cli.console import Console
+from instant_avatar.run.ingest_arguments import IngestArguments
+from instant_avatar.run.person_tracking import person_number
+from instant_avatar.run.run_folder import RunFolder
+from instant_avatar.run.run_tracking import import_tracked
+from preprocess.cameras.camera_file import write_cameras
+from preprocess.capture_session import Capture, CaptureInputs, InputKind
+from preprocess.fitting.capture_fit import CaptureFit, load_capture_fit
+from preprocess.fitting.capture_fitting import apply_fit, fit_capture
+from preprocess.masks.mask_refinement import MaskRefiner
+from preprocess.observation_source import ObservationSource, RecordedObservations
+from preprocess.open_capture import (
+    ImportedCapture,
+    align_capture,
+    open_tracked_stream,
+    read_capture,
+)
+from preprocess.plugins import DEFAULT_TRACKER, make_tracker
+from preprocess.poses.pose_file import write_motion
+from preprocess.sfm.capture_solving import apply_camera_solution, solve_capture_cameras
+
+
+def open_observations(
+    arguments: IngestArguments, inputs: CaptureInputs, run: RunFolder, console: Console
+) -> tuple[ObservationSource, Capture]:
+    """Open what a run learns from, whatever the input is.
+
+    Returns:
+        The observations, and their capture before it was fitted to the masks.
+    """
+    resumes = arguments.resume and run.has_checkpoint()
+    if inputs.kind is InputKind.STREAMED:
+        with console.status("opening video and poses"):
+            stream = _open_stream(arguments, inputs, run, resumes=resumes)
+        _describe(stream.capture, console)
+        return stream, stream.capture
+    if inputs.kind is InputKind.UNTRACKED:
+        imported = import_tracked(arguments, inputs, run, console)
+    else:
+        imported = read_capture(inputs)
+    size_px = arguments.longer_side_px(imported.source)
+    fit = None
+    try:
+        with console.status("opening video and poses"):
+            if resumes:
+                capture, fit = _align_as_trained(imported, run, size_px)
+            else:
+                capture = align_capture(imported, size_px=size_px)
+    except InputError as error:
+        hint = correction_hint(imported)
+        if not hint:
+            raise
+        raise InputError(f"{error} {hint}") from error
+    _describe(capture, console)
+    if not resumes:
+        preflight_check(capture, imported.inputs, console, force=arguments.force)
+    if inputs.cameras == "solve":
+        capture = _solve_cameras(arguments, capture, console)
+    fitted = capture
+    if arguments.refine_poses and capture.motion.proportions is None:
+        fitted = _fit_to_masks(capture, fit, inputs, console, fit_body=not resumes)
+    return RecordedObservations(fitted, realtime=inputs.realtime), capture
+
+
+def open_as_trained(imported: ImportedCapture, run: RunFolder, size_px: int) -> Capture:
+    """Align a run's own recording with the body and the poses that it was trained with."""
+    capture, fit = _align_as_trained(imported, run, size_px)
+    return capture if fit is None else apply_fit(capture, fit, height_m=imported.inputs.height_m)
+
+
+def _align_as_trained(
+    imported: ImportedCapture, run: RunFolder, size_px: int
+) -> tuple[Capture, CaptureFit | None]:
+    """Align a recording with the person of a run; also return the fit of its checkpoint."""
+    fit = load_capture_fit(run.fit_file, imported.identity)
+    keeps_person = run.body_file.is_file() and (fit is None or not fit.fits_body)
+    person = run.body_file if keeps_person else None
+    return align_capture(imported, size_px=size_px, avatar_body=person), fit
+
+
+def _open_stream(
+    arguments: IngestArguments, inputs: CaptureInputs, run: RunFolder, *, resumes: bool
+) -> ObservationSource:
+    tracker = make_tracker(inputs.tracker or DEFAULT_TRACKER, person_number(inputs.person))
+    return open_tracked_stream(
+        inputs,
+        tracker,
+        MaskRefiner,
+        run.tracked_poses,
+        longer_side_px=arguments.longer_side_px,
+        avatar_body=run.body_file if resumes and run.body_file.is_file() else None,
+    )
+
+
+def _describe(capture: Capture, console: Console) -> None:
+    """Print what was opened, and what is to be said about it."""
+    source, (width, height) = capture.source, capture.source.size_px
+    count = "frames" if source.frame_count is None else f"{source.frame_count} frames"
+    console.info(
+        f"{capture.paths.video}: {count} of {width}x{height} px, {len(capture.motion)} poses, "
+        f"body {capture.shaped.body.family}, camera: {capture.cameras.source}"
+    )
+    for note in capture.notes:
+        console.note(note)
+
+
+def _solve_cameras(arguments: IngestArguments, capture: Capture, console: Console) -> Capture:
+    """Return the capture, with its poses in the camera of each frame, in a world of cameras."""
+    with console.progress("solving cameras", 1.0) as bar:
+        solved = solve_capture_cameras(
+            capture,
+            seed=arguments.seed,
+            threads=arguments.threads or os.cpu_count() or 1,
+            report_progress=bar.set_share,
+        )
+    placed = apply_camera_solution(capture, solved)
+    console.info(placed.notes[-1])
+    return placed
+
+
+def _fit_to_masks(
+    capture: Capture,
+    fit: CaptureFit | None,
+    inputs: CaptureInputs,
+    console: Console,
+    *,
+    fit_body: bool,
+) -> Capture:
+    """Fit body, poses and focal length to the masks, or repeat a fit."""
+    if fit is None:
+        with console.status("fitting body and poses to the masks"):
+            fit = fit_capture(capture, fit_body=fit_body)
+    if fit is None:
+        return capture
+    fitted = apply_fit(capture, fit, height_m=inputs.height_m)
+    for note in fitted.notes[len(capture.notes) :]:
+        console.note(note)
+    if (advice := fit.advice()) is not None:
+        console.warning(advice)
+    return fitted
+
+
+def write_solved_cameras(capture: Capture, run: RunFolder, console: Console) -> None:
+    """Write cameras.npz and poses.npz of the run, if its cameras were solved.
+
+    Solving takes minutes: call it before training, so that the result is kept whatever follows.
+    The poses are those before the fit to the masks, which `checkpoint/` holds.
+    """
+    report = capture.figures("cameras")
+    if report is None or report["verdict"] != "solved":
+        return
+    with atomic_file(run.cameras) as path:
+        write_cameras(path, capture.cameras)
+    with atomic_file(run.poses) as path:
+        write_motion(path, replace(capture.motion, intrinsic=None, camera_from_world=None))
+    console.print_artifact("cameras", run.cameras)
+    console.print_artifact("poses there", run.poses)

@@ -1,0 +1,140 @@
+"""Poses and masks that are tracked in the video of a run, and kept in its folder tracking/."""
+
+import json
+import threading
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any
+
+from capture.atomic_files import OutputFileList, write_text_atomically
+from capture.input_error import InputError, quote_command
+from instant_avatar.cli.command_line import INTERRUPTED, CommandExit, stop_on_interrupt
+from instant_avatar.cli.console import Console
+from instant_avatar.run.ingest_arguments import IngestArguments
+from instant_avatar.run.person_tracking import (
+    PersonTracking,
+    print_grade,
+    track_person,
+    tracked_inputs,
+)
+from instant_avatar.run.run_folder import RunFolder
+from preprocess.capture_paths import find_own_poses
+from preprocess.capture_session import CaptureInputs, Provenance
+from preprocess.open_capture import ImportedCapture, read_capture
+
+
+def import_tracked(
+    arguments: IngestArguments, inputs: CaptureInputs, run: RunFolder, console: Console
+) -> ImportedCapture:
+    """Track the person of a recording for a run; of a resumed run, read its own tracking.
+
+    Poses are written to the run's folder tracking/, as ia-track writes them. After Ctrl-C that
+    folder holds the frames before it, and a resumed run goes on with the next.
+
+    Raises:
+        CommandExit: After Ctrl-C.
+    """
+    stored = _read_stored(arguments, run) if arguments.resume else None
+    if stored is not None and stored["complete"]:
+        return _with_grade(read_capture(_stored_inputs(stored, inputs, run)), stored)
+    beside = find_own_poses(inputs.video.parent)
+    if beside is not None:
+        console.warning(f"{beside} lies beside the video; to use it, pass --poses.")
+    with stop_on_interrupt(console, "keeping the frames that were tracked") as stop:
+        tracking = _track(inputs, run, console, stop, resume=stored is not None)
+    imported, grade = tracking.imported, tracking.grade
+    chosen = imported.inputs.frames
+    stored = {
+        "request": _describe_request(arguments),
+        "frames": None if chosen is None else [chosen.start, chosen.stop, chosen.step],
+        "masks": imported.inputs.masks == run.tracking / "masks",
+        "grade": grade.as_json(),
+        "complete": not tracking.interrupted,
+    }
+    write_text_atomically(run.tracking_grade, json.dumps(stored, indent=1) + "\n")
+    if stop.is_set():
+        raise CommandExit(
+            f"stopped by Ctrl-C. {grade.frames} tracked frames are kept in {run.tracking}: to go "
+            "on from there, run the same command with --resume.",
+            INTERRUPTED,
+        )
+    if not (grade.is_good_enough or arguments.force):
+        remove_tracking(run)
+        look = quote_command("ia-track", str(inputs.video))
+        raise InputError(
+            f"{grade.describe()} Look at the poses ({look}), film the person again, or give "
+            "--poses of another tracker. To train anyway, pass --force."
+        )
+    print_grade(grade, console)
+    return _with_grade(imported, stored)
+
+
+def inputs_as_tracked(
+    arguments: IngestArguments, inputs: CaptureInputs, run: RunFolder
+) -> CaptureInputs:
+    """Return a finished run's inputs with the poses that were tracked for it, if any were."""
+    stored = _read_stored(arguments, run)
+    return inputs if stored is None else _stored_inputs(stored, inputs, run)
+
+
+def _stored_inputs(stored: dict[str, Any], inputs: CaptureInputs, run: RunFolder) -> CaptureInputs:
+    if stored["frames"] is not None:
+        inputs = replace(inputs, frames=slice(*stored["frames"]))
+    masks = run.tracking / "masks" if stored["masks"] else None
+    return tracked_inputs(inputs, run.tracked_poses, masks)
+
+
+def _with_grade(imported: ImportedCapture, stored: dict[str, Any]) -> ImportedCapture:
+    tracking = Provenance(
+        part="tracking", origin="tracking/", uncertainty=1.0, figures=stored["grade"]
+    )
+    return replace(imported, provenance=(tracking,))
+
+
+def _track(
+    inputs: CaptureInputs,
+    run: RunFolder,
+    console: Console,
+    stop: threading.Event,
+    *,
+    resume: bool,
+) -> PersonTracking:
+    """Track the person into the run's folder; leave no empty folder if that fails."""
+    run.tracking.mkdir(parents=True, exist_ok=True)
+    OutputFileList(run.tracking).create()
+    OutputFileList(run.tracking).remove_temporaries()
+    try:
+        return track_person(inputs, run.tracked_poses, console, stop=stop, resume=resume)
+    finally:
+        OutputFileList(run.tracking).remove_if_empty()
+        with suppress(OSError):  # not empty
+            run.tracking.rmdir()
+
+
+def remove_tracking(run: RunFolder) -> None:
+    """Remove what was tracked for a run."""
+    for folder in (run.tracking / "masks", run.tracking):
+        OutputFileList(folder).remove_all()
+        with suppress(OSError):  # not empty, or missing
+            folder.rmdir()
+
+
+def _describe_request(arguments: IngestArguments) -> dict[str, Any]:
+    """Return what decides the tracked poses; those of another request are tracked again."""
+    named = {
+        name: None if value is None else str(value)
+        for name, value in vars(arguments).items()
+        if name in ("masks", "cameras", "body", "frames", "person", "tracker", "rotate")
+    }
+    return {"video": str(arguments.video.resolve()), **named}
+
+
+def _read_stored(arguments: IngestArguments, run: RunFolder) -> dict[str, Any] | None:
+    """Return what was tracked for the run and its request before; None if there is no such."""
+    try:
+        stored = json.loads(run.tracking_grade.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    expected = {"request", "frames", "masks", "grade", "complete"}
+    usable = isinstance(stored, dict) and stored.keys() == expected and run.tracked_poses.is_file()
+    return stored if usable and stored["request"] == _describe_request(arguments) else None
