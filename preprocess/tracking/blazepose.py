@@ -116,6 +116,9 @@ MAX_UNSEEN_COLOR_DISTANCE = 12.0
 networks hold on to a thing that the person passed."""
 CROWD_MEMORY = 20
 """Frames after which another person who was near and is not seen any more does not count."""
+MASK_JUMP = 1.2
+"""Factor by which the person's mask changes from one frame to the next only if another person comes
+or goes, or the film is cut: of persons who turn and dance it changes by 1.15 at most."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,15 +158,20 @@ class BlazePoseTracker:
         self._frames_to_watch = 0
         self._crowded_frames = 0
         self._has_company = False
+        self._mask_px = 0.0
 
     def __call__(self, rgb: UInt8[np.ndarray, "height width 3"]) -> PersonKeypoints | None:
         """Find the person in the next frame; None where there is none."""
         rgb = self._brighten(rgb)
         found = self._follow(rgb) or self._find(rgb)
-        if found is None:
-            if self._last is not None:
-                self._last = replace(self._last, frames_ago=self._last.frames_ago + 1)
+        mask_px = 0.0 if found is None else found.keypoints.mask.person_px()
+        jumps = self._mask_px and abs(np.log(max(mask_px, 1.0) / self._mask_px)) > np.log(MASK_JUMP)
+        self._mask_px = mask_px
+        if found is None or (jumps and self._is_strange(rgb, found)):
+            self._look_for_who_hides(rgb)
             return None
+        if jumps:
+            self._frames_to_watch = 0
         self._last = LastPlace(square=found.square)
         self._watch(rgb, found)
         return replace(found.keypoints, crowded=self._crowded_frames > 0)
@@ -175,10 +183,33 @@ class BlazePoseTracker:
         found = self._accept(rgb, self._find_landmarks(rgb, self._last.square))
         return None if found is None or self._is_a_thing(rgb, found) else found
 
+    def _is_strange(self, rgb: UInt8[np.ndarray, "height width 3"], found: FoundLandmarks) -> bool:
+        """True if the colors are another one's."""
+        distance = self._looks.distance(colors_of(rgb, found.keypoints))
+        return self._looks.is_known and distance > MAX_UNSEEN_COLOR_DISTANCE
+
+    def _look_for_who_hides(self, rgb: UInt8[np.ndarray, "height width 3"]) -> None:
+        """Look for another person where the person was, who is not there now."""
+        last = self._last
+        if last is None:
+            return
+        for detection in self._detect(rgb) if last.frames_ago == 1 else ():
+            found = self._find_landmarks(rgb, detection.square)
+            is_near = distance_in_sides(last.square, found.square) < NEAR
+            if (
+                found.keypoints.presence >= MIN_PRESENCE
+                and is_near
+                and self._is_strange(rgb, found)
+            ):
+                self._company.learn(colors_of(rgb, found.keypoints))
+                self._crowded_frames = CROWD_MEMORY
+        if last.frames_ago > CROWD_MEMORY and not self._has_company:  # the film was cut
+            self._crowded_frames = 0
+        self._last = replace(last, frames_ago=last.frames_ago + 1)
+
     def _is_a_thing(self, rgb: UInt8[np.ndarray, "height width 3"], found: FoundLandmarks) -> bool:
         """True if the colors are strange, and the detector finds no person there."""
-        distance = self._looks.distance(colors_of(rgb, found.keypoints))
-        return distance > MAX_UNSEEN_COLOR_DISTANCE and not any(
+        return self._is_strange(rgb, found) and not any(
             distance_in_sides(found.square, each.square) < NEAR for each in self._detect(rgb)
         )
 

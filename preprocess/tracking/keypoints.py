@@ -45,6 +45,11 @@ class CroppedMask:
     values: UInt8[np.ndarray, "rows columns"]
     image_from_crop: Float[np.ndarray, "2 3"]
 
+    def person_px(self) -> float:
+        """Area of the person in pixels of the frame."""
+        pixel = abs(float(np.linalg.det(self.image_from_crop[:, :2])))
+        return pixel * float((self.values > 127).sum())
+
     def resample(
         self, frame_px: tuple[int, int], size_px: tuple[int, int]
     ) -> Float32[np.ndarray, "height width"]:

@@ -3,6 +3,7 @@
 No grade uses ground truth, so the same grades hold for any video.
 """
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -49,6 +50,8 @@ JUMP_STEPS = 8.0
 """The same, in medians of that way."""
 JUMPED = "the person jumps to another place; was the film cut here?"
 """Reason of the frames before and after a cut."""
+HIDDEN = "another person is in front"
+"""Reason of frames in which the person was not found, between others with another one near."""
 LIMBS = {
     "left arm": (13, 15), "right arm": (14, 16), "left leg": (25, 27), "right leg": (26, 28),
 }  # fmt: skip
@@ -83,6 +86,10 @@ class TrackingGrade:
         person_px: Median height of the person in the frames, px.
         directions_seen: Share of the horizontal directions from which the person was seen.
         breadth: Breadth of shoulders and hips to the height, relative to the mean body's.
+        breadth_seen: Degree to which the directions seen show that breadth, in [0, 1]: 0 from the
+            side.
+        main_doubt: Reason of most of the doubtful frames; empty without any.
+        main_doubt_frames: Number of those.
         left_out: Numbers of the frames that had better not be learnt from.
         doubts: Reasons why frames are doubtful, by their numbers.
     """
@@ -96,6 +103,9 @@ class TrackingGrade:
     person_px: float
     directions_seen: float
     breadth: float
+    breadth_seen: float
+    main_doubt: str
+    main_doubt_frames: int
     left_out: tuple[int, ...]
     stretches: tuple[DoubtfulStretch, ...]
     doubts: Mapping[int, str]
@@ -104,6 +114,10 @@ class TrackingGrade:
     def objections(self) -> tuple[str, ...]:
         """Reasons why the poses are not good enough for an avatar; empty if they are."""
         objections = []
+        if self.doubtful_share > MAX_DOUBTFUL_SHARE:
+            objections.append(
+                f"{self.main_doubt} in {self.main_doubt_frames} of {self.frames} frames"
+            )
         if self.found_share < MIN_FOUND_SHARE:
             objections.append(f"the person was found in only {self.found_share:.0%} of the frames")
         count = round(self.found_share * self.frames)
@@ -113,13 +127,11 @@ class TrackingGrade:
             objections.append(
                 f"body and masks agree by an IoU of only {self.iou_mean:.2f} (expected {MIN_IOU})"
             )
-        if self.doubtful_share > MAX_DOUBTFUL_SHARE:
-            objections.append(f"{self.doubtful_share:.0%} of the frames are doubtful")
         if self.person_px < MIN_PERSON_PX:
             objections.append(
                 f"the person is only {self.person_px:.0f} px tall (expected {MIN_PERSON_PX:.0f})"
             )
-        if not BREADTHS[0] <= self.breadth <= BREADTHS[1]:
+        if not BREADTHS[0] <= self.breadth**self.breadth_seen <= BREADTHS[1]:
             which = "broad" if self.breadth > 1.0 else "narrow"
             objections.append(
                 f"the body is too {which}, {self.breadth:.2f} times the usual (the pictures may be "
@@ -192,22 +204,27 @@ def grade_tracking(
     numbers = np.array(sorted(frame_times_s))
     reasons = _reasons_by_frame(keypoints, frame_times_s, iou_of_frame)
     of_limbs = ("is a guess", "is fast")
-    doubtful = [
-        any(not each.endswith(of_limbs) for each in reasons.get(int(number), ()))
+    serious = [
+        [each for each in reasons.get(int(number), ()) if not each.endswith(of_limbs)]
         for number in numbers
     ]
+    counts = Counter(each for row in serious for each in row)
+    ((main_doubt, main_doubt_frames),) = counts.most_common(1) or [("", 0)]
     ious = np.array([value for value in iou_of_frame.values() if np.isfinite(value)])
-    heights = np.ptp(keypoints.image_px[:, :, 1], axis=1)
+    heights, views = np.ptp(keypoints.image_px[:, :, 1], axis=1), _views(motion, camera)
     return TrackingGrade(
         frames=len(numbers),
         found_share=len(keypoints) / max(1, len(numbers)),
-        doubtful_share=float(np.mean(doubtful)),
+        doubtful_share=float(np.mean([bool(row) for row in serious])),
         iou_mean=float(ious.mean()) if len(ious) else float("nan"),
         iou_worst=float(ious.min()) if len(ious) else float("nan"),
         jitter_mm=_jitter_mm(motion, shaped),
         person_px=float(np.median(heights)) if len(heights) else 0.0,
-        directions_seen=_directions_seen(motion, camera),
+        directions_seen=view_sector_share(views),
         breadth=_breadth(shaped) / _breadth(shaped.body.with_shape()),
+        breadth_seen=_breadth_seen(views),
+        main_doubt=main_doubt,
+        main_doubt_frames=main_doubt_frames,
         left_out=_frames_to_leave_out(keypoints, iou_of_frame),
         stretches=tuple(_stretches(numbers.tolist(), frame_times_s, reasons)),
         doubts={number: "; ".join(words) for number, words in reasons.items()},
@@ -226,10 +243,11 @@ def _reasons_by_frame(
         for number in keypoints.frames[rows].tolist():
             reasons.setdefault(int(number), []).append(reason)
 
-    tracked = set(keypoints.frames.tolist())
+    tracked, hidden = set(keypoints.frames.tolist()), _frames_hidden_by_others(keypoints)
     for number in frame_times_s:
         if number not in tracked:
-            reasons[number] = ["the person was not found"]
+            is_hidden = any(begin < number < end for begin, end in hidden)
+            reasons[number] = [HIDDEN if is_hidden else "the person was not found"]
     for number, iou in iou_of_frame.items():
         if iou < DOUBTFUL_IOU and number in tracked:
             reasons.setdefault(number, []).append("body and mask disagree")
@@ -243,6 +261,15 @@ def _reasons_by_frame(
     for name, point in ENDS.items() if len(keypoints) >= MIN_SPEED_FRAMES else ():
         note(_speed(keypoints, point, frame_times_s) > FAST_HEIGHTS_PER_S, f"the {name} is fast")
     return reasons
+
+
+def _frames_hidden_by_others(keypoints: KeypointTrack) -> list[tuple[int, int]]:
+    """Frames before and after which another person is near, and between which none was found."""
+    if keypoints.problems is None:
+        return []
+    crowded = (keypoints.problems & PROBLEM_BITS[TrackingProblem.CROWDED]) > 0
+    gaps = np.flatnonzero((np.diff(keypoints.frames) > 1) & crowded[:-1] & crowded[1:])
+    return [(int(keypoints.frames[row]), int(keypoints.frames[row + 1])) for row in gaps]
 
 
 def _frames_to_leave_out(
@@ -308,10 +335,17 @@ def _jitter_mm(motion: Motion, shaped: ShapedBody) -> float:
     return 1000.0 * float(np.median(np.linalg.norm(bend[inner][:, 1:], axis=2)))
 
 
-def _directions_seen(motion: Motion, camera: Camera) -> float:
-    """Share of the horizontal directions around the person from which the camera saw it."""
+def _views(motion: Motion, camera: Camera) -> Float[np.ndarray, "views 3"]:
+    """Directions to the camera in the body's axes, of the frames with a pose."""
     turned = camera.camera_from_world[:3, :3] @ rotation_matrices(motion.root_rotations)
-    return view_sector_share(-turned[motion.valid, 2])  # the view's axis, in the body's axes
+    return -turned[motion.valid, 2]
+
+
+def _breadth_seen(views: Float[np.ndarray, "views 3"]) -> float:
+    """Degree to which views show a body's breadth: 1 if half of them are from front or back."""
+    across, ahead = views[:, 0], views[:, 2]
+    frontal = ahead**2 / np.maximum(across**2 + ahead**2, 1e-9)
+    return min(1.0, 2.0 * float(frontal.mean())) if len(views) else 0.0
 
 
 def _stretches(

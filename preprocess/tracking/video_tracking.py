@@ -14,7 +14,7 @@ from typing import Protocol, final, runtime_checkable
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Int, UInt8
 
 from capture.input_error import InputError
 from capture.source import FrameSource
@@ -36,6 +36,8 @@ MIN_FOUND = 8
 """Fewest frames in which the person must be found; 4 of fewer than 16 frames."""
 FRAMES_REFINED_AGAIN = 60
 """First frames whose masks are made again in the end, when the background behind them is known."""
+APPROACH_FRAMES = 4
+"""Frames before another person is seen to be near in which it may have come near."""
 QUEUED_MASKS = 8
 """Most masks that wait to be written."""
 
@@ -201,11 +203,18 @@ def track_video(
         first = dict(zip(frames[:FRAMES_REFINED_AGAIN], found, strict=False))
         _refine_again(source, first, refine, mask_folder)
     track = KeypointTrack.of(frames, found, source.size_px, [times[number] for number in frames])
-    track = replace(track, problems=np.array(problems, dtype=np.int64))
+    track = replace(track, problems=_mark_approach(np.array(problems, dtype=np.int64)))
     if before is not None:
         track, times = before.keypoints.join(track), before.frame_times_s | times
     _require_person(source, len(track), len(times))
     return TrackedVideo(keypoints=track, frame_times_s=times, interrupted=interrupted)
+
+
+def _mark_approach(problems: Int[np.ndarray, "rows"]) -> Int[np.ndarray, "rows"]:
+    """Mark frames right before others are seen to be near, too: not every frame is searched."""
+    crowded = (problems & PROBLEM_BITS[TrackingProblem.CROWDED]) > 0
+    near = [crowded[row : row + APPROACH_FRAMES + 1].any() for row in range(len(crowded))]
+    return problems | np.array(near, dtype=np.int64) * PROBLEM_BITS[TrackingProblem.CROWDED]
 
 
 def _refine_again(

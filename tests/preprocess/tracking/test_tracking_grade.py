@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from capture.camera import Camera
 from preprocess.body.body_pose import Motion
 from preprocess.body.parametric_body import load_body_model
 from preprocess.tracking.keypoints import KeypointTrack
-from preprocess.tracking.tracking_grade import TrackingGrade, grade_tracking
+from preprocess.tracking.tracking_grade import HIDDEN, TrackingGrade, grade_tracking
 from preprocess.tracking.video_tracking import PROBLEM_BITS, TrackingProblem
 
 FRAMES = 60
@@ -26,8 +27,6 @@ def a_motion(turns: float = 1.0, noise_rad: float = 0.0) -> Motion:
     rng = np.random.default_rng(0)
     angles = np.linspace(0.0, 2.0 * np.pi * turns, FRAMES)
     upright = np.array([np.pi, 0.0, 0.0])  # OpenCV's y points down
-    from scipy.spatial.transform import Rotation
-
     roots = Rotation.from_rotvec(upright) * Rotation.from_rotvec(
         np.column_stack([np.zeros(FRAMES), angles, np.zeros(FRAMES)])
     )
@@ -107,6 +106,24 @@ def test_a_stretched_film_is_an_objection(shaped):
     assert grade(replace(shaped, joints=shaped.joints * [0.7, 1, 1])).objections
 
 
+def test_breadth_is_judged_only_as_far_as_the_directions_seen_show_it(shaped):
+    """Two seconds of a side view say nothing about it."""
+    broad = replace(shaped, joints=shaped.joints * np.array([1.21, 1.0, 1.0]))
+    front = a_motion(turns=0.0)
+    turned = Rotation.from_rotvec(front.root_rotations) * Rotation.from_rotvec([0, np.pi / 2, 0])
+    assert grade(broad, motion=front).objections
+    assert not grade(broad, motion=replace(front, root_rotations=turned.as_rotvec())).objections
+
+
+def test_the_cause_of_most_doubtful_frames_leads_the_verdict(shaped):
+    problems = np.zeros(FRAMES, dtype=np.int64)
+    problems[10:50] = PROBLEM_BITS[TrackingProblem.BOTTOM]
+    problems[5:12] |= PROBLEM_BITS[TrackingProblem.LEFT]
+    verdict = grade(shaped, keypoints=replace(some_keypoints(), problems=problems)).describe()
+    cause = "the person is cut by the picture's lower border in 40 of 60 frames"
+    assert verdict.startswith(f"Good enough for an avatar: no, because {cause}")
+
+
 def test_a_cut_film_is_named_where_it_is_cut(shaped):
     keypoints = some_keypoints()
     image = keypoints.image_px + np.linspace(0.0, 30.0, FRAMES)[:, None, None] * [1.0, 0.0]
@@ -124,6 +141,16 @@ def test_frames_with_another_person_near_are_left_out_unless_they_are_most(shape
     assert found.left_out == tuple(range(10, 20))
     most = replace(keypoints, problems=np.full(FRAMES, PROBLEM_BITS[TrackingProblem.CROWDED]))
     assert grade(shaped, keypoints=most).left_out == ()
+
+
+def test_frames_lost_between_others_with_another_person_near_are_hidden_by_it(shaped):
+    keep = np.r_[0:20, 30:FRAMES]
+    problems = np.where(np.abs(keep - 25) < 8, PROBLEM_BITS[TrackingProblem.CROWDED], 0)
+    arrays = ("frames", "image_px", "world_m", "visibility", "presence")
+    keypoints = some_keypoints()
+    some = {name: getattr(keypoints, name)[keep] for name in arrays}
+    doubts = grade(shaped, keypoints=replace(keypoints, problems=problems, **some)).doubts
+    assert {doubts[number] for number in range(20, 30)} == {HIDDEN}
 
 
 def test_lost_frames_are_reported_by_their_time(shaped):
