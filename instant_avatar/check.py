@@ -26,7 +26,7 @@ from instant_avatar.cli.shared_options import (
 )
 from instant_avatar.contact_sheet import write_contact_sheet
 from instant_avatar.corrected_capture import check_new_or_empty, write_corrected_capture
-from instant_avatar.run.person_tracking import grade_capture, print_grade, track_person
+from instant_avatar.run.person_tracking import grade_capture, print_doubts, track_person
 from preprocess.alignment.correction_search import CorrectionCandidate
 from preprocess.alignment.silhouette_objective import GOOD_IOU, mean_score
 from preprocess.capture_session import CaptureInputs, InputKind
@@ -140,7 +140,8 @@ def _check(arguments: CheckArguments, read: Callable[[], ImportedCapture], conso
         write_text_atomically(arguments.json, text, replace=arguments.overwrite)
     _print_findings(check_result, console)
     if grade is not None:
-        print_grade(grade, console)
+        print_doubts(grade, console)
+        console.info(grade.describe())
     path, ours = arguments.sheet_path(), arguments.sheet is None
     if write_contact_sheet(path, check_result, replace=arguments.overwrite, listed=ours):
         console.print_artifact("look at it", path)

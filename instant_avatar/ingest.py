@@ -34,7 +34,8 @@ def ingest(
 ) -> int:
     """Open, track, solve cameras, align; then train, bake and report, which `readers` read of.
 
-    After an `InputError` nothing was written; on a full disk the newest checkpoint is kept.
+    After an `InputError` nothing was written but what was tracked, if that is refused; on a full
+    disk the newest checkpoint is kept.
     """
     started_at = time.perf_counter()
     solver = ("pycolmap",) if arguments.cameras == "solve" else ()

@@ -3,22 +3,17 @@
 import json
 import os
 import sys
-import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-import cv2
-import numpy as np
-from jaxtyping import UInt8
 from tyro.conf import Positional, arg
 
-from capture.atomic_files import OutputFileList, atomic_file, write_text_atomically
+from capture.atomic_files import OutputFileList, write_text_atomically
 from capture.input_error import InputError, quote_command
 from capture.live_sources import camera_address
-from capture.video_writer import H264, write_video
 from instant_avatar.cli.command_line import (
     DONE,
     INTERRUPTED,
@@ -37,12 +32,10 @@ from instant_avatar.cli.shared_options import (
     parse_frame_range,
     unused_path,
 )
-from instant_avatar.contact_sheet import BODY_COLOR, MASK_COLOR
-from instant_avatar.run.person_tracking import masks_to_use, print_grade, track_person
+from instant_avatar.run.person_tracking import masks_to_use, print_doubts, track_person
 from instant_avatar.run.run_folder import RunFolder, claim_folder
-from preprocess.body.body_surface import SkinPoints, splat_silhouette
-from preprocess.capture_session import Capture, CaptureInputs
-from preprocess.observation import Observation, shrink_to_longer_side
+from instant_avatar.tracked_video import write_tracked_video
+from preprocess.capture_session import CaptureInputs
 
 PROGRAM = "ia-track"
 NOT_GOOD_ENOUGH = 1
@@ -207,9 +200,10 @@ def track(arguments: TrackArguments, console: Console) -> int:
         console.print_artifact("poses", poses)
         if arguments.film and not stop.is_set():
             with console.status("drawing the film"):
-                write_skeleton_film(arguments.film_path(), tracking.capture, tracking.grade.doubts)
+                write_tracked_video(arguments.film_path(), tracking.capture, tracking.grade.doubts)
             console.print_artifact("look at it", arguments.film_path())
-    print_grade(tracking.grade, console)
+    print_doubts(tracking.grade, console)
+    console.info(tracking.grade.describe())
     if tracking.grade.is_good_enough:
         console.info("Next:")
         command = next_command(arguments, tracking.imported.inputs.frames)
@@ -217,96 +211,6 @@ def track(arguments: TrackArguments, console: Console) -> int:
     if tracking.interrupted:
         return INTERRUPTED
     return DONE if tracking.grade.is_good_enough else NOT_GOOD_ENOUGH
-
-
-LONGER_SIDE_PX = 720
-"""Longer side of the film, px."""
-SHORTER_SIDE_PX = 320
-"""Least shorter side of the film, px: smaller frames are enlarged, so that text can be read."""
-LETTER_PX, LINE_PX = 7, 16
-"""Width of a letter and height of a line of text, px."""
-SILHOUETTE_PX = 256
-"""Longer side of the images in which the body's outline is found, px."""
-LEFT_COLOR, RIGHT_COLOR, MIDDLE_COLOR = (255, 150, 40), (60, 190, 255), (240, 240, 240)
-"""RGB colors of the person's left and right limbs, and of trunk and head."""
-DOUBT_COLOR = (255, 60, 60)
-"""RGB color of doubts."""
-LEFT_JOINTS = frozenset({1, 4, 7, 10, 13, 16, 18, 20, 22})
-"""Joints of SMPL's tree on the person's left; the next one is that on the right."""
-
-Rgb = UInt8[np.ndarray, "height width 3"]
-
-
-def write_skeleton_film(path: Path, capture: Capture, doubts: Mapping[int, str]) -> int:
-    """Draw skeleton, body and mask over each frame, and why a frame is doubtful.
-
-    `doubts` are sentences by frame number. Return the number of frames drawn.
-    """
-    source = capture.source
-    count, duration = source.frame_count or 1, source.duration_s
-    fps = min(60.0, max(1.0, count / duration)) if duration else 10.0
-    with atomic_file(path) as part:
-        return write_video(part, _draw_frames(capture, doubts), fps, H264)
-
-
-def _draw_frames(capture: Capture, doubts: Mapping[int, str]) -> Iterator[Rgb]:
-    skin = SkinPoints.of(capture.shaped)
-    for item in capture.observations():
-        if not isinstance(item, Observation):
-            continue
-        size_px = _film_size_px(item.frame.size_px)
-        picture = cv2.resize(item.frame.rgb, size_px, interpolation=cv2.INTER_AREA)
-        camera = item.camera.resize(size_px)
-        small = item.camera.resize(shrink_to_longer_side(item.camera.size_px, SILHOUETTE_PX))
-        drawn = splat_silhouette(skin.posed(item.pose), small).astype(np.float32)
-        _draw_outline(picture, cv2.resize(item.alpha, size_px) > 0.5, MASK_COLOR)
-        _draw_outline(picture, cv2.resize(drawn, size_px) > 0.5, BODY_COLOR)
-        pixels = camera.project(capture.shaped.with_pose(item.pose).joints())
-        for joint, parent in enumerate(capture.shaped.body.parents):
-            if parent >= 0:
-                _draw_bone(picture, pixels[parent], pixels[joint], _joint_color(joint))
-        doubt = doubts.get(item.frame.index, "")
-        _draw_text(picture, f"{item.frame.time_s:5.1f} s  {doubt}".rstrip(), bool(doubt))
-        yield picture
-
-
-def _film_size_px(size_px: tuple[int, int]) -> tuple[int, int]:
-    """Size of the film of frames of a size; even numbers, as encoders want."""
-    scale = max(1.0, SHORTER_SIDE_PX / min(size_px))
-    scale = min(scale, LONGER_SIDE_PX / max(size_px))
-    width, height = (max(2, 2 * round(scale * side / 2)) for side in size_px)
-    return width, height
-
-
-def _joint_color(joint: int) -> tuple[int, int, int]:
-    if joint in LEFT_JOINTS:
-        return LEFT_COLOR
-    return RIGHT_COLOR if joint - 1 in LEFT_JOINTS else MIDDLE_COLOR
-
-
-def _draw_bone(
-    picture: Rgb, one: np.ndarray, other: np.ndarray, color: tuple[int, int, int]
-) -> None:
-    ends = [tuple(int(v) for v in np.clip(16.0 * end, -1e6, 1e6)) for end in (one, other)]
-    cv2.line(picture, ends[0], ends[1], (20, 20, 20), 5, cv2.LINE_AA, shift=4)
-    cv2.line(picture, ends[0], ends[1], color, 3, cv2.LINE_AA, shift=4)
-
-
-def _draw_outline(picture: Rgb, inside: np.ndarray, color: tuple[int, int, int]) -> None:
-    found, _ = cv2.findContours(inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(picture, found, -1, color, 1, cv2.LINE_AA)
-
-
-def _draw_text(picture: Rgb, text: str, doubtful: bool) -> None:
-    """Write lines at the top, on a dark ground, as many as the width asks for."""
-    letters = max(12, (picture.shape[1] - 12) // LETTER_PX)
-    lines = textwrap.wrap(text, letters)
-    ground = picture[: 6 + LINE_PX * len(lines)]
-    ground[:] = ground // 4
-    color = DOUBT_COLOR if doubtful else MASK_COLOR
-    for row, line in enumerate(lines):
-        at = (6, LINE_PX * (row + 1))
-        cv2.putText(picture, line, at, cv2.FONT_HERSHEY_SIMPLEX, 0.42, color, 1, cv2.LINE_AA)
 
 
 if __name__ == "__main__":

@@ -39,7 +39,7 @@ PACKAGE_NAME = "avatar.iavatar"
 """The avatar."""
 KEPT_FILES = (
     PACKAGE_NAME, ANIMATION_NAME, "report.json", "report.html", "cameras.npz", "poses.npz",
-    "tracking/poses.npz", "tracking/grade.json",
+    "tracking/poses.npz", "tracking/grade.json", "tracking/skeleton.mp4",
 )  # fmt: skip
 """Files of a run that are brought back."""
 STATUSES = {DONE: "done", BAD_INPUT: "refused"}
@@ -178,7 +178,8 @@ def _ingest(
     except Exception as error:
         failure = describe_failure(error)
         if failure is not None:
-            return failure
+            code, cause = failure
+            return code, cause.replace(f"{run}{os.sep}", "")
         traceback.print_exc(file=log)
         return NO_AVATAR, f"{type(error).__name__}: {error}"
 

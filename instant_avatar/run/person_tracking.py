@@ -339,10 +339,9 @@ def _even_frame_times(source: FrameSource) -> dict[int, float]:
     return {number: number * step_s for number in numbers}
 
 
-def print_grade(grade: TrackingGrade, console: Console) -> None:
-    """Print the doubtful stretches and the verdict."""
+def print_doubts(grade: TrackingGrade, console: Console) -> None:
+    """Print the doubtful stretches."""
     for each in grade.stretches[:MAX_PRINTED_STRETCHES]:
         console.info(f"  doubtful: {each.describe()}")
     if len(grade.stretches) > MAX_PRINTED_STRETCHES:
         console.info(f"  … and {len(grade.stretches) - MAX_PRINTED_STRETCHES} more")
-    console.info(grade.describe())

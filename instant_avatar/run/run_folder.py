@@ -135,6 +135,11 @@ class RunFolder:
         return self.tracking / "poses.npz"
 
     @property
+    def tracked_video(self) -> Path:
+        """The video with the poses drawn over it, of poses that were refused."""
+        return self.tracking / "skeleton.mp4"
+
+    @property
     def tracking_grade(self) -> Path:
         """Grades of the tracked poses, and what they were tracked for."""
         return self.tracking / "grade.json"
@@ -250,7 +255,7 @@ class RunFolder:
         if not OutputFileList(self.path).exists():
             files = sorted(self.path.iterdir()) if self.path.exists() else []
             return next((f for f in files if not f.name.startswith(RESERVED_PREFIX)), None)
-        for path in (*self.files, self.tracked_poses, self.tracking_grade):
+        for path in (*self.files, self.tracked_poses, self.tracking_grade, self.tracked_video):
             if os.path.lexists(path) and not OutputFileList(path.parent).owns(path.name):
                 return path
         folders = (self.checkpoint, self.tracking)

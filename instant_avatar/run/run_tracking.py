@@ -7,17 +7,18 @@ from dataclasses import replace
 from typing import Any
 
 from capture.atomic_files import OutputFileList, write_text_atomically
-from capture.input_error import InputError, quote_command
+from capture.input_error import InputError
 from instant_avatar.cli.command_line import INTERRUPTED, CommandExit, stop_on_interrupt
 from instant_avatar.cli.console import Console
 from instant_avatar.run.ingest_arguments import IngestArguments
 from instant_avatar.run.person_tracking import (
     PersonTracking,
-    print_grade,
+    print_doubts,
     track_person,
     tracked_inputs,
 )
 from instant_avatar.run.run_folder import RunFolder
+from instant_avatar.tracked_video import write_tracked_video
 from preprocess.capture_paths import find_own_poses
 from preprocess.capture_session import CaptureInputs, Provenance
 from preprocess.open_capture import ImportedCapture, read_capture
@@ -32,10 +33,13 @@ def import_tracked(
     folder holds the frames before it, and a resumed run goes on with the next.
 
     Raises:
+        InputError: If the poses are not good enough; they and the tracked video are kept.
         CommandExit: After Ctrl-C.
     """
     stored = _read_stored(arguments, run) if arguments.resume else None
     if stored is not None and stored["complete"]:
+        if not (stored["grade"]["good_enough"] or arguments.force or run.has_checkpoint()):
+            raise _refusal(stored["grade"]["summary"], run)
         return _with_grade(read_capture(_stored_inputs(stored, inputs, run)), stored)
     beside = find_own_poses(inputs.video.parent)
     if beside is not None:
@@ -58,15 +62,20 @@ def import_tracked(
             "on from there, run the same command with --resume.",
             INTERRUPTED,
         )
+    print_doubts(grade, console)
     if not (grade.is_good_enough or arguments.force):
-        remove_tracking(run)
-        look = quote_command("ia-track", str(inputs.video))
-        raise InputError(
-            f"{grade.describe()} Look at the poses ({look}), film the person again, or give "
-            "--poses of another tracker. To train anyway, pass --force."
-        )
-    print_grade(grade, console)
+        with console.status("drawing the tracked video"):
+            write_tracked_video(run.tracked_video, tracking.capture, grade.doubts)
+        raise _refusal(grade.describe(), run)
+    console.info(grade.describe())
     return _with_grade(imported, stored)
+
+
+def _refusal(verdict: str, run: RunFolder) -> InputError:
+    return InputError(
+        f"{verdict} The tracked video is {run.tracked_video}. Look at it and film again, or give "
+        "--poses of another tracker. To train anyway: the same command with --resume --force."
+    )
 
 
 def inputs_as_tracked(

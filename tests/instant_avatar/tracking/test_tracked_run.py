@@ -9,6 +9,8 @@ import pytest
 
 from avatar.training import train
 from avatar.training.trainer import Trainer
+from capture.source_opening import open_source
+from capture.video_writer import H264, write_video
 from instant_avatar import ingest
 from instant_avatar.cli.console import Console
 from instant_avatar.evaluation.evaluation_frames import held_out_frames
@@ -73,6 +75,26 @@ def test_a_video_alone_is_tracked_and_learnt(ingest_video, monkeypatch):
     frames = held_out_frames(RunFolder(path=out), None)
     assert frames.capture.paths.poses == out / "tracking" / "poses.npz"
     assert frames.poses == "tracked"
+
+
+@pytest.mark.usefixtures("without_baking")
+def test_a_refusal_names_its_cause_and_keeps_the_tracked_video(ingest_video, video, monkeypatch):
+    images = [frame.rgb[:180] for frame in open_source(video).frames()]
+    write_video(video, images, 30.0, H264)
+    done, out = ingest_video()
+    assert done.code == 2
+    cut = "the person is cut by the picture's lower border"
+    assert f"doubtful: 0.0 to 0.6 s: {cut}" in done.err
+    assert f"no, because {cut} in 20 of 20 frames" in done.complaint()
+    assert str(out / "tracking" / "skeleton.mp4") in done.complaint()
+    assert open_source(out / "tracking" / "skeleton.mp4").frames_in_file == 20
+    # what was tracked is used again, but not without being asked
+    monkeypatch.setattr(run_tracking, "track_person", None)
+    again, _ = ingest_video("--resume")
+    assert again.code == 2
+    assert cut in again.complaint()
+    forced, _ = ingest_video("--resume", "--force")
+    assert forced.code == 0, forced.err
 
 
 class CountingTracker(BlazePoseTracker):

@@ -1,0 +1,103 @@
+"""The tracked video: skeleton, body and mask over each frame, and why a frame is doubtful."""
+
+import textwrap
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from capture.atomic_files import atomic_file
+from capture.video_writer import H264, write_video
+from instant_avatar.contact_sheet import BODY_COLOR, MASK_COLOR
+from preprocess.body.body_surface import SkinPoints, splat_silhouette
+from preprocess.capture_session import Capture
+from preprocess.observation import Observation, shrink_to_longer_side
+
+LONGER_SIDE_PX = 720
+"""Longer side of the video, px."""
+SHORTER_SIDE_PX = 320
+"""Least shorter side of the video, px: smaller frames are enlarged, so that text can be read."""
+LETTER_PX, LINE_PX = 7, 16
+"""Width of a letter and height of a line of text, px."""
+SILHOUETTE_PX = 256
+"""Longer side of the images in which the body's outline is found, px."""
+LEFT_COLOR, RIGHT_COLOR, MIDDLE_COLOR = (255, 150, 40), (60, 190, 255), (240, 240, 240)
+"""RGB colors of the person's left and right limbs, and of trunk and head."""
+DOUBT_COLOR = (255, 60, 60)
+"""RGB color of doubts."""
+LEFT_JOINTS = frozenset({1, 4, 7, 10, 13, 16, 18, 20, 22})
+"""Joints of SMPL's tree on the person's left; the next one is that on the right."""
+
+Rgb = UInt8[np.ndarray, "height width 3"]
+
+
+def write_tracked_video(path: Path, capture: Capture, doubts: Mapping[int, str]) -> int:
+    """Draw skeleton, body and mask over each frame, and why a frame is doubtful.
+
+    `doubts` are sentences by frame number. Return the number of frames drawn.
+    """
+    source = capture.source
+    count, duration = source.frame_count or 1, source.duration_s
+    fps = min(60.0, max(1.0, count / duration)) if duration else 10.0
+    with atomic_file(path) as part:
+        return write_video(part, _draw_frames(capture, doubts), fps, H264)
+
+
+def _draw_frames(capture: Capture, doubts: Mapping[int, str]) -> Iterator[Rgb]:
+    skin = SkinPoints.of(capture.shaped)
+    for item in capture.observations():
+        if not isinstance(item, Observation):
+            continue
+        size_px = _video_size_px(item.frame.size_px)
+        image = cv2.resize(item.frame.rgb, size_px, interpolation=cv2.INTER_AREA)
+        camera = item.camera.resize(size_px)
+        small = item.camera.resize(shrink_to_longer_side(item.camera.size_px, SILHOUETTE_PX))
+        drawn = splat_silhouette(skin.posed(item.pose), small).astype(np.float32)
+        _draw_outline(image, cv2.resize(item.alpha, size_px) > 0.5, MASK_COLOR)
+        _draw_outline(image, cv2.resize(drawn, size_px) > 0.5, BODY_COLOR)
+        pixels = camera.project(capture.shaped.with_pose(item.pose).joints())
+        for joint, parent in enumerate(capture.shaped.body.parents):
+            if parent >= 0:
+                _draw_bone(image, pixels[parent], pixels[joint], _joint_color(joint))
+        doubt = doubts.get(item.frame.index, "")
+        _draw_text(image, f"{item.frame.time_s:5.1f} s  {doubt}".rstrip(), bool(doubt))
+        yield image
+
+
+def _video_size_px(size_px: tuple[int, int]) -> tuple[int, int]:
+    """Size of the video of frames of a size; even numbers, as encoders want."""
+    scale = max(1.0, SHORTER_SIDE_PX / min(size_px))
+    scale = min(scale, LONGER_SIDE_PX / max(size_px))
+    width, height = (max(2, 2 * round(scale * side / 2)) for side in size_px)
+    return width, height
+
+
+def _joint_color(joint: int) -> tuple[int, int, int]:
+    if joint in LEFT_JOINTS:
+        return LEFT_COLOR
+    return RIGHT_COLOR if joint - 1 in LEFT_JOINTS else MIDDLE_COLOR
+
+
+def _draw_bone(image: Rgb, one: np.ndarray, other: np.ndarray, color: tuple[int, int, int]) -> None:
+    ends = [tuple(int(v) for v in np.clip(16.0 * end, -1e6, 1e6)) for end in (one, other)]
+    cv2.line(image, ends[0], ends[1], (20, 20, 20), 5, cv2.LINE_AA, shift=4)
+    cv2.line(image, ends[0], ends[1], color, 3, cv2.LINE_AA, shift=4)
+
+
+def _draw_outline(image: Rgb, inside: np.ndarray, color: tuple[int, int, int]) -> None:
+    found, _ = cv2.findContours(inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(image, found, -1, color, 1, cv2.LINE_AA)
+
+
+def _draw_text(image: Rgb, text: str, doubtful: bool) -> None:
+    """Write lines at the top, on a dark ground, as many as the width asks for."""
+    letters = max(12, (image.shape[1] - 12) // LETTER_PX)
+    lines = textwrap.wrap(text, letters)
+    ground = image[: 6 + LINE_PX * len(lines)]
+    ground[:] = ground // 4
+    color = DOUBT_COLOR if doubtful else MASK_COLOR
+    for row, line in enumerate(lines):
+        at = (6, LINE_PX * (row + 1))
+        cv2.putText(image, line, at, cv2.FONT_HERSHEY_SIMPLEX, 0.42, color, 1, cv2.LINE_AA)
