@@ -14,6 +14,7 @@ from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.frame_association import associate_by_order, associate_by_time
 from preprocess.masks.mask_sources import MaskSource
+from preprocess.tracking.video_tracking import reason_left_out
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -69,9 +70,11 @@ def observation_builder(
         if frame.index in cameras.frames_without_camera:
             return "no camera"
         row = row_of(frame)
-        if row is None:
-            return "no pose"
-        return motion[row] if motion.valid[row] else "pose invalid"
+        if row is not None and motion.valid[row]:
+            return motion[row]
+        if motion.keypoints is not None:
+            return reason_left_out(motion.keypoints, frame.index)
+        return "no pose" if row is None else "pose invalid"
 
     target_px = shrink_to_longer_side(source.size_px, size_px)
     return lambda frame: join_frame(

@@ -39,7 +39,7 @@ from preprocess.observation import (
     shrink_to_longer_side,
 )
 from preprocess.plugins import PersonTracker
-from preprocess.tracking.video_tracking import MaskRefinement
+from preprocess.tracking.video_tracking import NOT_FOUND, MaskRefinement
 
 START_FRAMES = 8
 """Frames with the person from which proportions and focal length are fitted."""
@@ -51,8 +51,6 @@ for the frames around a frame would span too short a time."""
 MAX_SKIPPED = 5
 """Most frames in a row that are left out; a machine that is too busy to decode a recording at its
 own speed falls behind instead."""
-NOT_FOUND = "person not found"
-"""Reason for which a frame without the person is not used."""
 
 
 @final

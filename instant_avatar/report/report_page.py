@@ -55,7 +55,7 @@ def report_page(
         name=name,
         verdict=verdict,
         report=report,
-        frames=report.frames.sentence(tracked=report.tracking is not None),
+        frames=report.frames.sentence(),
         curve=curve_svg(report.curve),
         body_map=body_map,
         pairs=pairs,

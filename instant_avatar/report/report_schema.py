@@ -18,10 +18,12 @@ from avatar.evaluation.image_metrics import (
 from avatar.events import HeldOutScore
 from capture.process_metrics import ReservoirSample
 from preprocess.observation import DroppedFrame
+from preprocess.tracking.video_tracking import NOT_FOUND
 
 REPORT_FORMAT = 1
 """Version of the format of report.json."""
 DROP_REASONS = {
+    NOT_FOUND: "without the person",
     "no pose": "without a pose",
     "pose invalid": "without a pose",
     "no camera": "without a camera",
@@ -59,8 +61,8 @@ class FrameStats:
     near_duplicates: int
     not_replayed: int
 
-    def sentence(self, *, tracked: bool) -> str:
-        """Tell what became of all frames; `tracked` poses are missing where no person was found."""
+    def sentence(self) -> str:
+        """Tell what became of all frames."""
         parts = [f"{self.used} learnt from"]
         if self.held_out:
             parts.append(f"{self.held_out} held out for scores")
@@ -69,8 +71,6 @@ class FrameStats:
         left_out = self.read - self.used - self.held_out - self.near_duplicates
         if left_out:
             words = [DROP_REASONS.get(drop.reason, f"with {drop.reason}") for drop in self.dropped]
-            if tracked:
-                words = [word.replace("without a pose", "without the person") for word in words]
             reasons = ", ".join(f"{count} {word}" for word, count in Counter(words).most_common())
             parts.append(f"{left_out} left out ({reasons})")
         return f"{self.read} frames read: {', '.join(parts)}."

@@ -228,7 +228,7 @@ class ReportWriter:
             fitted_score = format_psnr(fitted.psnr, fitted.verdict)
             score += f", with poses fitted to {some}those frames {fitted_score}"
         training = report.training
-        console.info(report.frames.sentence(tracked=report.tracking is not None))
+        console.info(report.frames.sentence())
         console.info(
             f"Trained for {training.wall_seconds:.1f} s ({training.steps} steps); {score}."
         )

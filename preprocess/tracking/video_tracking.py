@@ -53,6 +53,10 @@ class TrackingProblem(Enum):
     BOTTOM = "the person is cut by the picture's lower border"
 
 
+NOT_FOUND, ANOTHER_NEAR = "person not found", "another person near"
+DISAGREEING = "body and mask that disagree"
+"""Reasons for which tracked frames are not learnt from."""
+
 PROBLEM_BITS = {problem: 1 << place for place, problem in enumerate(TrackingProblem)}
 """The bit of each problem in the numbers that files hold."""
 
@@ -249,6 +253,16 @@ def _write_mask(
         mask = (refine(rgb, person.mask, (width, height)) * 255.0 + 0.5).astype(np.uint8)
     _, code = cv2.imencode(".png", mask, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     path.write_bytes(code.tobytes())
+
+
+def reason_left_out(track: KeypointTrack, frame: int) -> str:
+    """Reason for which a frame that was tracked has no valid pose."""
+    row = int(np.searchsorted(track.frames, frame))
+    if row == len(track) or track.frames[row] != frame:
+        return NOT_FOUND
+    problems = 0 if track.problems is None else int(track.problems[row])
+    is_crowded = problems & PROBLEM_BITS[TrackingProblem.CROWDED]
+    return ANOTHER_NEAR if is_crowded else DISAGREEING
 
 
 def _require_person(source: FrameSource, found: int, total: int) -> None:

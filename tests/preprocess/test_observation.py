@@ -20,6 +20,14 @@ from preprocess.observation import (
     observation_builder,
     shrink_to_longer_side,
 )
+from preprocess.tracking.keypoints import KeypointTrack
+from preprocess.tracking.video_tracking import (
+    ANOTHER_NEAR,
+    DISAGREEING,
+    NOT_FOUND,
+    PROBLEM_BITS,
+    TrackingProblem,
+)
 
 SIZE = (48, 64)
 COUNT = 8
@@ -154,6 +162,26 @@ def test_invalid_poses_are_dropped_and_listed(parts):
     results = list(observe(source, moving(COUNT, valid=valid), masks, cameras))
     dropped = [(r.index, r.reason) for r in results if isinstance(r, DroppedFrame)]
     assert dropped == [(i, "pose invalid") for i in (1, 3, 5, 7)]
+
+
+def test_tracked_frames_are_dropped_for_what_was_seen_in_them(parts):
+    source, masks, cameras = parts()
+    found = [0, 1, 2, 3, 4, 6, 7]
+    crowded = PROBLEM_BITS[TrackingProblem.CROWDED]
+    track = KeypointTrack(
+        frames=np.array(found),
+        image_px=np.zeros((7, 33, 2)),
+        world_m=np.zeros((7, 33, 3)),
+        visibility=np.ones((7, 33)),
+        presence=np.ones(7),
+        size_px=SIZE,
+        problems=np.where(np.array(found) == 1, crowded, 0),
+    )
+    valid = ~np.isin(np.arange(COUNT), [1, 3, 5])
+    motion = moving(COUNT, valid=valid, frames=np.arange(COUNT), keypoints=track)
+    results = list(observe(source, motion, masks, cameras))
+    dropped = {r.index: r.reason for r in results if isinstance(r, DroppedFrame)}
+    assert dropped == {1: ANOTHER_NEAR, 3: DISAGREEING, 5: NOT_FOUND}
 
 
 def test_more_than_half_of_the_poses_invalid_is_refused_at_once(parts):

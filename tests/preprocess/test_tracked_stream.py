@@ -21,13 +21,13 @@ from preprocess.masks.mask_sources import EstimatedMasks
 from preprocess.observation import DroppedFrame, Observation
 from preprocess.open_capture import open_tracked_stream
 from preprocess.tracked_stream import (
-    NOT_FOUND,
     LiveTracking,
     TrackedMasks,
     TrackedObservations,
     TrackedStream,
 )
 from preprocess.tracking.keypoints import CroppedMask, PersonKeypoints
+from preprocess.tracking.video_tracking import NOT_FOUND
 
 COUNT = 24
 SIZE = (180, 320)
