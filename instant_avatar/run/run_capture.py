@@ -143,8 +143,6 @@ def _fit_to_masks(
     fitted = apply_fit(capture, fit, height_m=inputs.height_m)
     for note in fitted.notes[len(capture.notes) :]:
         console.note(note)
-    if (advice := fit.advice()) is not None:
-        console.warning(advice)
     return fitted
 
 

@@ -16,11 +16,6 @@ from preprocess.body.proportion_space import ProportionSpace
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.file_content import read_npz
 
-MAX_USUAL_TURN_DEG = 5.0
-"""Mean rotation by which the fit changes joints of usual given poses, degrees. From poses that it
-changed by 3, avatars were better than from the built-in tracker's; from such of 7 worse, by 2 dB
-on held-out frames."""
-
 
 def correct_pose(
     pose: BodyPose,
@@ -49,6 +44,8 @@ class CaptureFit:
         error_after_cm: The same with the whole of the changes.
         share: Share of the changes that is made, in [0, 1], and how far the given poses are
             estimates: none where they are exact, 1 where they were made of key points.
+        keypoint_share: Weight of poses by the built-in tracker's key points beside the given ones,
+            in [0, 1]: 0 where given poses are exact, or were made of key points themselves.
         fits_body: Whether proportions could change; not those of a finished avatar's person.
     """
 
@@ -58,6 +55,7 @@ class CaptureFit:
     error_before_cm: float
     error_after_cm: float
     share: float
+    keypoint_share: float
     fits_body: bool
 
     def shape(self, shaped: ShapedBody) -> ShapedBody:
@@ -90,18 +88,15 @@ class CaptureFit:
             f"{self.error_before_cm:.1f} cm apart, and {self.error_after_cm:.1f} cm by the fit, of "
             f"which {self.share:.0%} was made (the root turned by {turned[0]:.1f} "
             f"degrees on average, other joints by {turned[1:].mean():.1f}; focal length times "
-            f"{self.focal_factor:.2f})."
+            f"{self.focal_factor:.2f}).{self._describe_keypoints()}"
         )
 
-    def advice(self) -> str | None:
-        """Say that the given poses were far from the video; None if they were not."""
-        turn_deg = self._mean_turns_deg()[1:].mean()
-        if turn_deg <= MAX_USUAL_TURN_DEG:
-            return None
+    def _describe_keypoints(self) -> str:
+        if not self.keypoint_share:
+            return ""
         return (
-            f"The given poses disagree with the film: joints had to turn by {turn_deg:.1f} degrees "
-            "on average, those of good trackers by 2 to 4. The built-in tracker is likely nearer: "
-            "try it without --poses (and with the poses' file out of the video's folder)."
+            f" The given poses count by {1.0 - self.keypoint_share:.0%}, those that the built-in "
+            "tracker's key points tell by the rest."
         )
 
     def _mean_turns_deg(self) -> Float[np.ndarray, "24"]:
@@ -114,6 +109,7 @@ class CaptureFit:
         return {
             "taken": self.share > 0.0,
             "share": round(self.share, 3),
+            "keypoint_share": round(self.keypoint_share, 3),
             "outline_cm_before": round(self.error_before_cm, 3),
             "outline_cm_after": round(self.error_after_cm, 3),
             "focal_factor": round(self.focal_factor, 4),
@@ -129,7 +125,14 @@ def load_capture_fit(path: Path, video: str) -> CaptureFit | None:
     """Read what `CaptureFit.save` wrote; None if there is nothing for this video."""
     if not path.is_file():
         return None
-    scalars = ("focal_factor", "error_before_cm", "error_after_cm", "share", "fits_body")
+    scalars = (
+        "focal_factor",
+        "error_before_cm",
+        "error_after_cm",
+        "share",
+        "keypoint_share",
+        "fits_body",
+    )
     try:
         read = read_npz(path, ("coefficients", "corrections", "video", *scalars))
         if str(read["video"]) != video:

@@ -36,6 +36,7 @@ from preprocess.fitting.clip_fitting import (
     EvidenceWeights,
     FitParameters,
 )
+from preprocess.fitting.keypoint_poses import blend_poses, weigh_keypoint_poses
 from preprocess.fitting.outlines import OUTLINE_PERSON_PX, OutlineDistances
 from preprocess.observation import Observation, associate_cameras
 
@@ -60,6 +61,8 @@ POSE_ITERATIONS = 2
 """Iterations over poses alone after those, with `TRACKED_POSE_WEIGHTS`."""
 TRACKED_POSE_WEIGHTS = EvidenceWeights(outline_rows=480.0, keypoints=0.6)
 """Weights while poses alone are fitted: with these, proportions would follow the clothes."""
+BLENDED_ITERATIONS = 3
+"""Iterations over poses alone, once key points count beside given poses."""
 MIN_ERROR_DECREASE = 0.01
 """Relative decrease of the error below which the iterations end."""
 NOISE_DEG_PER_CM = 1.5
@@ -122,9 +125,12 @@ def fit_capture(capture: Capture, *, fit_body: bool = True) -> CaptureFit | None
     else:
         settling = _iterate_until_settled(fitter, everything)
     before, after = settling[0], settling[-1]
-    corrections = fitter.corrections
     pixel_cm = 100.0 * capture.pixel_footprint_m() * _reduction(capture, fitter)
-    share = 1.0 if tracked else share_beyond_noise(corrections, after * pixel_cm)
+    share = 1.0 if tracked else share_beyond_noise(fitter.corrections, after * pixel_cm)
+    keypoint_share = 0.0
+    if not tracked and share:
+        keypoint_share = _take_keypoints(capture, fitter)
+    corrections = fitter.corrections
     return CaptureFit(
         coefficients=share * fitter.coefficients,
         focal_factor=float(np.exp(share * fitter.log_focal)),
@@ -132,8 +138,22 @@ def fit_capture(capture: Capture, *, fit_body: bool = True) -> CaptureFit | None
         error_before_cm=before * pixel_cm,
         error_after_cm=after * pixel_cm,
         share=share,
+        keypoint_share=keypoint_share,
         fits_body=fit_body,
     )
+
+
+def _take_keypoints(capture: Capture, fitter: ClipFitter) -> float:
+    """Fit poses once more, near given ones and those by key points; return the latter's weight."""
+    evidence = weigh_keypoint_poses(capture, fitter)
+    if evidence is None:
+        return 0.0
+    turns, share = fitter.camera_rotations, evidence.share
+    fitter.expect(blend_poses(fitter.given, evidence.poses, share, turns))
+    fitter.poses = blend_poses(fitter.poses, evidence.poses, share, turns)
+    for _ in range(BLENDED_ITERATIONS):
+        fitter.iterate(FitParameters(proportions=False, focal=False))
+    return share
 
 
 def share_beyond_noise(corrections: Float[np.ndarray, "frames 75"], error_cm: float) -> float:

@@ -94,6 +94,8 @@ class ClipFitter:
         coefficients: Proportions, in prior standard deviations.
         log_focal: Logarithm of the focal length's factor.
         weights: May be changed between iterations.
+        given: The poses from which the fit began.
+        camera_rotations: Rotation of each frame's camera, camera from world.
     """
 
     def __init__(
@@ -127,25 +129,39 @@ class ClipFitter:
         self._priors, self.weights = max(1.0, seen / frames_per_prior), weights
         self.coefficients = np.zeros(space.count)
         self.log_focal, self._sigma_log_focal = 0.0, sigma_log_focal
-        self._given = ClipPoses.of(motion, [frame.row for frame in self.frames])
-        self.poses = self._given
-        self._turns = np.stack([each.camera.camera_from_world[:3, :3] for each in self.frames])
+        self.given = ClipPoses.of(motion, [frame.row for frame in self.frames])
+        self.poses = self.given
+        self.camera_rotations = np.stack(
+            [each.camera.camera_from_world[:3, :3] for each in self.frames]
+        )
         numbers = np.array([frame.number for frame in self.frames])
         self._keypoints: ClipKeypoints | None = None
         if track is None:
-            self._prior = GivenPosePrior(self._given, self._turns, numbers)
+            self._prior = GivenPosePrior(self.given, self.camera_rotations, numbers)
         else:
             cameras = [frame.camera for frame in self.frames]
             used = [int(frame.number) for frame in self.frames]
             self._keypoints = ClipKeypoints.of(track, used, cameras, space.shaped.joints)
-            self._prior = HumanPosePrior(self._turns, _times_s(track, numbers), settled=settled)
+            self._prior = HumanPosePrior(
+                self.camera_rotations, _times_s(track, numbers), settled=settled
+            )
+
+    def expect(self, given: ClipPoses) -> None:
+        """Go on near other poses of the frames than those given."""
+        numbers = np.array([frame.number for frame in self.frames])
+        self._prior = GivenPosePrior(given, self.camera_rotations, numbers)
+
+    def take_person(self, other: "ClipFitter") -> None:
+        """Go on with another fit's proportions and focal length; both are around one shape."""
+        self.coefficients, self.log_focal = other.coefficients.copy(), other.log_focal
+        self.model.set_proportions(self.coefficients)
 
     @property
     def corrections(self) -> Float[np.ndarray, "frames 75"]:
         """Correction of each frame: root and joint rotations (radians, in their joints' axes) and
         root position (metres, in the camera's axes).
         """
-        return self.poses.steps_from(self._given, self._turns)
+        return self.poses.steps_from(self.given, self.camera_rotations)
 
     def camera(self, index: int) -> Camera:
         """Camera of a frame, with the present focal length."""
@@ -169,7 +185,7 @@ class ClipFitter:
         moved[:, 74] -= (zoom - zoomed) * self._depths_m()  # distances go with the focal length
         moved[:, :72] = np.clip(moved[:, :72], -MAX_TURN_STEP_RAD, MAX_TURN_STEP_RAD)
         moved[:, 72:] = np.clip(moved[:, 72:], -MAX_PLACE_STEP_M, MAX_PLACE_STEP_M)
-        self.poses = self.poses.moved(moved, self._turns)
+        self.poses = self.poses.moved(moved, self.camera_rotations)
         if fitted.proportions:
             self.coefficients += np.clip(step[:-1], -1.0, 1.0)
             self.model.set_proportions(self.coefficients)

@@ -321,6 +321,38 @@ def distance_in_sides(a: PersonSquare, b: PersonSquare) -> float:
 
 
 @final
+class PosedPersonFinder:
+    """Finds key points and the coarse mask of a person where a pose puts the body."""
+
+    def __init__(self, shaped: ShapedBody) -> None:
+        """Loads the network."""
+        self._shaped, self._skin = shaped, SkinPoints.of(shaped)
+        self._brighten, self._find_landmarks = DarkFilmBrightener(), BlazePoseLandmarks()
+
+    def __call__(
+        self, rgb: UInt8[np.ndarray, "height width 3"], pose: BodyPose, camera: Camera
+    ) -> tuple[PersonKeypoints, float]:
+        """Look at the square around the posed body; the mask holds nothing far from it.
+
+        Returns the person, and the IoU of its mask with the body.
+
+        Raises:
+            InputError: If the body is outside the image.
+        """
+        points = self._skin.posed(pose).astype(np.float64)
+        depth = points @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
+        pixels = camera.project(points) if depth.min() > NEAR_PLANE_M else np.full((1, 2), -1.0)
+        if not ((pixels >= 0.0) & (pixels < camera.size_px)).all(axis=1).any():
+            raise InputError("the posed body is not in the image")
+        joints = camera.project(self._shaped.with_pose(pose).joints())
+        square = _square_around(pixels, joints)
+        px_per_m = max(camera.focal_px) / float(np.median(depth))
+        person = self._find_landmarks(self._brighten(rgb), square).keypoints
+        mask, agreement = _limit_to_body(person.mask, pixels, px_per_m)
+        return replace(person, mask=mask), agreement
+
+
+@final
 class BlazePoseSegmenter:
     """Segments one person, frame by frame.
 
@@ -331,8 +363,7 @@ class BlazePoseSegmenter:
 
     def __init__(self, shaped: ShapedBody) -> None:
         """Loads the network."""
-        self._shaped, self._skin = shaped, SkinPoints.of(shaped)
-        self._brighten, self._find_landmarks = DarkFilmBrightener(), BlazePoseLandmarks()
+        self._find = PosedPersonFinder(shaped)
         self._refine: MaskRefiner | None = None
         self.mask_count, self.agreement = 0, 0.0
 
@@ -344,16 +375,7 @@ class BlazePoseSegmenter:
         Raises:
             InputError: If the body is outside the image, or the mask disagrees with it.
         """
-        points = self._skin.posed(pose).astype(np.float64)
-        depth = points @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
-        pixels = camera.project(points) if depth.min() > NEAR_PLANE_M else np.full((1, 2), -1.0)
-        if not ((pixels >= 0.0) & (pixels < frame.size_px)).all(axis=1).any():
-            raise InputError("the posed body is not in the image")
-        joints = camera.project(self._shaped.with_pose(pose).joints())
-        square = _square_around(pixels, joints)
-        px_per_m = max(camera.focal_px) / float(np.median(depth))
-        mask = self._find_landmarks(self._brighten(frame.rgb), square).keypoints.mask
-        mask, agreement = _limit_to_body(mask, pixels, px_per_m)
+        person, agreement = self._find(frame.rgb, pose, camera)
         if agreement < MIN_BODY_IOU:
             raise InputError(
                 f"the estimated mask agrees by {agreement:.0%} only with the posed body"
@@ -361,7 +383,7 @@ class BlazePoseSegmenter:
         self.mask_count += 1
         self.agreement += (agreement - self.agreement) / self.mask_count
         self._refine = self._refine or MaskRefiner(frame.size_px)
-        return self._refine(frame.rgb, mask)
+        return self._refine(frame.rgb, person.mask)
 
 
 def _square_around(

@@ -14,7 +14,8 @@ def fit() -> CaptureFit:
     corrections[:, 0] = 0.1
     return CaptureFit(
         coefficients=np.arange(3.0), focal_factor=1.05, corrections=corrections,
-        error_before_cm=1.6, error_after_cm=0.7, share=0.9, fits_body=False,
+        error_before_cm=1.6, error_after_cm=0.7, share=0.9, keypoint_share=0.0,
+        fits_body=False,
     )  # fmt: skip
 
 
@@ -40,10 +41,6 @@ def test_the_description_names_quantities_and_units(fit):
     assert "5.7 degrees" in fit.describe()
 
 
-def test_poses_that_the_fit_turns_far_are_said_to_disagree_with_the_film(fit):
-    assert fit.advice() is None
-    corrections = np.zeros((4, 75))
-    corrections[:, 3:72:3] = np.radians(6.5)
-    advice = replace(fit, corrections=corrections).advice()
-    assert "6.5 degrees" in advice
-    assert "without --poses" in advice
+def test_the_weight_of_key_points_is_described_where_they_count(fit):
+    assert "key points" not in fit.describe()
+    assert "count by 60%" in replace(fit, keypoint_share=0.4).describe()

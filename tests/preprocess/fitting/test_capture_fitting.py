@@ -11,6 +11,7 @@ from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.capture_session import CaptureInputs
+from preprocess.fitting import capture_fitting
 from preprocess.fitting.capture_fit import CaptureFit
 from preprocess.fitting.capture_fitting import (
     NOISE_DEG_PER_CM,
@@ -19,6 +20,7 @@ from preprocess.fitting.capture_fitting import (
     share_beyond_noise,
 )
 from preprocess.open_capture import open_capture
+from preprocess.poses.pose_file import read_motion
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +48,7 @@ def fit(capture) -> CaptureFit:
     corrections[:, 1] = 0.1
     return CaptureFit(
         coefficients=coefficients, focal_factor=1.1, corrections=corrections, error_before_cm=2.0,
-        error_after_cm=1.0, share=1.0, fits_body=True,
+        error_after_cm=1.0, share=1.0, keypoint_share=0.0, fits_body=True,
     )  # fmt: skip
 
 
@@ -131,3 +133,42 @@ def test_poses_are_fitted_to_refined_masks(tmp_path):
         errors.append(found.error_before_cm)
     as_given, refined = errors
     assert refined < 0.7 * as_given
+
+
+# --- key points beside given poses ---------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def coarse(tmp_path_factory):
+    """A film whose given poses err 2.5 times as far as a good tracker's; opened, and its truth."""
+    folder = tmp_path_factory.mktemp("coarse") / "capture"
+    film_capture(
+        folder,
+        ShootConfig(frames=24, size=112, fps=8.0, like_a_phone=True, tracker_error=2.5),
+    )
+    return open_capture(CaptureInputs(video=folder)), read_motion(folder / "truth" / "poses.npz")
+
+
+def error_deg(motion, truth) -> float:
+    """Mean angle of the joints that trackers see to the truth's, degrees."""
+    one, other = (rotation_matrices(each.joint_rotations[:, :21]) for each in (motion, truth))
+    vectors = axis_angles_from_matrices(one.swapaxes(-1, -2) @ other)
+    return float(np.degrees(np.linalg.norm(vectors, axis=-1)).mean())
+
+
+def test_key_points_bring_coarse_poses_nearer_to_the_truth(coarse, monkeypatch):
+    capture, truth = coarse
+    with_keypoints = fit_capture(capture)
+    monkeypatch.setattr(capture_fitting, "weigh_keypoint_poses", lambda capture, fitter: None)
+    without = fit_capture(capture)
+    assert with_keypoints.keypoint_share > 0.3
+    assert without.keypoint_share == 0.0
+    by_both, by_outlines = (
+        error_deg(apply_fit(capture, fit).motion, truth) for fit in (with_keypoints, without)
+    )
+    assert by_both < 0.85 * by_outlines
+
+
+def test_no_key_points_are_looked_for_where_given_poses_are_exact(capture, monkeypatch):
+    monkeypatch.delattr(capture_fitting, "weigh_keypoint_poses")
+    assert fit_capture(capture).share == 0.0
