@@ -41,7 +41,7 @@ WEIGHTS = ROOT / "preprocess" / "tracking" / "weights"
 OTHER_PACKAGES = frozenset({
     "av", "filelock", "jaxtyping", "jinja2", "numpy", "onnxruntime", "pillow", "psutil", "rich",
     "opencv-contrib-python-headless", "scipy", "tyro", "numba", "onnx", "pycolmap", "torch",
-    "trimesh", "fast-simplification", "docstring-parser",
+    "trimesh", "fast-simplification", "docstring-parser", "xatlas",
 })  # fmt: skip
 """What playing, learning and exporting need without a tracker."""
 AVATAR_TARGETS = {

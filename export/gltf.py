@@ -23,8 +23,10 @@ ARRAY_BUFFER = 34962
 """glTF's code of a buffer of vertices."""
 ELEMENT_ARRAY_BUFFER = 34963
 """glTF's code of a buffer of indices."""
-LINEAR_FILTER, CLAMP_TO_EDGE = 9729, 33071
-"""OpenGL's codes of how a texture is read; smaller copies would mix the colors of its triangles."""
+LINEAR_FILTER, MIPMAP_FILTER, CLAMP_TO_EDGE = 9729, 9987, 33071
+"""OpenGL's codes of how a texture is read: magnified, minified, and beyond its edge."""
+JPEG_QUALITY = 95
+"""Quality of the texture's JPEG, of 100."""
 FIRST_JOINT = 2
 """Node of the first joint; 0 is the mesh and 1 the floor."""
 
@@ -142,14 +144,17 @@ def _material(draft: "_GltfBuffer", mesh: SkinnedMesh) -> dict[str, Any]:
     if mesh.texture is None:
         return {"materials": [material]}
     surface["baseColorTexture"] = {"index": 0}
-    code = cv2.imencode(".png", np.ascontiguousarray(mesh.texture.image[..., ::-1]))[1].tobytes()
-    modes = dict.fromkeys(("magFilter", "minFilter"), LINEAR_FILTER)
+    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    options += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+    image = np.ascontiguousarray(mesh.texture.image[..., ::-1])
+    code = cv2.imencode(".jpg", image, options)[1].tobytes()
     wraps = dict.fromkeys(("wrapS", "wrapT"), CLAMP_TO_EDGE)
+    sampler = {"magFilter": LINEAR_FILTER, "minFilter": MIPMAP_FILTER, **wraps}
     return {
         "materials": [material],
         "textures": [{"source": 0, "sampler": 0}],
-        "images": [{"bufferView": draft.add_bytes(code), "mimeType": "image/png"}],
-        "samplers": [{**modes, **wraps}],
+        "images": [{"bufferView": draft.add_bytes(code), "mimeType": "image/jpeg"}],
+        "samplers": [sampler],
     }
 
 

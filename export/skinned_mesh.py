@@ -1,10 +1,6 @@
-"""A package's avatar as a mesh for other programs: vertices, colors or a texture, skinning weights.
+"""A package's avatar as a mesh: vertices, colors or a texture, and skinning weights."""
 
-In a texture each pair of triangles has a square cell.
-"""
-
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, UInt8
@@ -13,6 +9,7 @@ from scipy.sparse import coo_array
 from scipy.spatial import KDTree
 
 from export.bake.voxel_grid import extract_isosurface, remove_floaters_and_cavities, resample_grid
+from export.mesh_texture import Texture, draw_texture, unwrap
 from export.package.player_tables import (
     BRICK_SIZE,
     BrickTable,
@@ -51,25 +48,6 @@ MIN_COLOR_ALPHA = 0.2
 """Alpha below which a vertex takes the color of the nearest other one."""
 JOINTS_PER_VERTEX = 4
 """Joints that move a vertex: all importers read this many."""
-TEXEL_M = 0.002
-"""Edge of a texel on the surface, about, metres: as fine as the bricks' voxels."""
-MIN_CELL_PX, MAX_SIDE_PX = 6, 4096
-"""Least side of a cell, and largest side of the image, px."""
-MARGIN_PX = 3.5
-"""Texels of a cell's side that are beyond a triangle, so that filters mix no other's colors in."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Texture:
-    """A texture and where its mesh's vertices lie in it; no two triangles share a vertex.
-
-    Attributes:
-        image: sRGB, the first row at the top.
-        coordinates: Of each vertex, in [0, 1] from the image's upper left corner.
-    """
-
-    image: UInt8[np.ndarray, "rows columns 3"]
-    coordinates: Float32[np.ndarray, "vertices 2"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -92,16 +70,6 @@ class SkinnedMesh:
     joints: UInt8[np.ndarray, "vertices 4"]
     weights: UInt8[np.ndarray, "vertices 4"]
     texture: Texture | None = None
-
-    def split(self) -> "SkinnedMesh":
-        """The same surface, with vertices of its own for each triangle."""
-        corners = self.faces.ravel()
-        each = {
-            name: getattr(self, name)[corners]
-            for name in ("positions", "normals", "colors", "joints", "weights")
-        }
-        faces = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
-        return replace(self, faces=faces, **each)
 
 
 def extract_mesh(
@@ -142,7 +110,18 @@ def extract_mesh(
     )
     if not textured:
         return mesh
-    return replace(mesh.split(), texture=make_texture(positions, normals, faces, color_at))
+    unwrapped = unwrap(positions, faces)
+    rows = unwrapped.sources
+    texture = draw_texture(unwrapped, positions[rows], normals[rows], color_at)
+    return SkinnedMesh(
+        positions=positions[rows],
+        normals=normals[rows],
+        colors=mesh.colors[rows],
+        faces=unwrapped.faces,
+        joints=joints[rows],
+        weights=weights[rows],
+        texture=texture,
+    )
 
 
 def _simplify(
@@ -283,56 +262,3 @@ def _strongest_joints(
     rank = np.argsort(np.argsort(codes - scaled, axis=1, kind="stable"), axis=1)
     codes += rank < missing
     return np.where(codes > 0, joints, 0).astype(np.uint8), codes.astype(np.uint8)
-
-
-def make_texture(
-    positions: Float32[np.ndarray, "vertices 3"],
-    normals: Float32[np.ndarray, "vertices 3"],
-    faces: Int32[np.ndarray, "faces 3"],
-    color_at: Callable[
-        [Float32[np.ndarray, "points 3"], Float32[np.ndarray, "points 3"]],
-        UInt8[np.ndarray, "points 3"],
-    ],
-) -> Texture:
-    """Draw the texture of a mesh.
-
-    Its vertices are the triangles' corners, in order. `color_at` takes points on the surface and
-    their normals.
-    """
-    columns = int(np.ceil(np.sqrt(np.ceil(len(faces) / 2))))
-    corners = positions[faces]
-    edge_m = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
-    side = int(np.clip(edge_m / TEXEL_M + MARGIN_PX, MIN_CELL_PX, max(8, MAX_SIDE_PX // columns)))
-    row, column = np.mgrid[:side, :side].reshape(2, -1) + 0.5
-    upper = row + column > side  # of the two triangles of a cell
-    first, leg = 1.0, side - MARGIN_PX
-    a = np.where(upper, side - column - first, column - first) / leg
-    b = np.where(upper, side - row - first, row - first) / leg
-    shares = np.stack([1.0 - a - b, a, b], axis=1).astype(np.float32)
-    image = np.zeros((columns, side, columns, side, 3), dtype=np.uint8)
-    for half, inside in enumerate((~upper, upper)):
-        own = faces[half::2]
-        points, directions = (
-            np.einsum("tc,fcx->ftx", shares[inside], each[own]).reshape(-1, 3)
-            for each in (positions, normals)
-        )
-        directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-6)
-        drawn = color_at(points, directions).reshape(len(own), -1, 3)
-        cell_row, cell_column = np.divmod(np.arange(len(own)), columns)
-        at_row, at_column = (np.floor(each[inside]).astype(int) for each in (row, column))
-        image[cell_row[:, None], at_row, cell_column[:, None], at_column] = drawn
-    return Texture(
-        image=image.reshape(columns * side, columns * side, 3),
-        coordinates=_coordinates(len(faces), columns, side),
-    )
-
-
-def _coordinates(faces: int, columns: int, side: int) -> Float32[np.ndarray, "vertices 2"]:
-    """Return coordinates of all triangles' corners in the image."""
-    leg = side - MARGIN_PX
-    lower = np.array([[1.0, 1.0], [1.0 + leg, 1.0], [1.0, 1.0 + leg]])
-    both = np.stack([lower, side - lower])[np.arange(faces) % 2]
-    cell_row, cell_column = np.divmod(np.arange(faces) // 2, columns)
-    corner = np.stack([cell_column, cell_row], axis=1) * side
-    placed = (both + corner[:, None]) / (columns * side)
-    return placed.reshape(-1, 2).astype(np.float32)

@@ -5,6 +5,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -136,11 +137,15 @@ def _export_mesh(arguments: ExportArguments, package: Path, console: Console) ->
         joints = held.manifest.rest_joints
         motion = load_driving_motion(arguments.poses, joints, console, person=arguments.person)
     to_glb, out = arguments.to == "glb", arguments.out
+    textured = to_glb and arguments.triangles is not None
+    if textured and find_spec("xatlas") is None:
+        textured = False
+        console.info("note: colors of vertices instead of a texture, which needs xatlas.")
     with console.status("extracting the surface"):
         mesh = extract_mesh(
             held.tables["hq"],
             triangles=arguments.triangles,
-            textured=to_glb and arguments.triangles is not None,
+            textured=textured,
         )
         if to_glb:
             content = _encode_animated(mesh, held.manifest, motion, out.stem)

@@ -212,17 +212,19 @@ def test_a_still_pose_is_a_motion_too(mesh, package, motion):
 @pytest.fixture(scope="module")
 def simple(package):
     """The same of three thousand triangles, with a texture."""
-    pytest.importorskip("fast_simplification")
+    pytest.importorskip("xatlas")
     return extract_mesh(package.tables["hq"], triangles=3000, textured=True)
 
 
-def texels(texture, shares):
-    """Bilinear samples at a place of every triangle, by its shares of the corners."""
-    height, width = texture.image.shape[:2]
-    x, y = (texture.coordinates.reshape(-1, 3, 2) * [width, height] - 0.5).transpose(2, 0, 1)
+def texels(mesh, shares, smaller=1):
+    """Bilinear samples at a place of every triangle, by its shares of the corners, of a mipmap."""
+    side = len(mesh.texture.image) // smaller
+    image = mesh.texture.image[: side * smaller, : side * smaller].astype(float)
+    image = image.reshape(side, smaller, side, smaller, 3).mean(axis=(1, 3))
+    x, y = (mesh.texture.coordinates[mesh.faces] * side - 0.5).transpose(2, 0, 1)
     place = [each @ shares for each in (y, x)]
     channels = [
-        ndimage.map_coordinates(texture.image[..., channel].astype(float), place, order=1)
+        ndimage.map_coordinates(image[..., channel], place, order=1, mode="nearest")
         for channel in range(3)
     ]
     return np.stack(channels, axis=1)
@@ -230,17 +232,20 @@ def texels(texture, shares):
 
 def test_few_triangles_keep_the_shape_and_its_colors(simple, mesh):
     assert 2900 <= len(simple.faces) <= 3000
-    assert len(simple.positions) == 3 * len(simple.faces)
+    assert len(simple.positions) < 1.3 * len(simple.faces)
     assert volume(simple.positions, simple.faces) == pytest.approx(
         volume(mesh.positions, mesh.faces), rel=0.04
     )
-    assert KDTree(mesh.positions).query(simple.positions)[0].max() < 0.02
     near = KDTree(mesh.positions)
-    for shares in ([1 / 3, 1 / 3, 1 / 3], [0.9, 0.05, 0.05], [0.05, 0.05, 0.9]):
-        points = np.einsum("c,fcx->fx", shares, simple.positions.reshape(-1, 3, 3))
+    assert near.query(simple.positions)[0].max() < 0.02
+    for smaller, shares in [
+        (1, [1 / 3, 1 / 3, 1 / 3]), (1, [0.9, 0.05, 0.05]), (1, [1.1, -0.05, -0.05]),
+        (4, [0.05, 0.05, 0.9]), (4, [1.1, -0.05, -0.05]),
+    ]:  # fmt: skip
+        points = np.einsum("c,fcx->fx", shares, simple.positions[simple.faces])
         away, nearest = near.query(points)
         expected = mesh.colors[nearest].astype(float)
-        off = np.abs(texels(simple.texture, np.array(shares)) - expected).mean(axis=1)
+        off = np.abs(texels(simple, np.array(shares), smaller) - expected).mean(axis=1)
         assert np.median(off[away < 0.004]) < 6.0
 
 
@@ -253,4 +258,7 @@ def test_a_texture_is_read_by_another_reader(simple, package, motion):
     assert ((read.attribute("TEXCOORD_0") > 0.0) & (read.attribute("TEXCOORD_0") < 1.0)).all()
     (found,) = trimesh.load(io.BytesIO(content), file_type="glb").geometry.values()
     image = np.asarray(found.visual.material.baseColorTexture.convert("RGB"))
-    np.testing.assert_array_equal(image, simple.texture.image)
+    assert image.shape == simple.texture.image.shape
+    assert np.abs(image.astype(float) - simple.texture.image).mean() < 3.0  # a JPEG
+    (sampler,) = read.json["samplers"]
+    assert sampler["minFilter"] == 9987  # mipmaps

@@ -93,7 +93,7 @@ def test_a_mesh_dances_what_any_file_of_poses_says(run, film, call_export, tmp_p
 
 
 def test_a_mesh_of_few_triangles_has_a_texture(run, call_export, tmp_path):
-    pytest.importorskip("fast_simplification")
+    pytest.importorskip("xatlas")
     out = tmp_path / "few.glb"
     words = ("--to", "glb", "--triangles", 2000, "--out", out)
     code, said = call_export(run / "avatar.iavatar", *words)
@@ -102,6 +102,17 @@ def test_a_mesh_of_few_triangles_has_a_texture(run, call_export, tmp_path):
     (mesh,) = trimesh.load(out).geometry.values()
     assert mesh.visual.kind == "texture"
     assert np.asarray(mesh.visual.material.baseColorTexture)[..., :3].std() > 20.0
+
+
+def test_without_xatlas_a_mesh_of_few_triangles_has_colors(run, call_export, tmp_path, monkeypatch):
+    monkeypatch.setattr("instant_avatar.export.find_spec", lambda name: None)
+    out = tmp_path / "few.glb"
+    code, said = call_export(
+        run / "avatar.iavatar", "--to", "glb", "--triangles", 2000, "--out", out
+    )
+    assert code == 0, said.err
+    assert "colors of vertices" in said.err
+    assert b"COLOR_0" in out.read_bytes()
 
 
 @pytest.mark.parametrize("name", ["A.PLY", pytest.param("a.OBJ", marks=pytest.mark.slow)])
