@@ -260,7 +260,7 @@ def package_figures(avatar: Avatar, held_out: list[HeldOutFrame]) -> Figures:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "avatar.iavatar"
         try:
-            export_avatar(avatar, path, views=views[:VALIDATION_VIEWS], metrics={})
+            list(export_avatar(avatar, path, views=views[:VALIDATION_VIEWS], metrics={}))
         except ExportRefused as refusal:
             print(refusal, file=sys.stderr)
         else:

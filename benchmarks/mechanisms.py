@@ -390,7 +390,7 @@ def _player_psnr(avatar: Avatar, held_out: Sequence[HeldOutFrame], dance: Motion
     rows = np.linspace(0, len(dance) - 1, DANCE_POSES).round().astype(int)
     with TemporaryDirectory() as folder:
         package = Path(folder) / "avatar.iavatar"
-        export_avatar(avatar, package, views=views, metrics={})
+        list(export_avatar(avatar, package, views=views, metrics={}))
         player, found = Player.load(package, tier="hq"), []
         for place, row in enumerate(rows):
             pose, camera = views[place % len(views)]

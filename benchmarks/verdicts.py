@@ -191,7 +191,7 @@ def player_psnr(trainer: Trainer, held_out: list[HeldOutFrame]) -> float | None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "avatar.iavatar"
         try:
-            report = export_avatar(trainer.avatar, path, views=views, metrics={})
+            (report,) = export_avatar(trainer.avatar, path, views=views, metrics={})
         except ExportRefused:
             return None
     return report.psnr_to_renderer["hq"]

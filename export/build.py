@@ -1,6 +1,6 @@
 """Exporting an avatar: sample the field, bake, fine-tune, build the graphs, check, write.
 
-report = export_avatar(avatar, Path("avatar.iavatar"), views=[(pose, camera)], metrics={})
+(report,) = export_avatar(avatar, Path("avatar.iavatar"), views=[(pose, camera)], metrics={})
 
 The checks compare a package's player with its reference and with the volume renderer.
 """
@@ -93,32 +93,23 @@ class ExportReport:
 
 
 def export_avatar(
-    avatar: Avatar, path: Path, *, views: Sequence[PosedView], metrics: Mapping[str, Any]
-) -> ExportReport:
-    """Write an avatar's fine-tuned package, or nothing; arguments as of `export_in_stages`."""
-    (report,) = export_in_stages(avatar, path, views=views, metrics=metrics, baked_first=False)
-    return report
-
-
-def export_in_stages(
     avatar: Avatar,
     path: Path,
     *,
     views: Sequence[PosedView],
     metrics: Mapping[str, Any],
-    baked_first: bool = True,
+    baked_first: bool = False,
     fine_tune_bricks: bool = True,
     progress: ExportProgress = lambda _: None,
 ) -> Iterator[ExportReport]:
-    """Write an avatar's package as it was baked, then the fine-tuned one in its place.
+    """Write an avatar's package; with `baked_first` as it was baked, then again fine-tuned.
 
     Args:
         path: The `.iavatar` file; replaced atomically if it exists.
         views: Poses and cameras to check it with, at least one; the first is the preview, and the
             first few become golden frames. Lens distortion is ignored.
         metrics: Training metrics, kept in the manifest (JSON).
-        baked_first: Whether the package is written before its bricks are fine-tuned, too.
-        fine_tune_bricks: Takes some ten seconds.
+        fine_tune_bricks: Whether to spend some ten seconds on them.
         progress: Receives the fraction of the export that is done, from 0 to 1, while bricks are
             fine-tuned. A KeyboardInterrupt meanwhile, or from it, ends only the fine-tuning.
 
@@ -156,7 +147,7 @@ def export_field(
     baked_first: bool = False,
     progress: ExportProgress = lambda _: None,
 ) -> Iterator[ExportReport]:
-    """Write packages of any canonical field; arguments and errors as of `export_in_stages`."""
+    """Write packages of any canonical field; arguments and errors as of `export_avatar`."""
     if not views:
         raise InputError("An avatar cannot be checked without a pose and a camera; give one view.")
     started, config = time.perf_counter(), config or BakeConfig()
@@ -339,7 +330,7 @@ SIMPLIFIED_WARNING = (
 POOR_WARNING = (
     "The package shows the avatar poorly: what it draws is only {score:.1f} dB from the avatar as "
     "trained ({good:.0f} dB and more look the same). The avatar is still fog rather than a "
-    "surface; train longer (ia-ingest with --resume and more --seconds)."
+    "surface; train longer (ia-ingest --resume, and more --seconds or --steps)."
 )
 """Shown below `POOR_PSNR`."""
 CHECK_PX = 256

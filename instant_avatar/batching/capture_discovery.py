@@ -18,6 +18,7 @@ from capture.source_opening import SIDE_VIDEO_PREFIXES
 from capture.video import VIDEO_SUFFIXES
 from instant_avatar.batching.remote_files import ListedFile, is_url, list_files, read_text
 from instant_avatar.cli.command_line import parse_arguments
+from instant_avatar.cli.shared_options import USUAL_NAMES
 from instant_avatar.run.ingest_arguments import IngestArguments
 from preprocess.capture_paths import CAMERA_NAMES, MASK_NAMES, POSE_FILE_NAMES
 
@@ -189,7 +190,9 @@ def _folder_captures(
     for name in sorted(entries):
         path = f"{place}/{name}"
         if name in films:
-            yield prefix + Path(name).stem, path, ({}, ()), entries[name]
+            alone = len(films) == 1 and Path(name).stem.lower() in USUAL_NAMES
+            called = prefix.rstrip("-") or Path(place).name if alone else prefix + Path(name).stem
+            yield called, path, ({}, ()), entries[name]
         elif name not in names:
             yield from _folder_captures(path, entries[name], f"{prefix}{name}-")
 

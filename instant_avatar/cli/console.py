@@ -4,7 +4,6 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from types import TracebackType
 from typing import final
 
 from rich.console import Console as RichConsole
@@ -112,9 +111,14 @@ class Console:
         with self._rich.status(escape(message)) as status:
             yield lambda note: status.update(f"{escape(message)}: {escape(note)}")
 
-    def progress(self, label: str, total: float) -> "ProgressBar":
-        """Return a progress bar for a `with` block."""
-        return ProgressBar(self._rich, label, total)
+    @contextmanager
+    def progress(self, label: str, total: float) -> Iterator["ProgressBar"]:
+        """Show a progress bar during a block."""
+        bar = ProgressBar(self._rich, label, total)
+        try:
+            yield bar
+        finally:
+            bar.stop()
 
 
 def _min_width_column(width: int) -> Column:
@@ -127,48 +131,29 @@ class ProgressBar:
     """Progress: a bar on a terminal, a line every `LOG_INTERVAL_S` in a log."""
 
     def __init__(self, console: RichConsole, label: str, total: float) -> None:
-        """Called by `Console.progress`."""
+        """Show the bar; called by `Console.progress`."""
         self._console, self._label, self._total = console, label, total
         self._progress: Progress | None = None
         self._task = TaskID(0)
         self._started_at = self._logged_at = time.perf_counter()
         self._drawn_at = 0.0
-
-    def start(self) -> None:
-        """Show the bar."""
-        if self._console.is_terminal:
-            self._progress = Progress(
-                TextColumn(
-                    "[bold]{task.description}", table_column=_min_width_column(len(self._label))
-                ),
-                BarColumn(bar_width=28, table_column=_min_width_column(MIN_BAR_WIDTH)),
-                TextColumn("{task.fields[note]}"),
-                console=self._console,
-                transient=True,
-            )
-            self._progress.start()
-            self._task = self._progress.add_task(self._label, total=self._total, note="")
-        else:
-            self._console.print(escape(self._label), highlight=False)
+        if not console.is_terminal:
+            console.print(escape(label), highlight=False)
+            return
+        self._progress = Progress(
+            TextColumn("[bold]{task.description}", table_column=_min_width_column(len(label))),
+            BarColumn(bar_width=28, table_column=_min_width_column(MIN_BAR_WIDTH)),
+            TextColumn("{task.fields[note]}"),
+            console=console,
+            transient=True,
+        )
+        self._progress.start()
+        self._task = self._progress.add_task(label, total=total, note="")
 
     def stop(self) -> None:
         """Remove the bar."""
         if self._progress is not None:
             self._progress.stop()
-
-    def __enter__(self) -> "ProgressBar":
-        """Show the bar."""
-        self.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Remove the bar."""
-        self.stop()
 
     def set_count(self, done: int) -> None:
         """Set the number done of the total, and show the remaining time."""

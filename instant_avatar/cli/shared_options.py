@@ -74,10 +74,15 @@ class CaptureArguments:
         )
 
 
+USUAL_NAMES = frozenset({"video", "movie", "film", "clip", "images", "frames"})
+"""Names of videos that say nothing about what they show."""
+
+
 def capture_name(video: Path) -> str:
-    """Return the name of a capture, after which its outputs are called."""
+    """Return the name of a capture, or of its folder if its own says nothing."""
     place = video.resolve()
-    return place.name if place.is_dir() else place.stem
+    name = place.name if place.is_dir() else place.stem
+    return place.parent.name or name if name.lower() in USUAL_NAMES else name
 
 
 def parse_frame_range(text: str) -> slice | None:

@@ -1,4 +1,7 @@
-"""report.json: the inputs of a run, its cost and the quality of its avatar."""
+"""report.json: the inputs of a run, its cost and the quality of its avatar.
+
+docs/report.md says what each key means.
+"""
 
 import dataclasses
 import json
@@ -44,15 +47,7 @@ class MachineInfo:
 
 @dataclass(frozen=True, kw_only=True)
 class FrameStats:
-    """Number of frames by use.
-
-    Attributes:
-        used: Trained on.
-        held_out: Scored, never trained on.
-        dropped: Skipped, each with its reason.
-        near_duplicates: Skipped because they resemble the previous frame.
-        not_replayed: Trained on when they arrived, but not kept as key frames.
-    """
+    """Number of frames by use."""
 
     read: int
     used: int
@@ -78,18 +73,7 @@ class FrameStats:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingStats:
-    """Cost of training.
-
-    Attributes:
-        wall_seconds: From the first frame handed to the trainer to the last step.
-        cpu_seconds: CPU time of the whole process in that time.
-        step_cpu_seconds: The part of it during training steps.
-        cpu_contention_seconds: Wall time of training steps above their CPU time: at least so long
-            did other programs hold the cores; a resumed run counts its own part only.
-        startup_seconds: Before training: imports, opening and checking the capture, kernels.
-        samples_per_ray: Mean number of samples per ray.
-        peak_memory_mb: Peak resident memory of the process.
-    """
+    """Cost of training."""
 
     wall_seconds: float
     cpu_seconds: float
@@ -105,24 +89,7 @@ class TrainingStats:
 
 @dataclass(frozen=True, kw_only=True)
 class HeldOutStats:
-    """Scores of the held-out frames, composited on white.
-
-    Attributes:
-        frames: Frame numbers in the video.
-        size: Width and height in pixels.
-        psnr: Mean PSNR of the whole image, dB; null if nothing was scored.
-        psnr_mask: Mean PSNR where alpha > 0.5, dB.
-        ssim: Mean SSIM of the whole image.
-        verdict: sharp, soft, blurred or failed (`avatar.evaluation.image_metrics`); null if
-            nothing was scored.
-        blur: Median equivalent blur, as a fraction of body height; null beyond the largest
-            measurable one.
-        overlap: Median soft IoU of rendered alpha and mask.
-        lpips: Not measured.
-        poses: Poses that the frames were rendered in: given, or fitted.
-        whole_images: Number of frames of which the whole image was scored. The scores of the others
-            are estimates from a sample of their pixels, and `ssim` leaves them out.
-    """
+    """Scores of the held-out frames, composited on white."""
 
     frames: tuple[int, ...]
     size: tuple[int, int] | None
@@ -157,16 +124,8 @@ class HeldOutStats:
 class CurvePoint:
     """One evaluation of held-out frames during training.
 
-    Its scores are estimates from a sample of each frame's pixels, the same ones every time.
-
-    Attributes:
-        wall_seconds, cpu_seconds: Training time up to here.
-        frames_seen: Frames trained on up to here.
-        psnr, psnr_mask: Mean PSNR of the frames scored here, whole and inside their masks, dB.
-        frames: Frame number in the video and PSNR of the whole image of each frame scored here.
-            Evaluations may score different frames, so only a frame's own scores show a drop.
-        video: Number of the video that the frames are from, 1 for the first.
-        pixels: Pixels sampled of each frame, at most; None if all were scored.
+    Its scores are estimates from a sample of the pixels, the same ones every time. `frames`
+    are their numbers in the video, and the PSNR of each; `pixels` is None if all were scored.
     """
 
     wall_seconds: float
@@ -202,19 +161,7 @@ class Percentiles:
 
 @dataclass(frozen=True, kw_only=True)
 class StreamStats:
-    """Timing of the frame stream.
-
-    Attributes:
-        realtime: Whether frames arrived at their own times: simulated (--realtime), or live.
-        ingest_ms: From decoding to ready for training, per frame.
-        inbox_dropped: Frames of a live source that were replaced by newer ones.
-        ready_after_last_frame_seconds: From the end of the video, as if filmed from the first
-            frame on, to the package; null without a package.
-        latency_ms: From the moment a frame was available (due, filmed, or decoded) until the
-            trainer had it.
-        lateness_ms: From the moment a frame was available until its preparation began.
-        inbox_depth: Frames waiting in the inbox.
-    """
+    """Timing of the frame stream."""
 
     realtime: bool
     ingest_ms: Percentiles
@@ -237,14 +184,7 @@ class PackageStats:
 
 @dataclass(frozen=True, kw_only=True)
 class CoverageStats:
-    """Fraction of the person's skin that the training frames show.
-
-    Attributes:
-        seen: Fraction of the skin seen, in [0, 1].
-        well: Fraction seen within 53° of the surface normal.
-        parts: Fraction seen of each body part under "seen", then of each of its sides. Left and
-            right are the person's.
-    """
+    """Fraction of the person's skin that the training frames show."""
 
     seen: float
     well: float
@@ -264,17 +204,7 @@ class CoverageStats:
 
 @dataclass(frozen=True, kw_only=True)
 class ForgettingStats:
-    """Forgetting of earlier videos caused by adding this one.
-
-    Attributes:
-        videos: Names of the earlier videos, in order.
-        frames_trained, replayed_key_frames: Numbers of their frames.
-        wall_seconds: Training time before this video.
-        frames: Their held-out frames, by frame number in their own video.
-        video_of_frame: Position in `videos`, from 1, of the video of each of these frames.
-        psnr_before, psnr_after: Mean PSNR of these frames before this video and at the end, dB.
-        largest_drop: Largest drop in PSNR of one of these frames, dB; 0 if none dropped.
-    """
+    """Forgetting of earlier videos caused by adding this one."""
 
     videos: tuple[str, ...]
     frames_trained: int

@@ -5,6 +5,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, final
 
+from avatar.evaluation.all_round_verdict import TRAIN_LONGER
 from avatar.evaluation.image_metrics import (
     MAX_MEASURABLE_BLUR,
     MIN_OVERLAP,
@@ -19,7 +20,7 @@ from export.player import Player
 from instant_avatar.animation.driving_motion import FollowingCamera, ResampledMotion, demo_motion
 from instant_avatar.cli.command_line import DONE, INTERRUPTED, NO_AVATAR, CommandExit
 from instant_avatar.cli.console import Console
-from instant_avatar.cli.shared_options import option_words
+from instant_avatar.cli.shared_options import capture_name, option_words
 from instant_avatar.report.page_rendering import data_uri, encode_webp, to_uint8, webp_data_uri
 from instant_avatar.report.report_figures import CoverageMap
 from instant_avatar.report.report_page import ComparisonPair, report_page
@@ -52,11 +53,7 @@ def diagnose_failure(report: Report) -> str | None:
     held = report.held_out_refined or report.held_out
     what = f"The result is no usable avatar: {_describe_scores(held)}."
     if report.training.steps < MIN_STEPS_TO_JUDGE:
-        option = "--steps" if report.recipe.get("steps") else "--seconds"
-        return (
-            f"{what} Only {report.training.steps} steps were made: train longer (the same command "
-            f"with --resume and more {option})."
-        )
+        return f"{what} Only {report.training.steps} steps were made: {TRAIN_LONGER}."
     return (
         f"{what} The model did not converge to the person. Usual causes: masks that include "
         "background, or poses from another video. Compare video and avatar in report.html"
@@ -103,8 +100,6 @@ FIRST_ANIMATION_FPS = 8.0
 """Images per second while the user waits for the page."""
 ANIMATION_FRAMES = 96
 """Largest number of images of an animation."""
-USUAL_NAMES = frozenset({"video", "movie", "film", "clip", "images", "frames"})
-"""Names of videos that say nothing about what they show."""
 
 
 @final
@@ -188,7 +183,7 @@ class ReportWriter:
             write_text_atomically(path, report.to_json(), replace=may_replace)
         page = report_page(
             report,
-            name=display_name(self._capture.paths.video),
+            name=capture_name(self._capture.paths.video),
             verdict=describe_verdict(report, _refusal(result), is_final=is_final),
             body_map=CoverageMap(self._capture.shaped, result.coverage).svg(),
             pairs=comparison_pairs(result),
@@ -201,8 +196,10 @@ class ReportWriter:
         write_text_atomically(self._run.report_html, page)
 
     def _play_command(self) -> str:
-        """Return the command that plays the package in the poses it was learnt from."""
-        return quote_command("ia-play", self._run.package, "--poses", self._capture.paths.poses)
+        """Return the command that plays the package, in the poses of the video if they are kept."""
+        poses = self._capture.paths.poses
+        options = ("--poses", poses) if poses.is_file() else ()
+        return quote_command("ia-play", self._run.package, *options)
 
     def _next_steps(self) -> dict[str, str]:
         """Return commands by what they do."""
@@ -240,11 +237,6 @@ class ReportWriter:
         console.print_artifact("look at it", run.report_html)
         console.print_artifact("report", run.report_json)
         console.print_artifact("checkpoint", run.checkpoint)
-
-
-def display_name(video: Path) -> str:
-    """Return the name of a video, or of its folder if its own says nothing."""
-    return video.absolute().parent.name if video.stem.lower() in USUAL_NAMES else video.name
 
 
 def _refusal(result: TrainingResult) -> str | None:

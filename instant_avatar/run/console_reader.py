@@ -1,6 +1,6 @@
 """The console's reader of a session: a progress line, scores as they are made, and messages."""
 
-from types import TracebackType
+from contextlib import ExitStack
 from typing import final
 
 from avatar.events import Evaluated, FrameArrived, FrameLeftOut, Stepped, Warned
@@ -19,26 +19,14 @@ from instant_avatar.run.training_session import TrainingSession
 
 @final
 class ConsoleReader:
-    """Shows a session's events on a console, within a `with` block."""
+    """Shows a session's events on a console."""
 
-    def __init__(self, session: TrainingSession, console: Console) -> None:
-        """Show nothing yet."""
+    def __init__(self, session: TrainingSession, console: Console, cleanup: ExitStack) -> None:
+        """Show nothing yet; `cleanup` removes the progress line."""
         self._session, self._console = session, console
+        self._line = cleanup.enter_context(ExitStack())
         self._bar: ProgressBar | None = None
         self._stage = ""
-
-    def __enter__(self) -> "ConsoleReader":
-        """Return the reader."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Remove the progress line."""
-        self._show_stage("")
 
     def __call__(self, event: SessionEvent) -> None:
         """Show an event."""
@@ -53,7 +41,10 @@ class ConsoleReader:
             case Progressed(stage=stage, share=share):
                 self._show_stage(stage).set_share(share)
             case PackageWritten() | Scored() | Ended():
-                self._show_stage("")  # other readers have the line now
+                self._line.close()  # other readers have it now
+                self._stage = ""
+                if isinstance(event, Ended):
+                    self._console.summarize_warnings()
             case Noted(message=message):
                 self._console.note(message)
             case Warned(message=message):
@@ -62,11 +53,9 @@ class ConsoleReader:
     def _show_stage(self, stage: str) -> ProgressBar:
         """Return the bar of a stage, which replaces that of another one."""
         if stage != self._stage or self._bar is None:
-            if self._bar is not None:
-                self._bar.stop()
-            self._stage, self._bar = stage, self._console.progress(stage, 1.0)
-            if stage:
-                self._bar.start()
+            self._line.close()
+            self._stage = stage
+            self._bar = self._line.enter_context(self._console.progress(stage, 1.0))
         return self._bar
 
     def _training_text(self) -> str:

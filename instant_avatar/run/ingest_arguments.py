@@ -72,7 +72,7 @@ class IngestArguments(CaptureArguments):
     """Height of the person, barefoot. Sets the metric scale of the body, its distance and solved
     cameras, which images alone cannot determine."""
     out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
-    """Folder for the run (default: runs/NAME, named after the video)."""
+    """Folder for the run (default: runs/NAME, named after the video or its folder)."""
     resume: Flag = False
     """Continue the run in --out: with the same video after an interruption, or with another one."""
     overwrite: Flag = False

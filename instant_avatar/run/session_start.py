@@ -1,7 +1,7 @@
 """Start of a training session: threads, kernels, a new, resumed or extended trainer, the viewer."""
 
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -107,14 +107,14 @@ def run_session(
         remove_tracking(run)
     on_start()
     try:
-        with stop_on_interrupt(console) as stop:
+        with stop_on_interrupt(console) as stop, ExitStack() as cleanup:
             session = TrainingSession(
                 start.trainer, observations, run, stop, start.notes,
                 restore_count=start.restore_count,
             )  # fmt: skip
             watching = () if viewer is None else (viewer.watch(session),)
-            with ConsoleReader(session, console) as shown:
-                _show_events(session, [shown, *watching, *readers])
+            shown = ConsoleReader(session, console, cleanup)
+            _show_events(session, [shown, *watching, *readers])
         if viewer is not None and not stop.is_set():
             console.info(f"The viewer stays open at {viewer.page.address}. Ctrl-C closes it.")
             viewer.serve_until_interrupt(session)

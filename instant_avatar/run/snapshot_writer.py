@@ -15,7 +15,7 @@ from avatar.training.trainer import Trainer
 from capture.atomic_files import atomic_file
 from export.bake.bake_tables import ExportRefused
 from export.bake.fine_tuning import PosedView
-from export.build import ExportReport, export_in_stages
+from export.build import ExportReport, export_avatar
 from export.package.package_file import update_metrics
 from instant_avatar.report.report_schema import CurvePoint
 from instant_avatar.run.run_folder import RunFolder
@@ -156,7 +156,7 @@ def write_packages(
         "recipe": asdict(trainer.config),
     }
     try:
-        for exported in export_in_stages(
+        for exported in export_avatar(
             trainer.avatar, path, views=views, metrics=metrics, baked_first=baked_first,
             fine_tune_bricks=fine_tune, progress=progress,
         ):  # fmt: skip

@@ -142,7 +142,7 @@ def without_baking(monkeypatch) -> None:
             largest_difference=0.0, fine_tuning_psnr=None, warnings=(),
         )  # fmt: skip
 
-    monkeypatch.setattr(snapshot_writer, "export_in_stages", export_nothing)
+    monkeypatch.setattr(snapshot_writer, "export_avatar", export_nothing)
     monkeypatch.setattr(snapshot_writer, "update_metrics", lambda path, metrics: 8)
     monkeypatch.setattr(report_writer, "diagnose_failure", lambda report: None)
     monkeypatch.setattr(report_writer, "demo_animation", lambda player, fps: b"")

@@ -266,7 +266,7 @@ def test_a_disk_that_has_no_room_for_anything_is_left_as_it_was(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(torch, "save", full)
-    monkeypatch.setattr("instant_avatar.run.snapshot_writer.export_in_stages", full)
+    monkeypatch.setattr("instant_avatar.run.snapshot_writer.export_avatar", full)
     outcome = call_ingest(capture, *FEW, "--out", tmp_path / "run")
     assert outcome.code == 3
     assert "Nothing was written" in outcome.complaint()

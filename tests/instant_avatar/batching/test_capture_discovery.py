@@ -26,11 +26,12 @@ def test_folders_videos_and_images_are_captures(tmp_path):
         tmp_path / "bob" / "images" / "0.png",
         tmp_path / "carl" / "0.jpg", tmp_path / "carl" / "1.jpg",
         tmp_path / "takes" / "one.mp4", tmp_path / "takes" / "two.mov",
-        tmp_path / "dora.mp4", tmp_path / "notes.txt", tmp_path / ".hidden" / "x.mp4",
+        tmp_path / "eve" / "video.mp4", tmp_path / "dora.mp4", tmp_path / "notes.txt",
+        tmp_path / ".hidden" / "x.mp4",
     )  # fmt: skip
     (tmp_path / "linked").symlink_to(tmp_path / "bob")
     assert names(tmp_path) == [
-        "anna", "bob", "carl", "dora", "linked", "takes-one", "takes-two",
+        "anna", "bob", "carl", "dora", "eve", "linked", "takes-one", "takes-two",
     ]  # fmt: skip
     assert names(tmp_path / "anna") == ["anna"]
     assert names(tmp_path / "dora.mp4") == ["dora"]

@@ -162,6 +162,15 @@ def test_warnings_are_said_once_and_not_for_ever():
     assert len(console.warnings) == MAX_PRINTED_WARNINGS + 3
 
 
+def test_a_note_asks_for_nothing_and_is_no_warning():
+    printed = io.StringIO()
+    console = Console(RichConsole(file=printed, soft_wrap=True))
+    for _ in range(2):
+        console.note("the masks were refined")
+    assert printed.getvalue() == "the masks were refined\n"
+    assert (console.notes, console.warnings) == (["the masks were refined"], [])
+
+
 def test_colors_and_images_serve_as_backgrounds(tmp_path, rng):
     rgba = rng.integers(0, 256, (6, 8, 4), dtype=np.uint8)
     rgba[0, :, 3], rgba[1, :, 3] = 0, 255

@@ -13,6 +13,7 @@ import pytest
 
 from avatar.evaluation.all_round_verdict import AllRoundVerdict
 from avatar.events import HeldOutScore
+from instant_avatar.cli.shared_options import capture_name
 from instant_avatar.report.page_rendering import data_uri, encode_webp, webp_data_uri
 from instant_avatar.report.report_figures import curve_svg
 from instant_avatar.report.report_page import ComparisonPair, report_page
@@ -27,7 +28,7 @@ from instant_avatar.report.report_schema import (
     StreamStats,
     TrainingStats,
 )
-from instant_avatar.report.report_writer import describe_verdict, diagnose_failure, display_name
+from instant_avatar.report.report_writer import describe_verdict, diagnose_failure
 from preprocess.observation import DroppedFrame
 
 
@@ -169,12 +170,15 @@ def test_the_page_is_whole_and_asks_for_no_other_file():
         pairs=[ComparisonPair(frame=9, psnr=30.0, verdict="soft", truth=white, render=white)],
         animation=data_uri(encode_webp([np.zeros((4, 4, 4), np.uint8)] * 3, fps=10.0)),
         warnings=["masks <turned>"],
+        notes=["masks refined"],
     )
     tags = Tags(page)
     assert len(tags.addresses) == 3
     assert all(address.startswith("data:image/webp;base64,") for address in tags.addresses)
     assert "a &lt;b&gt; &amp; c.mp4" in page
-    assert "masks &lt;turned&gt;" in page
+    folded = page.index("<summary>Notes</summary>")
+    assert page.index("masks &lt;turned&gt;") < folded < page.index("masks refined")
+    assert page.index("turning and dancing") < page.index("<h2>Numbers</h2>") < folded
     assert "url(" not in page
     assert 'tabindex="0"' in page  # a click enlarges a pair, by its focus alone
 
@@ -219,10 +223,10 @@ def test_a_failure_names_what_was_seen_and_what_to_do():
     assert diagnose_failure(report()) is None
 
 
-def test_advice_of_a_run_that_counts_steps_names_steps():
-    counted = replace(failed(steps=26), recipe={"steps": 26})
-    assert "--steps" in diagnose_failure(counted)
-    assert "--seconds" not in diagnose_failure(counted)
+def test_advice_to_a_run_of_too_few_steps_blames_no_other_program():
+    advice = diagnose_failure(failed(steps=26))
+    assert "--steps" in advice
+    assert "other" not in advice
 
 
 def test_frames_add_up_in_a_sentence():
@@ -240,8 +244,8 @@ def test_frames_add_up_in_a_sentence():
 
 
 def test_a_video_whose_name_says_nothing_is_called_by_its_folder():
-    assert display_name(Path("films/anna/video.MP4")) == "anna"
-    assert display_name(Path("films/anna turning.mov")) == "anna turning.mov"
+    assert capture_name(Path("films/anna/video.MP4")) == "anna"
+    assert capture_name(Path("films/anna turning.mov")) == "anna turning"
 
 
 def test_an_avatar_of_one_side_is_not_called_sharp():

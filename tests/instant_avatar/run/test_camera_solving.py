@@ -187,7 +187,7 @@ def test_cameras_are_kept_when_the_avatar_is_refused(ingest_walk, tmp_path, monk
     def refuse(*_, **__):
         raise ExportRefused("The player would not draw it.")
 
-    monkeypatch.setattr("instant_avatar.run.snapshot_writer.export_in_stages", refuse)
+    monkeypatch.setattr("instant_avatar.run.snapshot_writer.export_avatar", refuse)
     outcome, out = ingest_walk(), tmp_path / "run"
     assert outcome.code == 1
     assert "cameras.npz" in outcome.err

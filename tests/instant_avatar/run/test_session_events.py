@@ -86,7 +86,7 @@ def test_package_and_page_are_there_before_scores_are_made(learn, tmp_path):
 
 
 def write_twice(avatar, path, *, progress, **options):
-    """Writes a package, and then one that is fine-tuned, as `export_in_stages` does."""
+    """Writes a package, and then one that is fine-tuned, as `export_avatar` does."""
     for number, psnr in enumerate((None, (1.0, 2.0))):
         if number:
             try:
@@ -104,7 +104,7 @@ def write_twice(avatar, path, *, progress, **options):
 def test_ctrl_c_after_the_package_leaves_out_the_rest_and_keeps_everything(
     learn, tmp_path, monkeypatch, when
 ):
-    monkeypatch.setattr(snapshot_writer, "export_in_stages", write_twice)
+    monkeypatch.setattr(snapshot_writer, "export_avatar", write_twice)
 
     def read(event):
         if isinstance(event, PackageWritten) and when == ("final" if event.is_final else "first"):
