@@ -196,12 +196,13 @@ def _map(
 
 
 def _unsolved_error(failed: list[QualityGate]) -> InputError:
-    reasons = "; ".join(gate.failure_reason for gate in failed[:3]) or "no two images fit together"
+    reasons = "; ".join(gate.describe_failure() for gate in failed[:3])
     return InputError(
-        f"The cameras could not be solved with certainty: {reasons}. Film with the surroundings in "
-        "view (textured, not repeating, well lit), walking slowly and without sudden turns; or "
-        "give cameras (--cameras FILE, docs/formats.md); or, if the camera hardly moved, "
-        "--cameras static."
+        "The cameras could not be solved with certainty: "
+        f"{reasons or 'no two images fit together'}. Leave out --cameras solve to train without "
+        "them, each pose in its own frame's camera (of a camera that only turns, this is the only "
+        "way); give cameras (--cameras FILE, docs/formats.md); or film with the surroundings in "
+        "view (textured, not repeating, well lit), walking slowly and without sudden turns."
     )
 
 
