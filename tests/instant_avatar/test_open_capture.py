@@ -12,8 +12,8 @@ from capture.input_error import InputError
 from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
 from preprocess.capture_session import Capture, CaptureInputs
 from preprocess.open_capture import open_capture
-from preprocess.poses.motion_builder import place_in_camera_world
-from preprocess.poses.pose_format_registry import read_poses
+from preprocess.poses.motion_builder import MotionByPerson, build_motion, place_in_camera_world
+from preprocess.poses.pose_format_registry import TRACKERS, read_poses
 
 
 @pytest.fixture
@@ -113,3 +113,26 @@ def test_a_focal_length_that_the_poses_state_is_believed(capture, own, changed):
     changed(capture / "poses.npz", K=intrinsic)
     found = open_capture(CaptureInputs(video=capture))
     assert found.cameras[0].focal_px[0] == pytest.approx(intrinsic[0, 0])
+
+
+def test_a_new_format_is_one_importer(film, own, in_camera, tmp_path, monkeypatch):
+    """The example of CONTRIBUTING.md."""
+
+    def parse_rows(content: object, prefer_world: bool = False) -> MotionByPerson | None:
+        if not isinstance(content, dict) or "rows" not in content:
+            return None
+        rows = content["rows"]  # 24 axis-angles, then the pelvis in the frame's camera, metres
+        return {"1": build_motion([rows[:, :72]], rows[:, 72:], frames=content["frame"])}
+
+    monkeypatch.setitem(TRACKERS, "Rows", parse_rows)
+    matrices, places = in_camera
+    vectors = axis_angles_from_matrices(matrices).reshape(-1, 72)
+    path = tmp_path / "rows.npz"
+    np.savez(path, rows=np.concatenate([vectors, places], axis=1), frame=np.arange(24))
+    cameras = str(film / "cameras.npz")
+    capture = open_capture(CaptureInputs(video=film, poses=path, cameras=cameras))
+    read = place_in_camera_world(read_poses(path), own.shaped, own.cameras, cameras_given=True)
+    for row in (0, 11, 23):
+        joints = [own.shaped.with_pose(m[row]).joints() for m in (own.motion, read)]
+        np.testing.assert_allclose(joints[0], joints[1], atol=1e-9)
+    assert len(list(capture.observations())) == 24
