@@ -193,7 +193,7 @@ def _folder_captures(
             alone = len(films) == 1 and Path(name).stem.lower() in USUAL_NAMES
             called = prefix.rstrip("-") or Path(place).name if alone else prefix + Path(name).stem
             yield called, path, ({}, ()), entries[name]
-        elif name not in names:
+        elif name not in names and name not in PART_NAMES:
             yield from _folder_captures(path, entries[name], f"{prefix}{name}-")
 
 

@@ -26,6 +26,7 @@ def test_folders_videos_and_images_are_captures(tmp_path):
         tmp_path / "bob" / "images" / "0.png",
         tmp_path / "carl" / "0.jpg", tmp_path / "carl" / "1.jpg",
         tmp_path / "takes" / "one.mp4", tmp_path / "takes" / "two.mov",
+        tmp_path / "takes" / "masks" / "0.png", tmp_path / "takes" / "masks" / "1.png",
         tmp_path / "eve" / "video.mp4", tmp_path / "dora.mp4", tmp_path / "notes.txt",
         tmp_path / ".hidden" / "x.mp4",
     )  # fmt: skip
