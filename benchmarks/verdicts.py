@@ -158,7 +158,11 @@ def judge(job: VerdictJob, case: JudgedAvatar) -> tuple[str | None, list[str]]:
     train_for_steps(trainer, steps)
     scores = score_finally(trainer, compared.held_out, fit_poses=True)
     held_out = better_verdict(overall_verdict(scores.given), overall_verdict(scores.fitted))
-    known = {"seen": coverage.seen_share, "half_transparent": scores.half_transparent}
+    known = {
+        "seen": coverage.seen_share,
+        "mean_cosine": coverage.mean_cosine,
+        "half_transparent": scores.half_transparent,
+    }
     found, player = AllRoundVerdict.of(held_out, **known, player_psnr=None, film_advice=""), None
     if found.verdict == "sharp":  # a package can only make it worse
         player = player_psnr(trainer, compared.held_out)
@@ -166,7 +170,7 @@ def judge(job: VerdictJob, case: JudgedAvatar) -> tuple[str | None, list[str]]:
     return found.verdict, [
         found.limit or "",
         f"{held_out}, {mean(score.psnr for score in scores.fitted):.1f} dB",
-        f"{coverage.seen_share:.0%}",
+        f"{coverage.seen_share:.0%}, {coverage.mean_cosine:.2f}",
         f"{scores.half_transparent or 0.0:.1%}",
         format_value(player),
     ]

@@ -87,6 +87,12 @@ class Coverage:
         return _area_share(self.patches.areas, self.cosines > 0.0)
 
     @property
+    def mean_cosine(self) -> float:
+        """Mean of `cosines` over the whole surface, in [0, 1]: how squarely the skin was seen."""
+        areas = self.patches.areas
+        return float((areas * self.cosines).sum() / max(float(areas.sum()), 1e-12))
+
+    @property
     def well_seen_share(self) -> float:
         """The share that was seen within 53° of squarely."""
         return _area_share(self.patches.areas, self.cosines >= MIN_WELL_SEEN_COSINE)

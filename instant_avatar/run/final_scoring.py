@@ -134,6 +134,7 @@ class TrainingResult:
         return AllRoundVerdict.of(
             better_verdict(overall_verdict(scores.given), overall_verdict(scores.fitted)),
             seen=self.coverage.seen_share,
+            mean_cosine=self.coverage.mean_cosine,
             half_transparent=scores.half_transparent,
             player_psnr=exported.psnr_to_renderer.get("hq") if exported else None,
             film_advice=coverage_advice(self.coverage),

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from avatar.config import HELD_OUT_STRIDE, TrainConfig
-from avatar.evaluation.all_round_verdict import SEEN
+from avatar.evaluation.all_round_verdict import FILMED
 from avatar.evaluation.coverage import coverage_advice, expected_coverage
 from avatar.rig import Rig
 from avatar.training import checkpoint, train
@@ -279,7 +279,7 @@ def _announce_coverage(capture: Capture, console: Console) -> None:
     some = wanted[:: -(-len(wanted) // EXPECTED_POSES)]
     views = ((capture.motion[row], capture.camera_of_pose(row)) for row in some)
     expected = expected_coverage(capture.shaped, views)
-    if expected.seen_share < SEEN.sharp:
+    if expected.mean_cosine < FILMED.sharp:
         console.warning(
             f"The film shows {expected.seen_share:.0%} of the person's skin; the rest will be "
             f"completed by what it shows, as a guess. {coverage_advice(expected)}"

@@ -82,7 +82,12 @@ def report(**changes):
 
 def judged(held_out):
     return AllRoundVerdict.of(
-        held_out, seen=0.99, half_transparent=0.08, player_psnr=44.0, film_advice="Turn."
+        held_out,
+        seen=0.99,
+        mean_cosine=0.91,
+        half_transparent=0.08,
+        player_psnr=44.0,
+        film_advice="Turn.",
     )
 
 
@@ -250,7 +255,12 @@ def test_a_video_whose_name_says_nothing_is_called_by_its_folder():
 
 def test_an_avatar_of_one_side_is_not_called_sharp():
     one_sided = AllRoundVerdict.of(
-        "sharp", seen=0.45, half_transparent=0.11, player_psnr=40.0, film_advice="Turn round."
+        "sharp",
+        seen=0.45,
+        mean_cosine=0.35,
+        half_transparent=0.11,
+        player_psnr=40.0,
+        film_advice="Turn round.",
     )
     kept = replace(report(), all_round=one_sided)
     assert kept.verdict == "blurred"
