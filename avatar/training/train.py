@@ -119,14 +119,13 @@ def train(
 
 def _train_step(trainer: Trainer, stream: "_FrameIntake", now: float) -> Stepped:
     falling = cosine_decay(stream.progress(now))
-    wall, cpu = time.perf_counter(), time.process_time()
+    cpu = time.process_time()
     result = trainer.step(
         rate=min(falling, stream.highest_rate),
         pose_rate=falling,
         hard_surface_share=min(1.0, 4.0 * now / trainer.config.seconds),
         detail_share=1.0 - cosine_decay(now / trainer.config.seconds),
     )
-    trainer.step_wall_seconds += time.perf_counter() - wall
     trainer.step_cpu_seconds += time.process_time() - cpu
     stream.clock.read()
     return Stepped(

@@ -119,7 +119,7 @@ class Trainer:
             keeps at most twice the replay capacity.
         wall_seconds, cpu_seconds: Training time so far, continued by a resumed run.
         frames_seen: Frames added so far, whether or not the replay buffer still holds them.
-        step_wall_seconds, step_cpu_seconds: Time inside steps of this process.
+        step_cpu_seconds: CPU time of this process inside steps.
         paused_wall_seconds, paused_cpu_seconds: Time inside `paused`.
     """
 
@@ -150,7 +150,7 @@ class Trainer:
         self.pose_corrections: dict[int, Float[np.ndarray, "25 3"]] = {}
         self.steps = self.rays = self.samples = self.frames_seen = 0
         self.wall_seconds = self.cpu_seconds = 0.0
-        self.step_wall_seconds = self.step_cpu_seconds = 0.0
+        self.step_cpu_seconds = 0.0
         self.paused_wall_seconds = self.paused_cpu_seconds = 0.0
         self.generator = torch.Generator().manual_seed(config.seed)
         rate = config.learning_rate

@@ -225,7 +225,6 @@ def read_figures(report: bytes) -> dict[str, Any]:
         "frames": content["frames"]["used"],
         "steps": content["training"]["steps"],
         "training_s": content["training"]["wall_seconds"],
-        "contention_s": content["training"]["cpu_contention_seconds"],
         "package_bytes": (content["package"] or {}).get("bytes"),
         "seen": (content["coverage"] or {}).get("seen"),
         "tracked": content["tracking"] is not None,

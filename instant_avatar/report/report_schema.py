@@ -78,7 +78,6 @@ class TrainingStats:
     wall_seconds: float
     cpu_seconds: float
     step_cpu_seconds: float
-    cpu_contention_seconds: float
     startup_seconds: float
     steps: int
     rays: int

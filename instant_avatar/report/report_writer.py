@@ -66,7 +66,10 @@ def describe_verdict(report: Report, refusal: str | None, *, is_final: bool) -> 
     if (failure := refusal or diagnose_failure(report)) is not None:
         return failure
     if report.verdict is None:
-        return "Not scored." if is_final else "The avatar is there. Its scores are being made."
+        scored = [point for point in report.curve if point.psnr is not None]
+        estimate = f", at about {format_psnr(scored[-1].psnr, None, digits=0)}" if scored else ""
+        ending = "It was not scored." if is_final else "Its scores are being made."
+        return f"The avatar is there{estimate}. {ending}"
     if report.all_round.advice is None:
         return f"The avatar is {report.verdict} from all sides."
     return f"The avatar is {report.verdict}. {report.all_round.advice}"
@@ -361,7 +364,6 @@ def _training_stats(result: TrainingResult, startup_seconds: float) -> TrainingS
         wall_seconds=trainer.wall_seconds,
         cpu_seconds=trainer.cpu_seconds,
         step_cpu_seconds=trainer.step_cpu_seconds,
-        cpu_contention_seconds=max(0.0, trainer.step_wall_seconds - trainer.step_cpu_seconds),
         startup_seconds=startup_seconds,
         steps=trainer.steps,
         rays=trainer.rays,

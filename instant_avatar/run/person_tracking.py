@@ -131,9 +131,9 @@ def _open_video(
     console.info(describe_recording(source))
     inputs, step = limit_frames(inputs, source), source.selection.step
     source = reopen(source, inputs.frames)
-    if inputs.frames is not None and inputs.frames.step != step:
+    if source.selection.step != step:
         console.info(
-            f"One in {inputs.frames.step} frames is used, {source.frame_count} in all (--frames "
+            f"One in {source.selection.step} frames is used, {source.frame_count} in all (--frames "
             "names others)."
         )
     if look:

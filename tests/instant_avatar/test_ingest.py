@@ -28,7 +28,7 @@ KEYS = {
     "curve stream package coverage earlier_videos cameras tracking",
     "machine": "threads device backend",
     "frames": "read used held_out dropped near_duplicates not_replayed",
-    "training": "wall_seconds cpu_seconds step_cpu_seconds cpu_contention_seconds startup_seconds "
+    "training": "wall_seconds cpu_seconds step_cpu_seconds startup_seconds "
     "steps rays rays_per_second samples_per_ray peak_memory_mb",
     "held_out": "frames size psnr psnr_mask ssim verdict blur overlap lpips background poses "
     "whole_images",

@@ -55,7 +55,6 @@ def report(**changes):
             wall_seconds=60.0,
             step_cpu_seconds=1.0,
             cpu_seconds=61.0,
-            cpu_contention_seconds=0.5,
             startup_seconds=3.0,
             steps=100,
             rays=102400,

@@ -119,7 +119,7 @@ def save(browser: Browser, out: Path, process: subprocess.Popen) -> None:
 
 
 def stay_and_dance(browser: Browser, log: Path) -> None:
-    until(lambda: "The page stays" in log.read_text(), 240.0)
+    until(lambda: "viewer stays open" in log.read_text(), 240.0)
     until(lambda: "Done after 45 s" in browser.text(), 30.0)
     browser.click("Dance")
     pictures = []
