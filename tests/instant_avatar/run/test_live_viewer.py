@@ -18,11 +18,16 @@ import pytest
 from export.player import Player
 from instant_avatar import ingest
 from instant_avatar.cli.command_line import fill_optional_value
+from instant_avatar.run import live_viewer, session_start
 from instant_avatar.run.ingest_arguments import VIEW_PORT
+from instant_avatar.run.viser_page import NEWEST
 from tests.instant_avatar.browser import Browser, chromium, until
 
 PAPER = np.array([251, 250, 247])
 PANEL_PX = 380
+
+KINDS = ("Training", "Paused", "Writing the package")
+"""What the page says of a run, in this order."""
 
 with_viser = pytest.mark.skipif(
     importlib.util.find_spec("viser") is None, reason="viser is not installed ([viewer])"
@@ -129,6 +134,59 @@ def stay_and_dance(browser: Browser, log: Path) -> None:
     until(lambda: shows_a_person(scene(browser)[1]), 30.0)
     moved = [np.abs(b - a).max(axis=2).mean() for a, b in itertools.pairwise(pictures)]
     assert max(moved) > 0.5
+
+
+class StandInPage:
+    """Takes the place of viser's page: one press of each button, and what is shown."""
+
+    def __init__(self, name, port):
+        self.address, self.pose_choice, self.chosen_at = "nowhere", NEWEST, 0.0
+        self.save_requested = False
+        self.statuses, self.notes = [], []
+
+    @property
+    def paused(self):
+        """True until a status says so, once a package was saved."""
+        return bool(self.notes) and not any("Paused" in status for status in self.statuses)
+
+    def show_status(self, status, figures, *, note=""):
+        self.statuses.append(status)
+        self.save_requested = not self.notes and figures[1][0] != "0"
+
+    def notify(self, title, message):
+        self.notes.append(title)
+
+    def browser_cameras(self):
+        return {}
+
+    def show_frame(self, image): ...
+
+    def show_curve(self, curve): ...
+
+    def show_coverage(self, sentence, body_map): ...
+
+    def close(self): ...
+
+
+def test_the_viewer_reads_events_pauses_and_saves(
+    capture, call_ingest, without_baking, tmp_path, monkeypatch
+):
+    viewers = []
+
+    def open_viewer(arguments, recording, run, console):
+        viewers.append(live_viewer.LiveViewer(recording, run, console, 0))
+        viewers[0].serve_until_interrupt = lambda session: None
+        return viewers[0]
+
+    monkeypatch.setattr(live_viewer, "ViserPage", StandInPage)
+    monkeypatch.setattr(live_viewer, "PANEL_INTERVAL_S", 0.0)
+    monkeypatch.setattr(session_start, "_open_viewer", open_viewer)
+    outcome = call_ingest(capture, "--frames", "0:8", "--out", tmp_path / "run")
+    assert outcome.code == 0
+    page = viewers[0].page
+    assert page.notes == ["Package saved"]
+    kinds = [next(kind for kind in KINDS if kind in status) for status in page.statuses]
+    assert list(dict.fromkeys(kinds)) == list(KINDS)
 
 
 def test_view_without_viser_says_how_to_get_it(film, tmp_path, monkeypatch, capsys):
