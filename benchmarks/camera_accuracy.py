@@ -27,7 +27,8 @@ from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.mask_alignment import body_height_m, rescale_motion, scale_to_height
 from preprocess.cameras.camera_file import CameraTrack, read_cameras
-from preprocess.capture_session import Capture, CaptureInputs
+from preprocess.capture_inputs import CaptureInputs
+from preprocess.capture_session import Capture
 from preprocess.open_capture import open_capture
 from preprocess.poses.pose_file import read_motion
 from preprocess.sfm.camera_solution import CameraSolution

@@ -18,7 +18,7 @@ from benchmarks.capture_corruptions import CorruptedCapture, Corruption
 from benchmarks.hardware import Hardware
 from instant_avatar.capture_validation import check_capture
 from instant_avatar.studio.shoot import ShootConfig, film_capture
-from preprocess.capture_session import CaptureInputs
+from preprocess.capture_inputs import CaptureInputs
 from preprocess.open_capture import read_capture
 
 CAPTURES = {

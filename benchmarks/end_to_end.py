@@ -22,7 +22,7 @@ from benchmarks.hardware import ROOT, Hardware
 from export.player import Player, premultiply
 from instant_avatar.report.report_schema import CurvePoint
 from instant_avatar.studio.shoot import ShootConfig, film_capture
-from preprocess.capture_session import CaptureInputs
+from preprocess.capture_inputs import CaptureInputs
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 
 def main() -> None:
-    from preprocess.capture_session import CaptureInputs
+    from preprocess.capture_inputs import CaptureInputs
     from preprocess.open_capture import open_capture
 
     capture, began = Path(sys.argv[1]), float(sys.argv[2])

@@ -99,7 +99,7 @@ def readers(seeds: Path) -> dict[str, Callable[[Path], object]]:
     from instant_avatar.capture_validation import check_capture
     from preprocess.body.parametric_body import load_body_model, read_shaped_body
     from preprocess.cameras.camera_file import read_cameras
-    from preprocess.capture_session import CaptureInputs
+    from preprocess.capture_inputs import CaptureInputs
     from preprocess.file_content import read_untrusted_file
     from preprocess.masks.mask_files import open_masks, read_mask
     from preprocess.open_capture import open_capture, read_capture

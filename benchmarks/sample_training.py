@@ -12,7 +12,8 @@ from avatar.training.frame_stream import TrainingFrame, prepare_stream
 from avatar.training.train import Trainer
 from avatar.training.trainer import cosine_decay
 from instant_avatar.studio.shoot import ShootConfig, film_capture
-from preprocess.capture_session import Capture, CaptureInputs
+from preprocess.capture_inputs import CaptureInputs
+from preprocess.capture_session import Capture
 from preprocess.open_capture import open_capture
 
 

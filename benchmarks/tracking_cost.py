@@ -17,7 +17,7 @@ import cv2
 
 from capture.source_opening import open_source
 from instant_avatar.run.person_tracking import fit_tracked_video
-from preprocess.capture_session import CaptureInputs
+from preprocess.capture_inputs import CaptureInputs
 from preprocess.masks.mask_refinement import MaskRefiner
 from preprocess.plugins import make_tracker
 from preprocess.tracking.video_tracking import track_video

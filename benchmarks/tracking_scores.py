@@ -15,7 +15,8 @@ from benchmarks.real_scores import TRACKED_JOINTS
 from capture.input_error import InputError
 from preprocess.alignment.silhouette_objective import spaced_indices
 from preprocess.body.body_surface import MeshSilhouette, soft_iou
-from preprocess.capture_session import Capture, CaptureInputs
+from preprocess.capture_inputs import CaptureInputs
+from preprocess.capture_session import Capture
 from preprocess.masks.mask_files import open_masks
 from preprocess.open_capture import open_capture
 

@@ -34,7 +34,8 @@ from preprocess.alignment.silhouette_objective import (
     sample_masks,
 )
 from preprocess.body.body_surface import SkinPoints
-from preprocess.capture_session import Capture, CaptureInputs
+from preprocess.capture_inputs import CaptureInputs
+from preprocess.capture_session import Capture
 from preprocess.masks.mask_files import Masks
 from preprocess.masks.mask_sources import StoredMasks
 from preprocess.observation import associate_cameras

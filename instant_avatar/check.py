@@ -29,7 +29,7 @@ from instant_avatar.corrected_capture import check_new_or_empty, write_corrected
 from instant_avatar.run.person_tracking import grade_capture, print_doubts, track_person
 from preprocess.alignment.correction_search import CorrectionCandidate
 from preprocess.alignment.silhouette_objective import GOOD_IOU, mean_score
-from preprocess.capture_session import CaptureInputs, InputKind
+from preprocess.capture_inputs import CaptureInputs, InputKind
 from preprocess.open_capture import ImportedCapture, read_capture
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")

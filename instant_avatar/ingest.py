@@ -13,10 +13,10 @@ from instant_avatar.cli.command_line import (
     run_command,
 )
 from instant_avatar.cli.console import Console
+from instant_avatar.cli.shared_options import open_recording
 from instant_avatar.run.ingest_arguments import PROGRAM, VIEW_PORT, IngestArguments
-from instant_avatar.run.run_capture import open_observations, write_solved_cameras
 from instant_avatar.run.run_folder import RunFolder
-from preprocess.capture_session import InputKind
+from preprocess.capture_inputs import InputKind
 
 if TYPE_CHECKING:  # it imports torch
     from instant_avatar.run.session_events import EventReader
@@ -41,10 +41,15 @@ def ingest(
     solver = ("pycolmap",) if arguments.cameras == "solve" else ()
     require_packages("torch", "numba", "onnx", *solver)
     arguments.validate()
-    run, read = arguments.run_folder(), arguments.capture_inputs().input_paths()
+    inputs = arguments.capture_inputs()
+    if not inputs.is_live:
+        open_recording(inputs, console)  # before code is loaded that takes a second
+    from instant_avatar.run.run_capture import open_observations, write_solved_cameras
+
+    run, read = arguments.run_folder(), inputs.input_paths()
     run.check_usable(read, resume=arguments.resume, overwrite=arguments.overwrite)
     with run.claim(console, resume=arguments.resume, overwrite=arguments.overwrite):
-        command, inputs = arguments.as_json(), arguments.capture_inputs()
+        command = arguments.as_json()
         threads = None
         if inputs.kind is InputKind.STREAMED:  # its frames come as soon as it is open
             threads = _load_trainer_code(arguments, run, console)

@@ -28,14 +28,13 @@ from instant_avatar.cli.shared_options import (
     check_output_file,
     check_output_folder,
     format_frame_range,
+    open_recording,
     option_words,
     parse_frame_range,
     unused_path,
 )
-from instant_avatar.run.person_tracking import masks_to_use, print_doubts, track_person
 from instant_avatar.run.run_folder import RunFolder, claim_folder
-from instant_avatar.tracked_video import write_tracked_video
-from preprocess.capture_session import CaptureInputs
+from preprocess.capture_inputs import CaptureInputs
 
 PROGRAM = "ia-track"
 NOT_GOOD_ENOUGH = 1
@@ -147,6 +146,8 @@ class TrackArguments:
         read = [each for each in inputs.input_paths() if os.path.realpath(each) not in own]
         for path in written:
             check_output_file(path, "--out", read, overwrite=True, below=False)
+        from instant_avatar.run.person_tracking import masks_to_use
+
         if masks_to_use(inputs, masks) is None:
             check_output_folder(masks, "--out")
 
@@ -191,6 +192,10 @@ def claim_outputs(folder: Path, console: Console) -> Iterator[None]:
 def track(arguments: TrackArguments, console: Console) -> int:
     """Track the person, and write poses, masks, film and grades."""
     inputs, poses = arguments.capture_inputs(), arguments.poses_path()
+    open_recording(inputs, console)  # before code is loaded that takes a second
+    from instant_avatar.run.person_tracking import print_doubts, track_person
+    from instant_avatar.tracked_video import write_tracked_video
+
     arguments.check_outputs()
     saving = "writing what was found so far"
     with claim_outputs(poses.parent, console), stop_on_interrupt(console, saving) as stop:

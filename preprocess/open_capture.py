@@ -27,6 +27,7 @@ from preprocess.body.parametric_body import (
 )
 from preprocess.cameras.camera_file import CameraTrack, assume_static_camera
 from preprocess.cameras.camera_orientation import assume_camera, read_upright_cameras
+from preprocess.capture_inputs import CaptureInputs
 from preprocess.capture_paths import (
     CapturePaths,
     MaskOrigin,
@@ -36,7 +37,7 @@ from preprocess.capture_paths import (
     find_own_poses,
     find_stream_cameras,
 )
-from preprocess.capture_session import Capture, CaptureInputs, Provenance, video_identity
+from preprocess.capture_session import Capture, Provenance, video_identity
 from preprocess.masks.mask_files import Masks, open_masks, open_tracker_masks
 from preprocess.masks.mask_refinement import GivenMaskRefiner
 from preprocess.masks.mask_sources import (

@@ -12,7 +12,8 @@ from avatar.training.train import warm_up
 from avatar.training.trainer import Trainer
 from capture.input_error import InputError
 from preprocess.body.parametric_body import ShapedBody, load_body_model
-from preprocess.capture_session import Capture, CaptureInputs
+from preprocess.capture_inputs import CaptureInputs
+from preprocess.capture_session import Capture
 from preprocess.fitting.capture_fitting import apply_fit, fit_capture
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture

@@ -16,7 +16,10 @@ from capture.atomic_files import (
     is_stream,
 )
 from capture.input_error import InputError, quote_command
-from preprocess.capture_session import CaptureInputs
+from capture.source import FrameSource
+from capture.source_opening import describe_recording, open_source
+from instant_avatar.cli.console import Console
+from preprocess.capture_inputs import CaptureInputs
 
 Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
 """A flag without its opposite."""
@@ -76,6 +79,13 @@ class CaptureArguments:
 
 USUAL_NAMES = frozenset({"video", "movie", "film", "clip", "images", "frames"})
 """Names of videos that say nothing about what they show."""
+
+
+def open_recording(inputs: CaptureInputs, console: Console) -> FrameSource:
+    """Open the video or the images of a capture, and print what they are."""
+    source = open_source(inputs.video, frames=inputs.frames, rotate=inputs.rotate)
+    console.info(describe_recording(source))
+    return source
 
 
 def capture_name(video: Path) -> str:

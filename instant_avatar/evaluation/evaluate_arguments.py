@@ -8,7 +8,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from capture.input_error import InputError
 from instant_avatar.cli.shared_options import check_output_file, parse_frame_range
-from preprocess.capture_session import CaptureInputs
+from preprocess.capture_inputs import CaptureInputs
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,8 @@ from instant_avatar.run.ingest_arguments import IngestArguments
 from instant_avatar.run.run_capture import open_as_trained
 from instant_avatar.run.run_folder import RunFolder
 from instant_avatar.run.run_tracking import inputs_as_tracked
-from preprocess.capture_session import Capture, CaptureInputs, InputKind
+from preprocess.capture_inputs import CaptureInputs, InputKind
+from preprocess.capture_session import Capture
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture, read_capture
 

@@ -19,8 +19,7 @@ from instant_avatar.cli.shared_options import (
     check_output_file,
 )
 from instant_avatar.run.run_folder import RunFolder, is_run_report
-from preprocess.alignment.mask_alignment import MAX_HEIGHT_CM, MIN_HEIGHT_CM
-from preprocess.capture_session import CaptureInputs
+from preprocess.capture_inputs import MAX_HEIGHT_CM, MIN_HEIGHT_CM, CaptureInputs
 from preprocess.plugins import segmenter_name
 
 PROGRAM = "ia-ingest"

@@ -13,7 +13,7 @@ import numpy as np
 from capture.atomic_files import OutputFileList, atomic_file, atomic_folder
 from capture.input_error import InputError
 from capture.source import FrameSource
-from capture.source_opening import describe_recording, open_source, reopen
+from capture.source_opening import open_source, reopen
 from instant_avatar.cli.console import Console
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.silhouette_objective import sample_masks
@@ -21,8 +21,9 @@ from preprocess.body.body_pose import Motion
 from preprocess.body.body_surface import SkinPoints
 from preprocess.body.parametric_body import load_body_model
 from preprocess.cameras.camera_orientation import assume_camera
+from preprocess.capture_inputs import CaptureInputs
 from preprocess.capture_paths import CapturePaths, find_own_masks, find_stream_cameras
-from preprocess.capture_session import Capture, CaptureInputs
+from preprocess.capture_session import Capture
 from preprocess.fitting.capture_fitting import fit_capture, fitted_motion
 from preprocess.masks.mask_files import open_masks
 from preprocess.masks.mask_refinement import MaskRefiner
@@ -126,9 +127,8 @@ def track_person(
 def _open_video(
     inputs: CaptureInputs, console: Console, *, look: bool
 ) -> tuple[CaptureInputs, FrameSource]:
-    """Open the frames that are to be tracked; describe them, and with `look` what a few show."""
+    """Open the frames that are to be tracked; with `look` print what a few of them show."""
     source = open_source(inputs.video, frames=inputs.frames, rotate=inputs.rotate)
-    console.info(describe_recording(source))
     inputs, step = limit_frames(inputs, source), source.selection.step
     source = reopen(source, inputs.frames)
     if source.selection.step != step:

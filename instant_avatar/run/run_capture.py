@@ -12,7 +12,8 @@ from instant_avatar.run.person_tracking import person_number
 from instant_avatar.run.run_folder import RunFolder
 from instant_avatar.run.run_tracking import import_tracked
 from preprocess.cameras.camera_file import write_cameras
-from preprocess.capture_session import Capture, CaptureInputs, InputKind
+from preprocess.capture_inputs import CaptureInputs, InputKind
+from preprocess.capture_session import Capture
 from preprocess.fitting.capture_fit import CaptureFit, load_capture_fit
 from preprocess.fitting.capture_fitting import apply_fit, fit_capture
 from preprocess.masks.mask_refinement import MaskRefiner
@@ -102,11 +103,9 @@ def _open_stream(
 
 def _describe(capture: Capture, console: Console) -> None:
     """Print what was opened, and what is to be said about it."""
-    source, (width, height) = capture.source, capture.source.size_px
-    count = "frames" if source.frame_count is None else f"{source.frame_count} frames"
     console.info(
-        f"{capture.paths.video}: {count} of {width}x{height} px, {len(capture.motion)} poses, "
-        f"body {capture.shaped.body.family}, camera: {capture.cameras.source}"
+        f"{len(capture.motion)} poses, body {capture.shaped.body.family}, camera: "
+        f"{capture.cameras.source}"
     )
     for note in capture.notes:
         console.note(note)

@@ -17,11 +17,6 @@ from preprocess.body.body_surface import soft_iou, splat_silhouette
 from preprocess.body.kinematics import rotation_matrices
 from preprocess.body.parametric_body import ShapedBody
 
-MIN_HEIGHT_CM = 40.0
-"""Least height that a user may state, cm."""
-MAX_HEIGHT_CM = 260.0
-"""Largest height that a user may state, cm."""
-
 
 def body_height_m(shaped: ShapedBody) -> float:
     """Height from the soles to the crown at rest, metres: barefoot, without hair."""

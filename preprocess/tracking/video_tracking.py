@@ -273,7 +273,7 @@ def _require_person(source: FrameSource, found: int, total: int) -> None:
     raise InputError(
         f"A person was found in {where} of {total} frames of {source.path}. Tracking needs one "
         "person, from head to feet in the picture, upright, in good light, at least a quarter of "
-        "its height. Is the video rotated, or does it start before the person comes in "
+        "its height. Is the video rotated (--rotate), or does it start before the person comes in "
         "(--frames), or is --person more than there are? Poses of another tracker can be given "
         "with --poses."
     )

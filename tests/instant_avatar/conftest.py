@@ -17,7 +17,7 @@ from instant_avatar import ingest, play
 from instant_avatar.report import report_writer
 from instant_avatar.run import session_start, snapshot_writer
 from instant_avatar.studio.shoot import ShootConfig, film_capture
-from preprocess.capture_session import CaptureInputs
+from preprocess.capture_inputs import CaptureInputs
 from preprocess.open_capture import open_capture
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from instant_avatar import ingest
 from instant_avatar.run import run_capture
-from preprocess.capture_session import CaptureInputs
+from preprocess.capture_inputs import CaptureInputs
 from preprocess.open_capture import open_capture
 
 
@@ -43,9 +43,15 @@ def test_a_video_that_is_not_there(refused, tmp_path):
     refused(tmp_path / "none.mp4", "--poses", tmp_path / "none.npz", words=["none.mp4"])
 
 
-def test_a_video_that_cannot_be_tracked(refused, capture):
+def test_a_video_that_cannot_be_tracked_well_leaves_what_was_tracked(
+    call_ingest, capture, tmp_path
+):
     (capture / "masks").rename(capture / "elsewhere")
-    refused(capture / "video.mp4", words=["--poses"])
+    outcome = call_ingest(capture / "video.mp4", "--out", tmp_path / "run")
+    assert outcome.code == 2
+    assert "--poses" in outcome.complaint()
+    visible = [path.name for path in (tmp_path / "run").iterdir() if path.name[0] != "."]
+    assert visible == ["tracking"]
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")

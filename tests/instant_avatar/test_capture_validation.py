@@ -13,7 +13,7 @@ from benchmarks import capture_corruptions
 from instant_avatar import check, ingest
 from instant_avatar.capture_validation import passes_quick_check
 from instant_avatar.studio.shoot import ShootConfig, film_capture
-from preprocess.capture_session import CaptureInputs
+from preprocess.capture_inputs import CaptureInputs
 from preprocess.open_capture import open_capture
 from preprocess.poses.pose_file import read_motion
 

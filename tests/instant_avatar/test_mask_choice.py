@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from capture.source_opening import open_source
-from preprocess.capture_session import CaptureInputs
+from preprocess.capture_inputs import CaptureInputs
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
 

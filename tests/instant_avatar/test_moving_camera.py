@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from instant_avatar import check, play
 from instant_avatar.capture_validation import passes_quick_check
-from preprocess.capture_session import CaptureInputs
+from preprocess.capture_inputs import CaptureInputs
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
 from preprocess.poses.motion_builder import transform_motion

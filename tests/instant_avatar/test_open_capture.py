@@ -10,7 +10,8 @@ import pytest
 from benchmarks import capture_corruptions
 from capture.input_error import InputError
 from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
-from preprocess.capture_session import Capture, CaptureInputs
+from preprocess.capture_inputs import CaptureInputs
+from preprocess.capture_session import Capture
 from preprocess.open_capture import open_capture
 from preprocess.poses.motion_builder import MotionByPerson, build_motion, place_in_camera_world
 from preprocess.poses.pose_format_registry import TRACKERS, read_poses

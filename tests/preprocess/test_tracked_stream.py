@@ -14,8 +14,9 @@ from preprocess.body.body_surface import splat_silhouette
 from preprocess.body.parametric_body import load_body_model
 from preprocess.cameras.camera_file import CameraTrack, write_cameras
 from preprocess.cameras.camera_orientation import assume_camera
+from preprocess.capture_inputs import CaptureInputs
 from preprocess.capture_paths import CapturePaths
-from preprocess.capture_session import Capture, CaptureInputs
+from preprocess.capture_session import Capture
 from preprocess.fitting.tracked_frames import LAG_FRAMES, EarlierPoses
 from preprocess.masks.mask_sources import EstimatedMasks
 from preprocess.observation import DroppedFrame, Observation

@@ -14,7 +14,7 @@ from instant_avatar import evaluate
 from instant_avatar.cli.console import Console
 from instant_avatar.evaluation import datasets
 from instant_avatar.evaluation.datasets import find_neuman, find_people_snapshot, split_by_rule
-from preprocess.capture_session import CaptureInputs
+from preprocess.capture_inputs import CaptureInputs
 from preprocess.open_capture import open_capture
 
 h5py = pytest.importorskip("h5py")

@@ -15,7 +15,7 @@ from instant_avatar.evaluation import datasets
 from instant_avatar.evaluation.evaluation_session import FrameScorer
 from instant_avatar.evaluation.frame_scoring import SHOWN_FRAMES, FrameScore, score_picture
 from instant_avatar.evaluation.score_table import AvatarEvaluation, ScoreRow, markdown_table
-from preprocess.capture_session import CaptureInputs
+from preprocess.capture_inputs import CaptureInputs
 from preprocess.open_capture import open_capture
 from tests.instant_avatar.conftest import Outcome
 from tests.instant_avatar.report.test_report_page import Tags

@@ -8,7 +8,7 @@ import pytest
 from instant_avatar.cli.console import Console
 from instant_avatar.run.session_start import _announce_coverage
 from instant_avatar.studio.shoot import ShootConfig, film_capture
-from preprocess.capture_session import CaptureInputs
+from preprocess.capture_inputs import CaptureInputs
 from preprocess.open_capture import open_capture
 
 

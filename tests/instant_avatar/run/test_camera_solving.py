@@ -14,7 +14,7 @@ from instant_avatar.run import run_capture
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.alignment.mask_alignment import body_height_m
 from preprocess.cameras.camera_file import read_cameras, write_cameras
-from preprocess.capture_session import CaptureInputs
+from preprocess.capture_inputs import CaptureInputs
 from preprocess.open_capture import open_capture
 from preprocess.poses.pose_file import read_motion
 from preprocess.sfm.camera_solution import CameraSolution

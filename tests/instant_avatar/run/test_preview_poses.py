@@ -21,7 +21,8 @@ from instant_avatar.run.viser_page import (
     PreviewPoses,
 )
 from preprocess.body.kinematics import rotation_matrices
-from preprocess.capture_session import Capture, CaptureInputs
+from preprocess.capture_inputs import CaptureInputs
+from preprocess.capture_session import Capture
 from preprocess.observation import DroppedFrame
 from preprocess.open_capture import open_capture
 

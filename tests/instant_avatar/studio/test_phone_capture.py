@@ -9,7 +9,7 @@ from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
 from preprocess.body.parametric_body import load_body_model
 from preprocess.cameras.camera_file import read_cameras
-from preprocess.capture_session import CaptureInputs
+from preprocess.capture_inputs import CaptureInputs
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
 from preprocess.poses.pose_file import read_motion

@@ -14,7 +14,7 @@ from instant_avatar.cli.console import Console
 from instant_avatar.run import person_tracking
 from preprocess.body.parametric_body import load_body_model
 from preprocess.body.proportion_space import shape_for_motion
-from preprocess.capture_session import CaptureInputs
+from preprocess.capture_inputs import CaptureInputs
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
 from preprocess.poses.pose_file import read_motion

@@ -17,7 +17,7 @@ from instant_avatar.evaluation.evaluation_frames import held_out_frames
 from instant_avatar.run import person_tracking, run_tracking
 from instant_avatar.run.run_folder import RunFolder
 from preprocess import tracked_stream
-from preprocess.capture_session import CaptureInputs
+from preprocess.capture_inputs import CaptureInputs
 from preprocess.fitting import tracked_frames
 from preprocess.masks.mask_refinement import MaskRefiner
 from preprocess.poses.pose_file import read_motion

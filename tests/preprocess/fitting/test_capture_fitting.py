@@ -10,7 +10,7 @@ import pytest
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
 from preprocess.body.proportion_space import ProportionSpace
-from preprocess.capture_session import CaptureInputs
+from preprocess.capture_inputs import CaptureInputs
 from preprocess.fitting import capture_fitting
 from preprocess.fitting.capture_fit import CaptureFit
 from preprocess.fitting.capture_fitting import (

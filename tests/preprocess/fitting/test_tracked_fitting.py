@@ -11,7 +11,8 @@ from capture.input_error import InputError
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.body.body_pose import BodyPose, Motion, RelativeFocalLength
 from preprocess.body.parametric_body import ShapedBody, load_body_model
-from preprocess.capture_session import Capture, CaptureInputs
+from preprocess.capture_inputs import CaptureInputs
+from preprocess.capture_session import Capture
 from preprocess.fitting import capture_fitting
 from preprocess.fitting.capture_fitting import apply_fit, fit_capture, fitted_motion
 from preprocess.fitting.clip_fitting import USUAL_WEIGHTS, FitParameters
