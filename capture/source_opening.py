@@ -54,11 +54,11 @@ def glance(source: FrameSource) -> list[tuple[Frame, Frame]]:
     rate = (last + 1) / (source.duration_s or 1.0)
     places = (np.arange(GLANCES) + 0.5) * last / GLANCES + source.selection.start
     pairs = recording.glance((places / rate).tolist(), GLANCE_APART_S, GLANCE_PX)
-    turns = -source.rotate // 90
-    return [
-        tuple(replace(each, rgb=np.ascontiguousarray(np.rot90(each.rgb, turns))) for each in pair)
-        for pair in pairs
-    ]
+    return [(_turn(one, source.rotate), _turn(other, source.rotate)) for one, other in pairs]
+
+
+def _turn(frame: Frame, degrees: int) -> Frame:
+    return replace(frame, rgb=np.ascontiguousarray(np.rot90(frame.rgb, -degrees // 90)))
 
 
 def describe_recording(source: FrameSource) -> str:
@@ -69,7 +69,7 @@ def describe_recording(source: FrameSource) -> str:
     if not source.duration_s or source.path.is_dir():
         return f"{count} images of {size}"
     rate = source.selection.span(source.frames_in_file) / source.duration_s
-    hdr = ", HDR (turned into the usual range)" if source.is_hdr else ""
+    hdr = ", HDR (tone mapped)" if source.is_hdr else ""
     return f"{count} frames of {size}, {rate:.3g} a second{hdr}"
 
 

@@ -97,8 +97,8 @@ class VideoFile(Recording):
         self.quarter_turns = _quarter_turns(first.frame)
         self.has_unread_alpha = _has_transparency(first.frame)
         self.is_hdr = int(first.frame.color_trc) in HDR_TRANSFERS
-        size_px = (int(first.frame.width), int(first.frame.height))
-        self.size_px = size_px[::-1] if self.quarter_turns % 2 else size_px
+        width, height = int(first.frame.width), int(first.frame.height)
+        self.size_px = (height, width) if self.quarter_turns % 2 else (width, height)
         self.frames_in_file = claimed_frames if claimed_frames > 0 else self.count_frames()
         self.frame_count: int | None = selection.count(self.frames_in_file)
         span = selection.span(self.frames_in_file)
@@ -142,7 +142,7 @@ class VideoFile(Recording):
         """
         slack_s = 0.5 * (times_s[-1] - times_s[0]) / max(1, len(times_s) - 1)
         with av.open(str(self.path)) as container:
-            stream = container.streams.video[0]
+            stream: Any = container.streams.video[0]
             entries, start = stream.index_entries, stream.start_time or 0
             keys = np.array([entry.timestamp for entry in entries if entry.is_keyframe])
             keys_s = (keys - start) * float(stream.time_base)

@@ -278,8 +278,8 @@ def _shift(
     corners = cv2.goodFeaturesToTrack(one, MAX_CORNERS, 0.01, 7, mask=mask)
     if corners is None or len(corners) < MIN_CORNERS:
         return None
-    moved, ahead, _ = cv2.calcOpticalFlowPyrLK(one, other, corners, None, maxLevel=4)
-    back, behind, _ = cv2.calcOpticalFlowPyrLK(other, one, moved, None, maxLevel=4)
+    moved, ahead, _ = cv2.calcOpticalFlowPyrLK(one, other, corners, corners.copy(), maxLevel=4)
+    back, behind, _ = cv2.calcOpticalFlowPyrLK(other, one, moved, moved.copy(), maxLevel=4)
     is_same = (ahead.ravel() > 0) & (behind.ravel() > 0)
     is_same &= np.abs(back - corners).max(axis=(1, 2)) < 1.0
     start: Float[np.ndarray, "corners 2"] = corners[is_same, 0]
