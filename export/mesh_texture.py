@@ -132,9 +132,10 @@ def _fill_gutters(
     image: UInt8[np.ndarray, "rows columns 3"], is_drawn: Bool[np.ndarray, "rows columns"]
 ) -> UInt8[np.ndarray, "rows columns 3"]:
     """Give each texel outside of the charts the color of the nearest one within."""
-    _, nearest = cv2.distanceTransformWithLabels(
+    _, labels = cv2.distanceTransformWithLabels(
         (~is_drawn).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
     )
+    nearest = labels.astype(np.intp)
     colors = np.zeros((int(nearest.max()) + 1, 3), dtype=np.uint8)
     colors[nearest[is_drawn]] = image[is_drawn]
     return colors[nearest]

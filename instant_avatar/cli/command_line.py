@@ -16,7 +16,8 @@ from dataclasses import fields, is_dataclass
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from itertools import zip_longest
-from typing import Any, TypeVar
+from types import MappingProxyType
+from typing import Any, TypeVar, cast
 
 import tyro
 from docstring_parser import parse_from_object
@@ -229,10 +230,10 @@ def _join_help_lines(arguments_type: Any) -> None:
     for record in (arguments_type, *(field.default_factory for field in fields(arguments_type))):
         if is_dataclass(record):
             named = {field.name: field for field in fields(record)}
-            for base in reversed(record.__mro__[:-1]):
+            for base in reversed(inspect.getmro(cast("type", record))[:-1]):
                 for parameter in parse_from_object(base).params:
                     text = " ".join((parameter.description or "").split())
-                    named[parameter.arg_name].metadata = {"help": text}
+                    named[parameter.arg_name].metadata = MappingProxyType({"help": text})
 
 
 def _installed_version() -> str:

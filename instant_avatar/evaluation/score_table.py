@@ -209,7 +209,7 @@ def compare_avatars(evaluations: Sequence[AvatarEvaluation]) -> str | None:
         frames = f"on the same {len(shared)} frames"
     else:
         parts = [np.array([*each.values()]) for each in (ours, theirs)]
-        gain, error = means[first] - means[second], float(np.hypot(*map(_standard_error, parts)))
+        gain, error = means[first] - means[second], math.hypot(*map(_standard_error, parts))
         frames = "on frames of different captures or moments"
     if gain < 0.0:
         best, other, gain = other, best, -gain
