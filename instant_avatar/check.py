@@ -13,7 +13,6 @@ from tyro.conf import arg
 
 from capture.atomic_files import OutputFileList, write_text_atomically
 from capture.input_error import InputError
-from capture.live_sources import camera_address
 from instant_avatar.capture_validation import CaptureValidation, check_capture, check_command
 from instant_avatar.cli.command_line import BAD_INPUT, DONE, parse_arguments, run_command
 from instant_avatar.cli.console import Console
@@ -72,9 +71,10 @@ class CheckArguments(CaptureArguments):
 
     def capture_inputs(self) -> CaptureInputs:
         """Return the inputs to open; refuse a camera."""
-        if camera_address(self.video) is not None:
+        inputs = super().capture_inputs()
+        if inputs.camera is not None:
             raise InputError(f"{self.video} is a camera, but ia-check needs a recording.")
-        return super().capture_inputs()
+        return inputs
 
     def check_outputs(self) -> None:
         """Refuse outputs that cannot be written."""

@@ -205,7 +205,8 @@ def track(arguments: TrackArguments, console: Console) -> int:
         console.print_artifact("poses", poses)
         if arguments.film and not stop.is_set():
             with console.status("drawing the film"):
-                write_tracked_video(arguments.film_path(), tracking.capture, tracking.grade.doubts)
+                video = arguments.film_path()
+                write_tracked_video(video, tracking.capture(), tracking.grade.doubts)
             console.print_artifact("look at it", arguments.film_path())
     print_doubts(tracking.grade, console)
     console.info(tracking.grade.describe())

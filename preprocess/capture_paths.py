@@ -6,7 +6,6 @@ from pathlib import Path
 
 from capture.input_error import InputError
 from capture.live_sources import camera_address
-from preprocess.plugins import DEFAULT_SEGMENTER, segmenter_name
 
 POSE_FILE_NAMES = [
     "poses.npz",
@@ -77,11 +76,11 @@ def find_capture_paths(
     if poses is None:
         poses = find_own_poses(video)
     if poses is None:
-        beside = _first_existing([video.parent], POSE_FILE_NAMES)
-        there = "" if beside is None else f" {beside} lies beside it: is it meant?"
+        other = _first_existing([video.parent], POSE_FILE_NAMES)
+        hint = "" if other is None else f" {other} lies beside it: is it meant?"
         raise InputError(
             f"No poses for {video}: give --poses FILE (an .npz in InstantAvatar's keys, or what a "
-            f"tracker wrote: docs/formats.md).{there} ia-track finds poses in a video."
+            f"tracker wrote: docs/formats.md).{hint} ia-track finds poses in a video."
         )
     if cameras is None:
         cameras = find_own_cameras(video, poses)
@@ -100,12 +99,12 @@ def find_own_poses(video: Path) -> Path | None:
 
 def find_own_masks(video: Path, poses: Path | None = None) -> Path | None:
     """The masks in a capture folder, beside a video, or beside its poses; None without any."""
-    return _first_existing(_places_of_parts(video, poses), MASK_NAMES)
+    return _first_existing(_search_folders(video, poses), MASK_NAMES)
 
 
 def find_own_cameras(video: Path, poses: Path | None = None) -> Path | None:
     """The cameras in a capture folder, beside a video, or beside its poses; None without any."""
-    return _first_existing(_places_of_parts(video, poses), CAMERA_NAMES)
+    return _first_existing(_search_folders(video, poses), CAMERA_NAMES)
 
 
 def find_stream_cameras(video: Path, named: str | None) -> Path | None:
@@ -118,55 +117,12 @@ def find_stream_cameras(video: Path, named: str | None) -> Path | None:
     return find_own_cameras(video) if named is None else Path(named)
 
 
-def _places_of_parts(video: Path, poses: Path | None) -> list[Path]:
+def _search_folders(video: Path, poses: Path | None) -> list[Path]:
     inside = video.is_dir() and video.name != "images"
-    place = video if inside else video.parent
-    beside = [] if camera_address(video) is not None else [place]
-    return beside if poses is None else [*beside, poses.parent]
+    folders = [] if camera_address(video) is not None else [video if inside else video.parent]
+    return folders if poses is None else [*folders, poses.parent]
 
 
-def _first_existing(places: list[Path], names: list[str]) -> Path | None:
-    candidates = (place / name for place in places if place.is_dir() for name in names)
+def _first_existing(folders: list[Path], names: list[str]) -> Path | None:
+    candidates = (folder / name for folder in folders if folder.is_dir() for name in names)
     return next((path for path in candidates if path.exists()), None)
-
-
-@dataclass(frozen=True, kw_only=True)
-class MaskOrigin:
-    """The origin of the masks: a file or folder, a segmenter by name, or else the alpha channel.
-
-    `is_explicit` tells whether the user named it.
-    """
-
-    path: Path | None = None
-    segmenter: str | None = None
-    is_explicit: bool = False
-
-    @property
-    def uses_alpha_channel(self) -> bool:
-        """Return whether the images' own alpha channel is the mask."""
-        return self.path is None and self.segmenter is None
-
-    @property
-    def is_fallback(self) -> bool:
-        """Return whether masks are estimated only because there are no others."""
-        return self.segmenter is not None and not self.is_explicit
-
-
-def choose_mask_origin(
-    requested: Path | None, found: Path | None, *, has_alpha: bool
-) -> MaskOrigin:
-    """Choose the masks the user named; else a file that was found, the alpha channel, an estimate.
-
-    Args:
-        requested: Value of --masks: a file, a folder, or `segmenter:NAME`.
-        found: Masks in the capture folder or beside the video.
-        has_alpha: Whether the images' alpha channel cuts the person out; an opaque one does not.
-    """
-    segmenter = segmenter_name(requested)
-    if segmenter is not None:
-        return MaskOrigin(segmenter=segmenter, is_explicit=True)
-    if requested is not None:
-        return MaskOrigin(path=requested, is_explicit=True)
-    if found is not None:
-        return MaskOrigin(path=found)
-    return MaskOrigin() if has_alpha else MaskOrigin(segmenter=DEFAULT_SEGMENTER)

@@ -1,8 +1,8 @@
 """A capture: everything that is opened and aligned before its first frame."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -27,23 +27,22 @@ def video_identity(source: FrameSource) -> str:
     return str(source.path.resolve())
 
 
-@dataclass(frozen=True, kw_only=True)
-class Provenance:
+class Provenance(NamedTuple):
     """Where a part of a capture comes from, and how sure it is.
 
     Attributes:
         part: "poses", "body", "cameras", "masks", "tracking" or "fit".
         origin: A file's name, or what made it.
+        notes: Messages for the user about how it was read or made; empty ones count as none.
         uncertainty: Degree to which it is an estimate, in [0, 1]; 0 if it counts as exact.
-        notes: Messages for the user about how it was read or made.
-        figures: The part's entry in the report; empty without one.
+        figures: The part's entry in the report; None without one.
     """
 
     part: str
     origin: str
+    notes: tuple[str | None, ...] = ()
     uncertainty: float = 0.0
-    notes: tuple[str, ...] = ()
-    figures: dict[str, Any] = field(default_factory=dict)
+    figures: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -76,7 +75,7 @@ class Capture:
     @property
     def notes(self) -> tuple[str, ...]:
         """Messages for the user about how the parts were read or made."""
-        return tuple(note for each in self.provenance for note in each.notes)
+        return tuple(note for each in self.provenance for note in each.notes if note)
 
     @property
     def pose_uncertainty(self) -> float:

@@ -30,23 +30,27 @@ from preprocess.cameras.camera_orientation import assume_camera, read_upright_ca
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.capture_paths import (
     CapturePaths,
-    MaskOrigin,
-    choose_mask_origin,
     find_capture_paths,
     find_own_masks,
     find_own_poses,
     find_stream_cameras,
 )
-from preprocess.capture_session import Capture, Provenance, video_identity
+from preprocess.capture_session import Capture, Provenance
 from preprocess.masks.mask_files import Masks, open_masks, open_tracker_masks
 from preprocess.masks.mask_refinement import GivenMaskRefiner
 from preprocess.masks.mask_sources import (
     AlphaChannelMasks,
     EstimatedMasks,
+    GivenMasks,
     MaskSource,
     StoredMasks,
 )
-from preprocess.plugins import PersonTracker, make_segmenter, segmenter_name
+from preprocess.plugins import (
+    DEFAULT_SEGMENTER,
+    PersonTracker,
+    make_segmenter,
+    segmenter_name,
+)
 from preprocess.poses.plausibility import (
     lost_pose_warnings,
     plausibility_warnings,
@@ -69,6 +73,7 @@ class ImportedCapture:
     Attributes:
         motion: The poses, in the space and for the body of their file.
         stored_masks: The masks, if a file holds them.
+        segmenter: Name of the segmenter that estimates them; None if they are given.
         polarity_error: Why it is unclear which side of them is the person; empty if it is clear.
         provenance: Where the poses come from, if not from a file of the user.
     """
@@ -78,24 +83,17 @@ class ImportedCapture:
     source: FrameSource
     body: BodyModel
     motion: Motion
-    mask_origin: MaskOrigin
     stored_masks: Masks | None
+    segmenter: str | None
     polarity_error: str = ""
     provenance: tuple[Provenance, ...] = ()
 
-    @property
-    def identity(self) -> str:
-        """Name of the video in a checkpoint."""
-        return video_identity(self.source)
-
-    def given_masks(self) -> StoredMasks | AlphaChannelMasks | None:
+    def given_masks(self) -> GivenMasks | None:
         """The masks of files or alpha channels; None if there are none."""
         refine = GivenMaskRefiner(enabled=self.inputs.refine_masks)
         if self.stored_masks is not None:
             return StoredMasks(self.stored_masks, self.source, refine)
-        if self.mask_origin.uses_alpha_channel:
-            return AlphaChannelMasks(self.source, refine)
-        return None
+        return AlphaChannelMasks(self.source, refine) if self.segmenter is None else None
 
     def transposed(self) -> "ImportedCapture":
         """The same with the video's width and height exchanged, as if it had been rotated."""
@@ -134,23 +132,31 @@ def import_capture(
     inputs: CaptureInputs, paths: CapturePaths, source: FrameSource, body: BodyModel, motion: Motion
 ) -> ImportedCapture:
     """Join poses with the masks of files or alpha channels, which may lie in the poses' file."""
-    origin = choose_mask_origin(inputs.masks, paths.masks, has_alpha=source.has_alpha)
+    segmenter = _choose_segmenter(inputs, paths.masks, source)
     masks, error = None, ""
-    if origin.is_fallback:
+    if segmenter is not None and inputs.masks is None:
         masks = open_tracker_masks(paths.poses, source, person=inputs.person)
-        origin = origin if masks is None else MaskOrigin(path=masks.path)
-    elif origin.path is not None:
+        segmenter = segmenter if masks is None else None
+    elif segmenter is None and (path := inputs.masks or paths.masks) is not None:
         try:
-            masks = open_masks(origin.path, invert=inputs.invert_masks, person=inputs.person)
+            masks = open_masks(path, invert=inputs.invert_masks, person=inputs.person)
         except InputError as unclear:
             if inputs.invert_masks is not None:
                 raise
-            masks = open_masks(origin.path, invert=False, person=inputs.person)
+            masks = open_masks(path, invert=False, person=inputs.person)
             error = str(unclear)
+    paths = replace(paths, masks=None if masks is None else masks.path)
     return ImportedCapture(
-        inputs=inputs, paths=replace(paths, masks=origin.path), source=source, body=body,
-        motion=motion, mask_origin=origin, stored_masks=masks, polarity_error=error,
+        inputs=inputs, paths=paths, source=source, body=body, motion=motion,
+        stored_masks=masks, segmenter=segmenter, polarity_error=error,
     )  # fmt: skip
+
+
+def _choose_segmenter(inputs: CaptureInputs, found: Path | None, source: FrameSource) -> str | None:
+    """The segmenter of the masks: the named one, or the built-in one if none are named or found."""
+    if inputs.masks is not None:
+        return segmenter_name(inputs.masks)
+    return None if found is not None or source.has_alpha else DEFAULT_SEGMENTER
 
 
 def align_capture(
@@ -178,14 +184,8 @@ def align_capture(
         if imported.polarity_error:
             raise InputError(imported.polarity_error)
     given = imported.given_masks()
-    cameras, cameras_given = _read_or_assume_cameras(imported), imported.paths.cameras is not None
-    evidence = CaptureEvidence(source, given, cameras)
-    motion, shaped = place_motion(motion, imported.body, evidence, cameras_given=cameras_given)
-    if not cameras_given and motion.intrinsic is None and motion.assumed_focal is None:
-        cameras = estimate_focal_length(evidence, motion, shaped)
-        evidence = evidence._replace(cameras=cameras)
-    fit = fit_person(motion, shaped, evidence, avatar_body=avatar_body, height_m=inputs.height_m)
-    masks = given or _estimated_masks(imported.mask_origin, fit.shaped)
+    fit, cameras = _align(imported, motion, given, avatar_body)
+    masks = given or _estimated_masks(imported.segmenter, fit.shaped)
     capture = Capture(
         paths=imported.paths,
         source=source,
@@ -196,9 +196,14 @@ def align_capture(
         size_px=size_px or max(source.size_px),
         provenance=(
             *imported.provenance,
-            _pose_provenance(imported.paths.poses, fit.motion, warnings),
-            Provenance(part="cameras", origin=cameras.source, notes=_given(cameras.note)),
-            _mask_provenance(masks, imported.mask_origin, source),
+            Provenance(
+                "poses",
+                imported.paths.poses.name,
+                (fit.motion.note, *lost_pose_warnings(motion), *warnings),
+                uncertainty=0.0 if motion.proportions is None else 1.0,
+            ),
+            Provenance("cameras", cameras.source, (cameras.note,)),
+            _mask_provenance(masks, inputs, imported.segmenter, source),
             _body_provenance(fit),
         ),
     )
@@ -207,13 +212,24 @@ def align_capture(
     return capture
 
 
-def _pose_provenance(poses: Path, motion: Motion, warnings: tuple[str, ...]) -> Provenance:
-    return Provenance(
-        part="poses",
-        origin=poses.name,
-        uncertainty=0.0 if motion.proportions is None else 1.0,
-        notes=(*_given(motion.note), *lost_pose_warnings(motion), *warnings),
+def _align(
+    imported: ImportedCapture, motion: Motion, given: GivenMasks | None, avatar_body: Path | None
+) -> tuple[BodyAlignment, CameraTrack]:
+    """Place poses in the cameras' world, and fit body, distance and an unknown focal length."""
+    source, named = imported.source, imported.paths.cameras
+    cameras = (
+        assume_static_camera(motion, source.size_px)
+        if named is None
+        else read_upright_cameras(named, source)
     )
+    evidence, is_given = CaptureEvidence(source, given, cameras), named is not None
+    motion, shaped = place_motion(motion, imported.body, evidence, cameras_given=is_given)
+    if not is_given and motion.intrinsic is None and motion.assumed_focal is None:
+        cameras = estimate_focal_length(evidence, motion, shaped)
+        evidence = evidence._replace(cameras=cameras)
+    height_m = imported.inputs.height_m
+    fit = fit_person(motion, shaped, evidence, avatar_body=avatar_body, height_m=height_m)
+    return fit, cameras
 
 
 def _body_provenance(fit: BodyAlignment) -> Provenance:
@@ -223,51 +239,36 @@ def _body_provenance(fit: BodyAlignment) -> Provenance:
             f"The poses were made for the body model {fit.motion.body_model!r}, but {family!r} is "
             f"used (--body), with joints where the mean shape has them. {note}".strip()
         )
-    figures = {} if fit.placement is None else fit.placement.as_json()
-    return Provenance(part="body", origin=family, notes=_given(note), figures=figures)
+    figures = None if fit.placement is None else fit.placement.as_json()
+    return Provenance("body", family, (note,), figures=figures)
 
 
-def _mask_provenance(masks: MaskSource, origin: MaskOrigin, source: FrameSource) -> Provenance:
-    return Provenance(
-        part="masks",
-        origin=masks.origin,
-        uncertainty=0.0 if masks.is_given else 1.0,
-        notes=tuple(_mask_notes(masks, origin, source)),
-    )
-
-
-def _mask_notes(masks: MaskSource, origin: MaskOrigin, source: FrameSource) -> Iterator[str]:
-    if origin.segmenter is not None:
-        yield (
-            "Masks are estimated from the pictures and the poses "
-            f"(segmenter:{origin.segmenter}); a segmenter's own masks (--masks) are sharper "
-            "around hair and hands."
+def _mask_provenance(
+    masks: MaskSource, inputs: CaptureInputs, segmenter: str | None, source: FrameSource
+) -> Provenance:
+    notes = []
+    if segmenter is not None:
+        notes.append(
+            f"Masks are estimated from the images and the poses (segmenter:{segmenter}); a "
+            "segmenter's own masks (--masks) are sharper around hair and hands."
         )
-    if origin.is_fallback and isinstance(source, VideoFile) and source.has_unread_alpha:
-        yield (
+    has_unread_alpha = isinstance(source, VideoFile) and source.has_unread_alpha
+    if segmenter is not None and inputs.masks is None and has_unread_alpha:
+        notes.append(
             f"{source.path} has an alpha channel, which is not read from videos. If it cuts "
             "the person out, write its frames as PNG images (ffmpeg), and learn from their folder."
         )
-    if origin.uses_alpha_channel:
-        yield "The pictures' own alpha channel is used as their masks."
+    if isinstance(masks, AlphaChannelMasks):
+        notes.append("The images' own alpha channel is used as their masks.")
     if isinstance(masks, StoredMasks) and masks.files.inverted:
-        yield f"The masks in {masks.files.path} show the background (white); they were inverted."
+        path = masks.files.path
+        notes.append(f"The masks in {path} show the background (white); they were inverted.")
+    return Provenance("masks", masks.origin, tuple(notes), 0.0 if masks.is_given else 1.0)
 
 
-def _given(note: str | None) -> tuple[str, ...]:
-    return () if not note else (note,)
-
-
-def _estimated_masks(origin: MaskOrigin, shaped: ShapedBody) -> EstimatedMasks:
-    assert origin.segmenter is not None
-    return EstimatedMasks(make_segmenter(origin.segmenter, shaped))
-
-
-def _read_or_assume_cameras(imported: ImportedCapture) -> CameraTrack:
-    """Cameras of their own file, or those that the poses state."""
-    if imported.paths.cameras is not None:
-        return read_upright_cameras(imported.paths.cameras, imported.source)
-    return assume_static_camera(imported.motion, imported.source.size_px)
+def _estimated_masks(segmenter: str | None, shaped: ShapedBody) -> EstimatedMasks:
+    assert segmenter is not None
+    return EstimatedMasks(make_segmenter(segmenter, shaped))
 
 
 def open_tracked_stream(
@@ -300,50 +301,46 @@ def open_tracked_stream(
             "first, and give its poses; or leave out --realtime."
         )
     source = _open_stream_source(inputs)
-    origin, given = _open_stream_masks(inputs, source)
+    own = None if inputs.is_live else find_own_masks(inputs.video)
+    segmenter = _choose_segmenter(inputs, own, source)
+    given = _open_stream_masks(inputs, own, source) if segmenter is None else None
     tracking = LiveTracking(TrackedStream(source), tracker)
     shaped = load_body_model(inputs.body).with_shape()
     if avatar_body is not None:
         shaped = read_shaped_body(avatar_body, shaped.body)
-    start = tracking.start(
+    motion, person, cameras = tracking.start(
         shaped,
         assume_camera(inputs.video, inputs.cameras, tracking.stream),
         fixed_body=avatar_body is not None,
         stated_focal=find_stream_cameras(inputs.video, inputs.cameras) is not None,
     )
     masks: MaskSource = TrackedMasks(tracking, make_refinement(source.size_px))
-    made = Provenance(part="masks", origin=masks.origin, uncertainty=1.0)
-    if not origin.is_fallback:
-        masks = given or _estimated_masks(origin, start.shaped)
-        made = _mask_provenance(masks, origin, source)
+    made = Provenance("masks", masks.origin, uncertainty=1.0)
+    if segmenter is None or inputs.masks is not None:
+        masks = given or _estimated_masks(segmenter, person)
+        made = _mask_provenance(masks, inputs, segmenter, source)
     unread = tuple(_unread_live_parts(inputs))
     capture = Capture(
-        paths=CapturePaths(video=inputs.video, poses=poses, masks=origin.path, cameras=None),
-        source=tracking.stream, motion=start.motion, masks=masks, cameras=start.cameras,
-        shaped=start.shaped, size_px=longer_side_px(source),
+        paths=CapturePaths(video=inputs.video, poses=poses, masks=own, cameras=None),
+        source=tracking.stream, motion=motion, masks=masks, cameras=cameras,
+        shaped=person, size_px=longer_side_px(source),
         provenance=(
-            Provenance(part="poses", origin="tracked", uncertainty=1.0, notes=unread),
-            Provenance(part="cameras", origin=start.cameras.source, uncertainty=1.0),
+            Provenance("poses", "tracked", unread, uncertainty=1.0),
+            Provenance("cameras", cameras.source, uncertainty=1.0),
             made,
         ),
     )  # fmt: skip
     return TrackedObservations(capture, tracking)
 
 
-def _open_stream_masks(
-    inputs: CaptureInputs, source: FrameSource
-) -> tuple[MaskOrigin, MaskSource | None]:
-    """The origin of the masks (a fallback means the tracker), and given ones, if there are any."""
-    own = None if inputs.is_live else find_own_masks(inputs.video)
-    origin = choose_mask_origin(inputs.masks, own, has_alpha=source.has_alpha)
-    refine = GivenMaskRefiner(enabled=inputs.refine_masks)
-    if origin.uses_alpha_channel:
-        return origin, AlphaChannelMasks(source, refine)
-    if origin.path is None:
-        return origin, None
-    given = StoredMasks(open_masks(origin.path, invert=inputs.invert_masks), source, refine)
+def _open_stream_masks(inputs: CaptureInputs, own: Path | None, source: FrameSource) -> GivenMasks:
+    """The masks of a file, or else the images' alpha channel."""
+    path, refine = inputs.masks or own, GivenMaskRefiner(enabled=inputs.refine_masks)
+    if path is None:
+        return AlphaChannelMasks(source, refine)
+    given = StoredMasks(open_masks(path, invert=inputs.invert_masks), source, refine)
     given.check()
-    return origin, given
+    return given
 
 
 def _unread_live_parts(inputs: CaptureInputs) -> Iterator[str]:

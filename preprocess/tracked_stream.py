@@ -9,7 +9,7 @@ being tracked are left out, so that tracking does not fall behind.
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import final
 
 import cv2
@@ -32,12 +32,14 @@ from preprocess.fitting.tracked_frames import (
     fit_first_frames,
     reduced_size_px,
 )
+from preprocess.masks.mask_sources import MaskSource
 from preprocess.observation import (
     DroppedFrame,
     Observation,
     join_frame,
     shrink_to_longer_side,
 )
+from preprocess.observation_source import ObservationSource
 from preprocess.plugins import PersonTracker
 from preprocess.tracking.video_tracking import NOT_FOUND, MaskRefinement
 
@@ -111,15 +113,6 @@ class TrackedStream(WrappedSource):
                 yield frame
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class StreamStart:
-    """The results of a stream's first frames: their poses, the person, and a static camera."""
-
-    motion: Motion
-    shaped: ShapedBody
-    cameras: CameraTrack
-
-
 @final
 class LiveTracking:
     """Poses of a stream's frames, tracked as they come.
@@ -150,8 +143,8 @@ class LiveTracking:
         *,
         fixed_body: bool = False,
         stated_focal: bool = False,
-    ) -> StreamStart:
-        """Track the first frames, and fit person and camera to them.
+    ) -> tuple[Motion, ShapedBody, CameraTrack]:
+        """Track the first frames, and fit them, the person and a static camera to each other.
 
         Args:
             shaped: The body's mean shape, or the person of a finished avatar.
@@ -179,11 +172,7 @@ class LiveTracking:
         for row, each in enumerate(seen):
             self._fitter.add(each, motion[row])
         source = "focal length fitted to the first frames"
-        return StreamStart(
-            motion=motion,
-            shaped=person,
-            cameras=CameraTrack(cameras=(camera,), source=source),
-        )
+        return motion, person, CameraTrack(cameras=(camera,), source=source)
 
     def pose_of(self, frame: Frame) -> BodyPose | str:
         """The pose of a frame that was tracked when it was taken, or why it has none; once."""
@@ -234,23 +223,14 @@ class LiveTracking:
 
 
 @final
-class TrackedMasks:
-    """The tracker's own masks of a stream's frames, refined (`MaskSource`)."""
+class TrackedMasks(MaskSource):
+    """The tracker's own masks of a stream's frames, refined."""
 
-    origin, agreement = "tracked", None
-    is_given = is_refined = False
-    needs_all_frames = True
+    origin = "tracked"
 
     def __init__(self, tracking: LiveTracking, refine: MaskRefinement) -> None:
         """Refine nothing yet."""
         self._tracking, self._refine = tracking, refine
-
-    def check(self) -> None:
-        """Nothing can be wrong before the frames come."""
-
-    def read(self, index: int, size_px: tuple[int, int]) -> Float32[np.ndarray, "rows columns"]:
-        """There is none before the frame is seen."""
-        raise InputError(f"the mask of frame {index} is not known before the frame")
 
     def alpha(
         self, frame: Frame, scaled: Frame, pose: BodyPose, camera: Camera
@@ -258,19 +238,15 @@ class TrackedMasks:
         """Refine the mask of the frame whose pose was asked for last."""
         return self._refine(frame.rgb, self._tracking.latest.keypoints.mask, scaled.size_px)
 
-    def notes(self) -> Iterator[str]:
-        """Nothing is left to say."""
-        yield from ()
-
 
 @final
-class TrackedObservations:
+class TrackedObservations(ObservationSource):
     """The observations of a stream whose person is tracked as its frames come."""
 
     def __init__(self, capture: Capture, tracking: LiveTracking) -> None:
         """Go on after the frames that tracking has started with."""
-        self.capture, self._tracking = capture, tracking
-        self.frames: FrameSource = tracking.stream
+        super().__init__(capture, tracking.stream)
+        self._tracking = tracking
         target_px = shrink_to_longer_side(self.frames.size_px, capture.size_px)
         self._camera = capture.cameras[0].resize(target_px)
 
@@ -283,14 +259,11 @@ class TrackedObservations:
             self._tracking.add_observation(item)
         return item
 
-    def set_catch_up(self, catch_up: bool) -> None:
-        """A stream comes once; nothing is read back."""
-
     def take_revised_poses(self) -> dict[int, BodyPose]:
-        """Poses of earlier frames that were fitted again since the last call, by their numbers."""
+        """Poses that were fitted again since the last call."""
         return self._tracking.take_revised_poses()
 
     def notes(self) -> Iterator[str]:
         """What tracking and masks have to say."""
         yield from self._tracking.notes()
-        yield from self.capture.masks.notes()
+        yield from super().notes()

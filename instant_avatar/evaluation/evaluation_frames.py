@@ -72,15 +72,11 @@ def held_out_frames(run: RunFolder, size_px: int | None) -> EvaluationFrames:
     report = read_report(run)
     given = _run_arguments(report, run)
     inputs = given.capture_inputs()
-    if inputs.is_live:
-        raise InputError(
-            f"{run.path} was trained from a live source, which was not recorded. Pass another "
-            "capture of the same person with --on."
-        )
     if inputs.kind is InputKind.STREAMED:
         raise InputError(
-            f"{run.path} was trained while its video was tracked, and those poses cannot be "
-            "repeated. Run ia-track, and pass --on and --poses."
+            f"{run.path} was trained on a stream: its frames, or the poses that were tracked while "
+            "they came, cannot be repeated. Pass another capture of the same person with --on, or "
+            "this video with --on and --poses of ia-track."
         )
     inputs = inputs_as_tracked(given, inputs, run)
     if given.cameras == "solve" and run.cameras.is_file():

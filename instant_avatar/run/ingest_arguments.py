@@ -121,37 +121,29 @@ class IngestArguments(CaptureArguments):
 
     def validate(self) -> None:
         """Check ranges, combinations and output files; an `InputError` names the option."""
-        if self.seconds is not None and not MIN_SECONDS <= self.seconds < float("inf"):
-            raise InputError(
-                f"--seconds is {self.seconds}, but must be at least {MIN_SECONDS:g} "
-                f"({DEFAULT_SECONDS:.0f} give a good avatar)."
-            )
-        if self.steps is not None and self.steps < 1:
-            raise InputError(f"--steps is {self.steps}, but must be at least 1.")
+        inputs = self.capture_inputs()
+        if inputs.is_live:
+            self._check_live_options()
+        for option, value, is_valid, rule in (
+            ("seconds", self.seconds, lambda s: MIN_SECONDS <= s < float("inf"),
+             f"at least {MIN_SECONDS:g} ({DEFAULT_SECONDS:.0f} give a good avatar)"),
+            ("steps", self.steps, lambda steps: steps >= 1, "at least 1"),
+            ("size", self.size, lambda px: px >= 16, "at least 16 pixels"),
+            ("threads", self.threads, lambda threads: threads >= 1, "at least 1"),
+            ("idle-seconds", self.idle_seconds, lambda s: 0.0 < s < float("inf"), "positive"),
+            ("height-cm", self.height_cm, lambda cm: MIN_HEIGHT_CM <= cm <= MAX_HEIGHT_CM,
+             f"from {MIN_HEIGHT_CM:.0f} to {MAX_HEIGHT_CM:.0f}"),
+            ("hold-out", self.hold_out, lambda n: n == 0 or n >= 2, "0, or at least 2"),
+            ("seed", self.seed, lambda seed: seed >= 0, "at least 0"),
+            ("view", self.view, lambda port: 0 <= port < 1 << 16, "a port from 0 to 65535"),
+        ):  # fmt: skip
+            if value is not None and not is_valid(value):
+                raise InputError(f"--{option} is {value}, but must be {rule}.")
         if self.steps is not None and self.seconds is not None:
             raise InputError("--steps and --seconds are mutually exclusive.")
-        if self.size is not None and self.size < 16:
-            raise InputError(f"--size is {self.size}, but must be at least 16 pixels.")
-        if self.threads is not None and self.threads < 1:
-            raise InputError(f"--threads is {self.threads}, but must be at least 1.")
-        if not 0.0 < self.idle_seconds < float("inf"):
-            raise InputError(f"--idle-seconds is {self.idle_seconds}, but must be positive.")
-        if self.capture_inputs().is_live:
-            self._check_live_options()
-        if self.height_cm is not None and not MIN_HEIGHT_CM <= self.height_cm <= MAX_HEIGHT_CM:
-            raise InputError(
-                f"--height-cm is {self.height_cm}, but must lie between {MIN_HEIGHT_CM:.0f} and "
-                f"{MAX_HEIGHT_CM:.0f}."
-            )
-        if self.hold_out < 0 or self.hold_out == 1:
-            raise InputError(f"--hold-out is {self.hold_out}, but must be 0, or at least 2.")
-        if self.seed < 0:
-            raise InputError(f"--seed is {self.seed}, but must be at least 0.")
-        inputs = self.capture_inputs().input_paths()
         if self.json is not None:
-            check_output_file(self.json, "--json", inputs, overwrite=self.may_replace_json)
-        if self.view is not None and not 0 <= self.view < 1 << 16:
-            raise InputError(f"--view is {self.view}, but must be a port from 0 to 65535.")
+            read = inputs.input_paths()
+            check_output_file(self.json, "--json", read, overwrite=self.may_replace_json)
         if self.view is not None:
             require_packages("viser")
 

@@ -27,7 +27,7 @@ from preprocess.capture_session import Capture
 from preprocess.fitting.capture_fitting import fit_capture, fitted_motion
 from preprocess.masks.mask_files import open_masks
 from preprocess.masks.mask_refinement import MaskRefiner
-from preprocess.masks.mask_sources import StoredMasks, associate_masks
+from preprocess.masks.mask_sources import associate_masks
 from preprocess.observation import associate_cameras
 from preprocess.open_capture import ImportedCapture, align_capture, import_capture
 from preprocess.plugins import DEFAULT_TRACKER, PersonTracker, make_tracker, segmenter_name
@@ -55,14 +55,16 @@ class PersonTracking:
 
     Attributes:
         imported: The recording with the poses, and with the masks that are learnt from.
-        capture: The recording with poses, tracked masks, camera and body, fitted to each other.
         interrupted: Whether tracking was stopped before the last frame.
     """
 
     imported: ImportedCapture
-    capture: Capture
     grade: TrackingGrade
     interrupted: bool
+
+    def capture(self) -> Capture:
+        """The recording, aligned as it is."""
+        return align_capture(self.imported, skip_checks=True)
 
 
 def limit_frames(inputs: CaptureInputs, source: FrameSource) -> CaptureInputs:
@@ -113,15 +115,10 @@ def track_person(
             capture = replace(capture, motion=_without(capture.motion, grade.left_out))
         with atomic_file(poses) as unfinished:
             write_motion(unfinished, capture.motion)
-    if own_masks:
-        masks = StoredMasks(open_masks(folder, invert=False), source)
-        capture = replace(capture, masks=masks)
     learnt = folder if own_masks and not names_segmenter else None
     there = tracked_inputs(inputs, poses, learnt)
-    return PersonTracking(
-        imported=_import_poses(source, capture.motion, there, given), capture=capture,
-        grade=grade, interrupted=tracked.interrupted,
-    )  # fmt: skip
+    imported = _import_poses(source, capture.motion, there, given)
+    return PersonTracking(imported=imported, grade=grade, interrupted=tracked.interrupted)
 
 
 def _open_video(

@@ -13,7 +13,7 @@ from instant_avatar.run.run_folder import RunFolder
 from instant_avatar.run.run_tracking import import_tracked
 from preprocess.cameras.camera_file import write_cameras
 from preprocess.capture_inputs import CaptureInputs, InputKind
-from preprocess.capture_session import Capture
+from preprocess.capture_session import Capture, video_identity
 from preprocess.fitting.capture_fit import CaptureFit, load_capture_fit
 from preprocess.fitting.capture_fitting import apply_fit, fit_capture
 from preprocess.masks.mask_refinement import MaskRefiner
@@ -81,7 +81,7 @@ def _align_as_trained(
     imported: ImportedCapture, run: RunFolder, size_px: int
 ) -> tuple[Capture, CaptureFit | None]:
     """Align a recording with the person of a run; also return the fit of its checkpoint."""
-    fit = load_capture_fit(run.fit_file, imported.identity)
+    fit = load_capture_fit(run.fit_file, video_identity(imported.source))
     keeps_person = run.body_file.is_file() and (fit is None or not fit.fits_body)
     person = run.body_file if keeps_person else None
     return align_capture(imported, size_px=size_px, avatar_body=person), fit

@@ -66,7 +66,7 @@ def import_tracked(
     print_doubts(grade, console)
     if not (grade.is_good_enough or arguments.force):
         with console.status("drawing the tracked video"):
-            write_tracked_video(run.tracked_video, tracking.capture, grade.doubts)
+            write_tracked_video(run.tracked_video, tracking.capture(), grade.doubts)
         raise _refusal(grade.describe(), run)
     console.info(grade.describe())
     return _with_grade(imported, stored)
@@ -95,9 +95,7 @@ def _stored_inputs(stored: dict[str, Any], inputs: CaptureInputs, run: RunFolder
 
 
 def _with_grade(imported: ImportedCapture, stored: dict[str, Any]) -> ImportedCapture:
-    tracking = Provenance(
-        part="tracking", origin="tracking/", uncertainty=1.0, figures=stored["grade"]
-    )
+    tracking = Provenance("tracking", "tracking/", uncertainty=1.0, figures=stored["grade"])
     return replace(imported, provenance=(tracking,))
 
 

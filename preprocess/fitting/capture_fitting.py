@@ -78,10 +78,8 @@ def apply_fit(capture: Capture, fit: CaptureFit, *, height_m: float | None = Non
     A static camera shows only the ratio of size and distance: the person keeps its size. A stated
     height stays, and the person of a finished avatar does not change at all.
     """
-    made = Provenance(
-        part="fit", origin="outlines of the masks", uncertainty=fit.share, figures=fit.as_json(),
-        notes=(fit.describe(),) if fit.share else (),
-    )  # fmt: skip
+    notes = (fit.describe(),) if fit.share else ()
+    made = Provenance("fit", "outlines of the masks", notes, fit.share, fit.as_json())
     if not fit.share:
         return capture.with_part(made, fits=(*capture.fits, fit))
     geometry = capture.geometry()

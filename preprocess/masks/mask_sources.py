@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol, final, runtime_checkable
+from typing import final
 
 import cv2
 import numpy as np
@@ -25,8 +25,7 @@ UNREFINED = GivenMaskRefiner(enabled=False)
 """Masks stay as they are."""
 
 
-@runtime_checkable
-class MaskSource(Protocol):
+class MaskSource:
     """Masks of the frames of one capture, asked for in the frames' order.
 
     Attributes:
@@ -36,30 +35,29 @@ class MaskSource(Protocol):
     """
 
     origin: str
-    is_given: bool
+    is_given = False
 
     @property
     def agreement(self) -> float | None:
-        """Agreement of estimated masks with the posed body; None for others."""
-        ...
+        """Agreement of estimated masks with the posed body, if it is known."""
+        return None
 
     @property
     def needs_all_frames(self) -> bool:
         """Return whether a mask depends on the frames before it."""
-        ...
+        return True
 
     @property
     def is_refined(self) -> bool:
         """Return whether given masks are refined, by the frames that were seen."""
-        ...
+        return False
 
     def check(self) -> None:
         """Raise an InputError if they do not belong to the frames."""
-        ...
 
     def read(self, index: int, size_px: tuple[int, int]) -> Alpha:
         """Read the given mask of a frame's number, scaled; an InputError if there is none."""
-        ...
+        raise InputError(f"the mask of frame {index} is not known before the frame")
 
     def alpha(self, frame: Frame, scaled: Frame, pose: BodyPose, camera: Camera) -> Alpha:
         """The mask of a frame, in [0, 1]; an InputError if there is none.
@@ -68,19 +66,20 @@ class MaskSource(Protocol):
             frame: The frame as it was filmed.
             scaled: The same, of the mask's and the camera's size.
         """
-        ...
+        raise NotImplementedError
 
     def notes(self) -> Iterator[str]:
         """Messages for the user that need the frames to have come."""
-        ...
+        yield from ()
 
 
-class _GivenMasks:
+class GivenMasks(MaskSource):
     """Masks that are read, and refined where the images show that they need it."""
 
-    is_given, agreement = True, None
+    is_given = True
 
     def __init__(self, origin: str, refine: GivenMaskRefiner) -> None:
+        """Read nothing yet."""
         self.origin, self._refine = origin, refine
 
     @property
@@ -94,7 +93,7 @@ class _GivenMasks:
         return self._refine.is_needed
 
     def alpha(self, frame: Frame, scaled: Frame, pose: BodyPose, camera: Camera) -> Alpha:
-        """The mask of a frame, refined if that is needed."""
+        """Read the mask of a frame, and refine it if that is needed."""
         if self._refine.keeps_given_masks:
             return self._of_frame(frame, scaled.size_px)
         return self._refine(frame.rgb, self._of_frame(frame, frame.size_px), scaled.size_px)
@@ -105,11 +104,11 @@ class _GivenMasks:
             yield self._refine.note
 
     def _of_frame(self, frame: Frame, size_px: tuple[int, int]) -> Alpha:
-        raise NotImplementedError
+        return self.read(frame.index, size_px)
 
 
 @final
-class StoredMasks(_GivenMasks):
+class StoredMasks(GivenMasks):
     """Masks of a file or a folder.
 
     Attributes:
@@ -129,7 +128,7 @@ class StoredMasks(_GivenMasks):
         return associate_masks(self.files, self._source)
 
     def check(self) -> None:
-        """Raise an InputError if they do not belong to the frames."""
+        """Raise an InputError if files and frames do not belong together."""
         self.row_of  # noqa: B018 - it is found here
 
     def read(self, index: int, size_px: tuple[int, int]) -> Alpha:
@@ -150,12 +149,9 @@ class StoredMasks(_GivenMasks):
             masks.row_of = lambda index: index
         return masks
 
-    def _of_frame(self, frame: Frame, size_px: tuple[int, int]) -> Alpha:
-        return self.read(frame.index, size_px)
-
 
 @final
-class AlphaChannelMasks(_GivenMasks):
+class AlphaChannelMasks(GivenMasks):
     """The images' own alpha channel."""
 
     def __init__(self, source: FrameSource, refine: GivenMaskRefiner = UNREFINED) -> None:
@@ -166,9 +162,6 @@ class AlphaChannelMasks(_GivenMasks):
     @cached_property
     def _paths(self) -> list[Path]:
         return list_images(self._source.path)  # only images have alpha channels
-
-    def check(self) -> None:
-        """Nothing can be wrong: each image has its own."""
 
     def read(self, index: int, size_px: tuple[int, int]) -> Alpha:
         """Read the alpha channel of an image."""
@@ -186,11 +179,9 @@ class AlphaChannelMasks(_GivenMasks):
         return alpha_channel_mask(frame, size_px)
 
 
-class EstimatedMasks:
-    """Masks that a segmenter finds in the images; base of others that need the images."""
-
-    is_given = is_refined = False
-    needs_all_frames = True
+@final
+class EstimatedMasks(MaskSource):
+    """Masks that a segmenter finds in the images."""
 
     def __init__(self, segment: Segmenter) -> None:
         """Estimate nothing yet."""
@@ -202,20 +193,9 @@ class EstimatedMasks:
         """Agreement with the posed body, if the segmenter knows it."""
         return getattr(self._segment, "agreement", None)
 
-    def check(self) -> None:
-        """Nothing can be wrong before the frames come."""
-
-    def read(self, index: int, size_px: tuple[int, int]) -> Alpha:
-        """There is none before the frame is seen."""
-        raise InputError(f"the mask of frame {index} is not known before the frame")
-
     def alpha(self, frame: Frame, scaled: Frame, pose: BodyPose, camera: Camera) -> Alpha:
         """Estimate the mask of a frame."""
         return self._segment(scaled, pose, camera)
-
-    def notes(self) -> Iterator[str]:
-        """Nothing is left to say."""
-        yield from ()
 
 
 def associate_masks(masks: Masks, source: FrameSource) -> Callable[[int], int]:

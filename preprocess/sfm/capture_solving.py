@@ -81,16 +81,14 @@ def apply_camera_solution(capture: Capture, solved: CameraSolution) -> Capture:
             f"{solved.background_motion:.2%} of the picture), so there was nothing to solve."
         )
         report = solution_report(solved, None, capture.source)
-        return capture.with_part(
-            Provenance(part="cameras", origin="solved", notes=(note,), figures=report)
-        )
+        return capture.with_part(Provenance("cameras", "solved", (note,), figures=report))
     placement = place_in_metric_world(
         solved, capture.motion, _tracker_camera(capture), capture.shaped, capture.source
     )
     report = solution_report(solved, placement, capture.source)
-    notes = (_describe_solution(report, placement),)
+    note = _describe_solution(report, placement)
     return capture.with_part(
-        Provenance(part="cameras", origin="solved", notes=notes, figures=report),
+        Provenance("cameras", "solved", (note,), figures=report),
         cameras=placement.cameras,
         motion=placement.motion,
     )

@@ -123,8 +123,8 @@ def started(tracker, source=None):
 def observations(stream, tracking, start, masks=None):
     capture = Capture(
         paths=CapturePaths(video=stream.path, poses=stream.path, masks=None, cameras=None),
-        source=stream, motion=start.motion, masks=masks or TrackedMasks(tracking, plain),
-        cameras=start.cameras, shaped=start.shaped, size_px=max(SIZE), provenance=(),
+        source=stream, motion=start[0], masks=masks or TrackedMasks(tracking, plain),
+        cameras=start[2], shaped=start[1], size_px=max(SIZE), provenance=(),
     )  # fmt: skip
     return TrackedObservations(capture, tracking)
 
@@ -198,8 +198,8 @@ def test_a_finished_avatars_person_keeps_the_body(standing):
     shaped = load_body_model(None).with_shape()
     person = replace(shaped, joints=1.1 * shaped.joints, vertices=1.1 * shaped.vertices)
     camera = assume_camera(Path("film.mp4"), "static", stream)
-    start = tracking.start(person, camera, fixed_body=True)
-    assert np.allclose(start.shaped.joints, person.joints)
+    _, kept, _ = tracking.start(person, camera, fixed_body=True)
+    assert np.allclose(kept.joints, person.joints)
 
 
 def test_a_stated_focal_length_changes_less_than_an_assumed_one(standing):
@@ -209,8 +209,8 @@ def test_a_stated_focal_length_changes_less_than_an_assumed_one(standing):
         tracking = LiveTracking(stream, Tracker(standing))
         guess = assume_camera(Path("film.mp4"), "static", stream).scale_focal(1.3)
         shaped = load_body_model(None).with_shape()
-        start = tracking.start(shaped, guess, stated_focal=stated)
-        changes.append(abs(np.log(start.cameras[0].focal_px[0] / guess.focal_px[0])))
+        _, _, cameras = tracking.start(shaped, guess, stated_focal=stated)
+        changes.append(abs(np.log(cameras[0].focal_px[0] / guess.focal_px[0])))
     assert changes[1] < 0.5 * changes[0]
 
 
