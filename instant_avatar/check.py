@@ -22,6 +22,7 @@ from instant_avatar.cli.shared_options import (
     capture_name,
     check_disjoint_from_inputs,
     check_output_file,
+    open_recording,
 )
 from instant_avatar.contact_sheet import write_contact_sheet
 from instant_avatar.corrected_capture import check_new_or_empty, write_corrected_capture
@@ -116,6 +117,7 @@ def check(arguments: CheckArguments, console: Console) -> int:
     arguments.check_outputs()
     if inputs.kind is InputKind.POSED:
         return _check(arguments, lambda: read_capture(inputs), console)
+    open_recording(inputs, console)
     with TemporaryDirectory() as folder:  # of the tracked masks
         tracking = track_person(inputs, Path(folder) / "poses.npz", console)
         return _check(arguments, lambda: tracking.imported, console)

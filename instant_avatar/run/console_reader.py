@@ -64,6 +64,8 @@ class ConsoleReader:
         elapsed_s, budget_s = trainer.wall_seconds, trainer.config.seconds
         if trainer.config.steps:
             position = f"step {trainer.steps} of {trainer.config.steps}, {elapsed_s:.0f} s"
+        elif session.meter.grows:
+            position = f"{elapsed_s:.0f} s"
         elif elapsed_s <= budget_s:
             position = f"{elapsed_s:.0f} of {budget_s:g} s"
         else:

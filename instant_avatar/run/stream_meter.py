@@ -54,6 +54,11 @@ class StreamMeter:
         self._available_at: deque[tuple[int, float]] = deque()
 
     @property
+    def grows(self) -> bool:
+        """True if frames are files that another program writes: the run ends with them."""
+        return self._source.frame_count is None and not self._source.live
+
+    @property
     def is_paced(self) -> bool:
         """True if frames come at their own times, which may be faster than training takes them."""
         return self._source.paced

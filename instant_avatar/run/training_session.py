@@ -138,8 +138,10 @@ class TrainingSession:
     def _train(self, report_progress: Callable[[Progressed], object]) -> Iterator[SessionEvent]:
         source = self._frames
         self._source.set_catch_up(self._restore_count > 0)
-        grows = source.frame_count is None and not source.live
-        inbox = Inbox(self._frame_stream(), paced=source.paced, live=source.live, ends_run=grows)
+        inbox = Inbox(
+            self._frame_stream(),
+            paced=source.paced, live=source.live, ends_run=self.meter.grows,
+        )  # fmt: skip
         try:
             restored = self._restore_frames(inbox, self._restore_count, report_progress)
             added = restored - self.trainer.frames_seen
