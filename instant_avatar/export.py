@@ -196,17 +196,19 @@ def _export_package(folder: Path, out: Path, console: Console, *, fine_tune: boo
         )
     with console.status("loading the checkpoint"):
         from avatar.training import checkpoint
+        from export.bake.bake_tables import ExportRefused
         from instant_avatar.run.snapshot_writer import write_packages
 
         trainer, _ = checkpoint.load(run.checkpoint)
     with console.progress("writing the package", 1.0) as bar:
         shots = synthetic_views(trainer.avatar.rig)
-        (taken,) = write_packages(
-            trainer, out, shots, curve_point=None, fine_tune=fine_tune, progress=bar.set_share
-        )
-    if taken.export_report is None:
-        raise CommandExit(taken.refusal or "nothing was written.", NO_AVATAR)
-    for warning in taken.export_report.warnings:
+        try:
+            (exported,) = write_packages(
+                trainer, out, shots, curve_point=None, fine_tune=fine_tune, progress=bar.set_share
+            )
+        except ExportRefused as error:
+            raise CommandExit(str(error), NO_AVATAR) from error
+    for warning in exported.warnings:
         console.warning(warning)
     console.info(f"Trained on {trainer.frames_seen} frames for {trainer.wall_seconds:.1f} s.")
 

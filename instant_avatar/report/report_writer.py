@@ -167,7 +167,7 @@ class ReportWriter:
         assert self._result is not None
         assert self.report is not None
         is_interrupted = self._result.interrupted
-        unusable = _refusal(self._result) or diagnose_failure(self.report)
+        unusable = self._result.refusal or diagnose_failure(self.report)
         if unusable is not None:
             raise CommandExit(unusable, INTERRUPTED if is_interrupted else NO_AVATAR)
         return INTERRUPTED if is_interrupted else DONE
@@ -187,7 +187,7 @@ class ReportWriter:
         page = report_page(
             report,
             name=capture_name(self._capture.paths.video),
-            verdict=describe_verdict(report, _refusal(result), is_final=is_final),
+            verdict=describe_verdict(report, result.refusal, is_final=is_final),
             body_map=CoverageMap(self._capture.shaped, result.coverage).svg(),
             pairs=comparison_pairs(result),
             animation=None if self._animation is None else data_uri(self._animation),
@@ -232,7 +232,7 @@ class ReportWriter:
         console.info(
             f"Trained for {training.wall_seconds:.1f} s ({training.steps} steps); {score}."
         )
-        if _refusal(result) is None and diagnose_failure(report) is None:
+        if result.refusal is None and diagnose_failure(report) is None:
             console.info(describe_verdict(report, None, is_final=True))
         if report.package is not None:
             console.print_artifact("package", run.package)
@@ -240,11 +240,6 @@ class ReportWriter:
         console.print_artifact("look at it", run.report_html)
         console.print_artifact("report", run.report_json)
         console.print_artifact("checkpoint", run.checkpoint)
-
-
-def _refusal(result: TrainingResult) -> str | None:
-    """Return why no package was written; None if one was."""
-    return None if result.package is None else result.package.refusal
 
 
 def comparison_pairs(result: TrainingResult) -> list[ComparisonPair]:
@@ -290,7 +285,7 @@ def _fitted_pose_stats(result: TrainingResult) -> HeldOutStats | None:
 
 def _package_stats(result: TrainingResult, run: RunFolder) -> PackageStats | None:
     """Describe the package, or remove a resumed run's older one if none was written."""
-    exported = None if result.package is None else result.package.export_report
+    exported = result.exported
     if exported is None:
         run.remove(run.package)
         run.remove(run.animation)
@@ -312,8 +307,7 @@ def _build_report(
     startup_seconds: float,
     threads: int,
 ) -> Report:
-    trainer, snapshot = result.trainer, result.package
-    ready_at = None if package is None or snapshot is None else snapshot.ready_at
+    trainer = result.trainer
     scores = result.scores.given
     held_out = HeldOutStats.of(scores, result.meter.size_px if scores else None)
     recipe = asdict(trainer.config) | {
@@ -333,7 +327,7 @@ def _build_report(
         held_out=held_out,
         held_out_refined=_fitted_pose_stats(result),
         curve=result.curve,
-        stream=result.meter.stats(ready_at=ready_at),
+        stream=result.meter.stats(ready_at=result.ready_at),
         package=package,
         all_round=result.all_round_verdict(),
         coverage=CoverageStats.of(result.coverage),

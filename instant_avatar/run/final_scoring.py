@@ -42,6 +42,7 @@ from avatar.training.checkpoint import (
 )
 from avatar.training.held_out_pose_fitting import fit_test_poses
 from avatar.training.trainer import Trainer
+from export.build import ExportReport
 from instant_avatar.cli.console import Console
 from instant_avatar.report.report_schema import (
     CurvePoint,
@@ -49,7 +50,6 @@ from instant_avatar.report.report_schema import (
     finite_mean,
 )
 from instant_avatar.run.run_folder import RunFolder
-from instant_avatar.run.snapshot_writer import PackageSnapshot
 from instant_avatar.run.stream_meter import StreamMeter
 
 SCORING_LIMIT_S = 12.0
@@ -108,7 +108,8 @@ class TrainingResult:
     Attributes:
         curve: Learning curve, up to the final scores.
         frames_added: Frames of this capture that were trained on.
-        package: Outcome of packaging; None before it.
+        exported: Describes the package; None without one, and `refusal` may say why.
+        ready_at: When the package could be played, on `time.perf_counter`'s clock.
         scores: Final scores of the held-out frames; empty before they are scored.
     """
 
@@ -119,7 +120,9 @@ class TrainingResult:
     coverage: Coverage
     frames_added: int
     interrupted: bool
-    package: PackageSnapshot | None = None
+    exported: ExportReport | None = None
+    refusal: str | None = None
+    ready_at: float | None = None
     scores: FinalScores = field(default_factory=FinalScores)
     earlier_videos: ForgettingStats | None = None
 
@@ -130,7 +133,7 @@ class TrainingResult:
 
     def all_round_verdict(self) -> AllRoundVerdict:
         """The verdict on the avatar from all sides, by what is known of it so far."""
-        scores, exported = self.scores, self.package and self.package.export_report
+        scores, exported = self.scores, self.exported
         return AllRoundVerdict.of(
             better_verdict(overall_verdict(scores.given), overall_verdict(scores.fitted)),
             seen=self.coverage.seen_share,

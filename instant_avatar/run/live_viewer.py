@@ -13,6 +13,7 @@ from avatar.evaluation.coverage import coverage_advice
 from avatar.events import Evaluated, Finished
 from avatar.render import render
 from capture.camera import Camera
+from export.bake.bake_tables import ExportRefused
 from instant_avatar.cli.command_line import stop_on_interrupt
 from instant_avatar.cli.console import Console
 from instant_avatar.report.report_figures import CoverageMap
@@ -123,17 +124,15 @@ class LiveViewer:
             self.page.notify("Not yet", "Training has not started.")
             return
         try:
-            taken = session.save_package()
+            exported = session.save_package()
         except OSError as error:
             self.page.notify("The package could not be written", str(error))
             return
-        if taken.export_report is None:
-            self.page.notify("No package yet", taken.refusal or "")
+        except ExportRefused as error:
+            self.page.notify("No package yet", str(error))
             return
-        exported = taken.export_report
-        size = (
-            f"{exported.bytes / 1e6:.1f} MB after {session.trainer.wall_seconds:.0f} s of training"
-        )
+        seconds = session.trainer.wall_seconds
+        size = f"{exported.bytes / 1e6:.1f} MB after {seconds:.0f} s of training"
         notes = " ".join([f"{self._run.package}: {size}.", *exported.warnings])
         self.page.notify("Package saved", notes)
         self._console.info(f"Saved from the live viewer: {self._run.package}, {size}.")

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, final
 
@@ -13,10 +13,8 @@ from avatar.evaluation.held_out import HeldOutFrame, subsample_evenly
 from avatar.training import checkpoint
 from avatar.training.trainer import Trainer
 from capture.atomic_files import atomic_file
-from export.bake.bake_tables import ExportRefused
 from export.bake.fine_tuning import PosedView
 from export.build import ExportReport, export_avatar
-from export.package.package_file import update_metrics
 from instant_avatar.report.report_schema import CurvePoint
 from instant_avatar.run.run_folder import RunFolder
 from preprocess.body.parametric_body import write_shaped_body
@@ -116,21 +114,6 @@ VALIDATION_VIEWS = 4
 """Views that a package is validated with."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class PackageSnapshot:
-    """Outcome of writing a package.
-
-    Attributes:
-        export_report: Describes the package; None if it was refused.
-        refusal: Why no package was written; None if one was.
-        ready_at: When the file was complete, on `time.perf_counter`'s clock.
-    """
-
-    export_report: ExportReport | None
-    refusal: str | None
-    ready_at: float
-
-
 def write_packages(
     trainer: Trainer,
     path: Path,
@@ -140,47 +123,14 @@ def write_packages(
     baked_first: bool = False,
     fine_tune: bool = True,
     progress: Callable[[float], None] = lambda _: None,
-) -> Iterator[PackageSnapshot]:
-    """Write the package, whole or not at all, and yield it; training may continue afterwards.
-
-    Args:
-        trainer: Holds the avatar; not in the middle of a step.
-        path: The `.iavatar` file; an existing one is kept if the package is refused.
-        views: Poses and cameras to validate the package with (`validation_views`).
-        baked_first: Whether to write and yield the package before it is fine-tuned, too.
-        fine_tune: Whether to spend about ten seconds on fine-tuning the bricks.
-        progress: Called with the fraction done, from 0 to 1, while bricks are fine-tuned.
-    """
-    metrics = {
-        "held_out": None if curve_point is None else asdict(curve_point),
-        "recipe": asdict(trainer.config),
-    }
-    try:
-        for exported in export_avatar(
-            trainer.avatar, path, views=views, metrics=metrics, baked_first=baked_first,
-            fine_tune_bricks=fine_tune, progress=progress,
-        ):  # fmt: skip
-            yield PackageSnapshot(
-                export_report=exported, refusal=None, ready_at=time.perf_counter()
-            )
-    except ExportRefused as error:
-        yield PackageSnapshot(export_report=None, refusal=str(error), ready_at=time.perf_counter())
-
-
-def store_scores(snapshot: PackageSnapshot, scores: CurvePoint) -> PackageSnapshot:
-    """Replace the scores in the package that was written, if one was."""
-    exported = snapshot.export_report
-    if exported is None:
-        return snapshot
-    size = update_metrics(exported.path, {"held_out": asdict(scores)})
-    return replace(snapshot, export_report=replace(exported, bytes=size))
-
-
-def prefer_final(first: PackageSnapshot | None, final: PackageSnapshot) -> PackageSnapshot:
-    """Return the package on disk after a first one; it was ready when the first one was."""
-    if first is None:
-        return final
-    return first if final.export_report is None else replace(final, ready_at=first.ready_at)
+) -> Iterator[ExportReport]:
+    """Write the package of a trainer that is between two steps; see `export_avatar`."""
+    scores = None if curve_point is None else asdict(curve_point)
+    return export_avatar(
+        trainer.avatar, path, views=views,
+        metrics={"held_out": scores, "recipe": asdict(trainer.config)},
+        baked_first=baked_first, fine_tune_bricks=fine_tune, progress=progress,
+    )  # fmt: skip
 
 
 def validation_views(held_out: list[HeldOutFrame], recording: Capture) -> Sequence[PosedView]:

@@ -1,9 +1,10 @@
 """A training session: frames in, steps, checkpoints, package, scores."""
 
 import threading
+import time
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import asdict, replace
 from typing import Any, final
 
 from avatar.evaluation.coverage import Coverage, coverage_advice
@@ -20,7 +21,9 @@ from avatar.training.frame_stream import (
 from avatar.training.train import train
 from avatar.training.trainer import Trainer
 from capture.inbox import Inbox
-from export.bake.fine_tuning import PosedView
+from export.bake.bake_tables import ExportRefused
+from export.build import ExportReport
+from export.package.package_file import update_metrics
 from instant_avatar.cli.command_line import BAD_INPUT, INTERRUPTED, CommandExit
 from instant_avatar.report.report_schema import CurvePoint, finite_mean, format_percent
 from instant_avatar.run.final_scoring import (
@@ -41,9 +44,6 @@ from instant_avatar.run.session_events import (
 )
 from instant_avatar.run.snapshot_writer import (
     CheckpointWriter,
-    PackageSnapshot,
-    prefer_final,
-    store_scores,
     validation_views,
     write_packages,
 )
@@ -52,8 +52,6 @@ from preprocess.body.body_pose import BodyPose
 from preprocess.observation import Observation
 from preprocess.observation_source import ObservationSource
 
-FINE_TUNING = "fine-tuning the package"
-"""The stage in which the package is replaced by one with finer detail."""
 REVISED_PER_STEP = 2
 """Frames whose poses are replaced between two steps; each solves its correspondences again."""
 
@@ -99,6 +97,7 @@ class TrainingSession:
             self.coverage.merge_state(notes["coverage"])
         self.is_interrupted = False
         self._result: TrainingResult | None = None
+        self._report_progress: Callable[[str, float], object] = lambda *_: None
 
     def run(
         self, report_progress: Callable[[Progressed], object] = lambda _: None
@@ -112,22 +111,24 @@ class TrainingSession:
         Raises:
             CommandExit: If the avatar was not trained.
         """
-        yield from self._train(report_progress)
+        self._report_progress = lambda stage, share: report_progress(
+            Progressed(stage=stage, share=share)
+        )
+        yield from self._train()
         self._check_trained()
-        views = validation_views(self.held_out, self._capture)
         self.trainer.replay.clear_correspondences()  # nothing is learnt from here on
-        yield from self._write_packages(views, report_progress)
+        yield from self._write_packages()
         EarlierVideos(self._run, self._notes).save_frames(self.trainer, self.held_out)
-        yield from self._score(report_progress)
+        yield from self._score()
         yield Ended(result=self.result)
 
-    def save_package(self) -> PackageSnapshot:
-        """Write the avatar in its current state, between two steps."""
-        (taken,) = write_packages(
+    def save_package(self) -> ExportReport:
+        """Write the avatar in its current state, between two steps; raise like `export_avatar`."""
+        (exported,) = write_packages(
             self.trainer, self._run.package, validation_views(self.held_out, self._capture),
             curve_point=self.curve[-1] if self.curve else None, fine_tune=False,
         )  # fmt: skip
-        return taken
+        return exported
 
     @property
     def result(self) -> TrainingResult:
@@ -135,7 +136,7 @@ class TrainingSession:
         assert self._result is not None
         return self._result
 
-    def _train(self, report_progress: Callable[[Progressed], object]) -> Iterator[SessionEvent]:
+    def _train(self) -> Iterator[SessionEvent]:
         source = self._frames
         self._source.set_catch_up(self._restore_count > 0)
         inbox = Inbox(
@@ -143,7 +144,7 @@ class TrainingSession:
             paced=source.paced, live=source.live, ends_run=self.meter.grows,
         )  # fmt: skip
         try:
-            restored = self._restore_frames(inbox, self._restore_count, report_progress)
+            restored = self._restore_frames(inbox, self._restore_count)
             added = restored - self.trainer.frames_seen
             self._source.set_catch_up(False)
             self._checkpoints.restart_interval()
@@ -174,48 +175,43 @@ class TrainingSession:
             interrupted=self.is_interrupted,
         )
 
-    def _write_packages(
-        self, views: Sequence[PosedView], report_progress: Callable[[Progressed], object]
-    ) -> Iterator[SessionEvent]:
+    def _write_packages(self) -> Iterator[SessionEvent]:
         """Write the package as baked, then the fine-tuned one, and checkpoints beside the first."""
 
         def check_stop(share: float) -> None:
             if self._is_left_out():
                 raise KeyboardInterrupt
-            report_progress(Progressed(stage=FINE_TUNING, share=share))
+            self._report_progress("fine-tuning the package", share)
 
         self._begin_checkpoint(trains_on=False)  # baking changes nothing of it
-        report_progress(Progressed(stage="writing the package", share=0.0))
-        packages = write_packages(
-            self.trainer, self._run.package, views, baked_first=True, progress=check_stop,
-            curve_point=self.curve[-1] if self.curve else None,
-        )  # fmt: skip
+        self._report_progress("writing the package", 0.0)
         try:
-            for is_final, package in enumerate(packages):
-                if not is_final:
-                    self._checkpoints.settle()
-                    self._checkpoints.wait()
-                package = prefer_final(self.result.package, package)
-                self._result = replace(self.result, package=package)
-                if package.export_report is not None:
-                    yield PackageWritten(
-                        path=self._run.package, result=self.result, is_final=bool(is_final)
-                    )
+            for exported in write_packages(
+                self.trainer, self._run.package, validation_views(self.held_out, self._capture),
+                curve_point=self.curve[-1] if self.curve else None, baked_first=True,
+                progress=check_stop,
+            ):  # fmt: skip
+                self._checkpoints.settle()
+                self._checkpoints.wait()
+                is_final = self.result.exported is not None
+                ready_at = self.result.ready_at or time.perf_counter()
+                self._result = replace(self.result, exported=exported, ready_at=ready_at)
+                yield PackageWritten(path=self._run.package, result=self.result, is_final=is_final)
+        except ExportRefused as error:  # of the fine-tuned one: that as baked stays
+            if self.result.exported is None:
+                self._result = replace(self.result, refusal=str(error))
         finally:
             self._checkpoints.settle()
-        exported = package.export_report
-        for message in () if exported is None else exported.warnings:
+        self._checkpoints.wait()
+        for message in self.result.exported.warnings if self.result.exported else ():
             yield Warned(message=message)
 
-    def _score(self, report_progress: Callable[[Progressed], object]) -> Iterator[SessionEvent]:
+    def _score(self) -> Iterator[SessionEvent]:
         """Score held-out frames, in the given poses and in poses fitted to them."""
         scores = score_finally(
             self.trainer, self.held_out,
             fit_poses=self.trainer.config.refine_poses and not self.is_interrupted,
-            report_progress=lambda stage, share: report_progress(
-                Progressed(stage=stage, share=share)
-            ),
-            is_left_out=self._is_left_out,
+            report_progress=self._report_progress, is_left_out=self._is_left_out,
         )  # fmt: skip
         last = self.curve[-1].wall_seconds if self.curve else -1.0
         if scores.sampled and self.trainer.wall_seconds > last:
@@ -233,9 +229,10 @@ class TrainingSession:
             self.result, scores=scores, curve=tuple(self.curve), earlier_videos=forgetting,
             interrupted=self.stop.is_set(),
         )  # fmt: skip
-        if scores.given and self.curve and result.package is not None:
+        if scores.given and self.curve and result.exported is not None:
             summary = scores.summarize(self.curve[-1], result.all_round_verdict().verdict)
-            result = replace(result, package=store_scores(result.package, summary))
+            size = update_metrics(self._run.package, {"held_out": asdict(summary)})
+            result = replace(result, exported=replace(result.exported, bytes=size))
         self._result = result
         yield Scored(result=result)
 
@@ -275,16 +272,11 @@ class TrainingSession:
                 self.newest_observation = item.observation
             yield item
 
-    def _restore_frames(
-        self,
-        inbox: Inbox[StreamItem],
-        count: int,
-        report_progress: Callable[[Progressed], object],
-    ) -> int:
+    def _restore_frames(self, inbox: Inbox[StreamItem], count: int) -> int:
         """Read frames back into the replay buffer; return how many."""
         seen = 0
         while seen < count and not (inbox.finished or self.stop.is_set()):
-            report_progress(Progressed(stage=f"reading back {count} frames", share=seen / count))
+            self._report_progress(f"reading back {count} frames", seen / count)
             for item in inbox.take(timeout_s=0.1):
                 if isinstance(item, HeldOutFrame):
                     add_held_out(self.held_out, item)

@@ -15,7 +15,7 @@ from export.bake import bake_tables, fine_tuning
 from export.build import ExportReport
 from instant_avatar import ingest, play
 from instant_avatar.report import report_writer
-from instant_avatar.run import session_start, snapshot_writer
+from instant_avatar.run import session_start, snapshot_writer, training_session
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.open_capture import open_capture
@@ -143,7 +143,7 @@ def without_baking(monkeypatch) -> None:
         )  # fmt: skip
 
     monkeypatch.setattr(snapshot_writer, "export_avatar", export_nothing)
-    monkeypatch.setattr(snapshot_writer, "update_metrics", lambda path, metrics: 8)
+    monkeypatch.setattr(training_session, "update_metrics", lambda path, metrics: 8)
     monkeypatch.setattr(report_writer, "diagnose_failure", lambda report: None)
     monkeypatch.setattr(report_writer, "demo_animation", lambda player, fps: b"")
     monkeypatch.setattr(report_writer.Player, "load", lambda path: None)

@@ -13,6 +13,7 @@ from avatar.evaluation.coverage import Coverage
 from avatar.events import FrameArrived, FrameLeftOut, Stepped
 from avatar.training.frame_stream import separate_held_out
 from avatar.training.trainer import Trainer
+from export.bake.bake_tables import ExportRefused
 from export.build import ExportReport
 from instant_avatar import train
 from instant_avatar.run import snapshot_writer
@@ -98,6 +99,17 @@ def write_twice(avatar, path, *, progress, **options):
             path=path, bytes=number + 1, seconds=0.0, psnr_to_renderer={"hq": 40.0},
             largest_difference=0.0, fine_tuning_psnr=psnr, warnings=(),
         )  # fmt: skip
+
+
+def test_the_package_as_baked_stays_if_the_fine_tuned_one_is_refused(learn, monkeypatch):
+    def refuse_the_second(avatar, path, **options):
+        yield next(write_twice(avatar, path, **options))
+        raise ExportRefused("fog")
+
+    monkeypatch.setattr(snapshot_writer, "export_avatar", refuse_the_second)
+    avatar = learn()
+    assert avatar.package.read_bytes() == b"a"
+    assert avatar.report["package"] is not None
 
 
 @pytest.mark.parametrize("when", [None, "first", "final"])
