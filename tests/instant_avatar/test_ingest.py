@@ -36,7 +36,7 @@ KEYS = {
     "lateness_ms inbox_depth",
     "package": "path bytes seconds psnr_to_renderer",
     "coverage": "seen well advice parts",
-    "all_round": "verdict limit advice seen half_transparent",
+    "all_round": "verdict limit advice seen half_transparent mean_cosine",
 }
 
 FEW = ("--frames", "0:8")
