@@ -50,9 +50,12 @@ GLANCE_PX = 960
 def glance(source: FrameSource) -> list[tuple[Frame, Frame]]:
     """Reduced frames at a few places of a recording, and for each one soon after it."""
     recording = _open_recording(source.path, source.selection)
-    last = source.selection.span(source.frames_in_file) - 1
-    rate = (last + 1) / (source.duration_s or 1.0)
-    places = (np.arange(GLANCES) + 0.5) * last / GLANCES + source.selection.start
+    span = source.selection.span(source.frames_in_file)
+    rate = span / (source.duration_s or 1.0)
+    apart = 1.0 if source.path.is_dir() else GLANCE_APART_S * rate
+    last = max(0.0, span - 1.0 - apart)
+    places = np.unique(np.round((np.arange(GLANCES) + 0.5) * last / GLANCES))
+    places += source.selection.start
     pairs = recording.glance((places / rate).tolist(), GLANCE_APART_S, GLANCE_PX)
     return [(_turn(one, source.rotate), _turn(other, source.rotate)) for one, other in pairs]
 
@@ -67,7 +70,7 @@ def describe_recording(source: FrameSource) -> str:
     chosen = "" if source.frame_count == source.frames_in_file else f"{source.frame_count} of "
     count = f"{source.path.name}: {chosen}{source.frames_in_file}"
     if not source.duration_s or source.path.is_dir():
-        return f"{count} images of {size}"
+        return f"{count} image{'s' * (source.frames_in_file != 1)} of {size}"
     rate = source.selection.span(source.frames_in_file) / source.duration_s
     hdr = ", HDR (tone mapped)" if source.is_hdr else ""
     return f"{count} frames of {size}, {rate:.3g} a second{hdr}"

@@ -133,8 +133,8 @@ def _open_video(
             f"One in {source.selection.step} frames is used, {source.frame_count} in all (--frames "
             "names others)."
         )
-    if look:
-        seen = look_at(source)
+    seen = look_at(source) if look else None
+    if seen is not None and seen.frames:  # of fewer than seven frames there is none
         console.info(seen.describe())
         for advice in seen.advice():
             console.warning(advice)

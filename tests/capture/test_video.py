@@ -10,7 +10,7 @@ import pytest
 
 from capture.input_error import InputError
 from capture.source import FrameSelection
-from capture.source_opening import describe_recording, open_source, reopen
+from capture.source_opening import GLANCES, describe_recording, glance, open_source, reopen
 from capture.video import VideoFile
 
 
@@ -99,6 +99,20 @@ def test_a_file_that_is_no_video_is_refused_with_its_cause(tmp_path, content, wo
     (tmp_path / "video.mp4").write_bytes(content)
     with pytest.raises(InputError, match=word):
         open_source(tmp_path / "video.mp4")
+
+
+def test_a_glance_decodes_a_few_places_from_the_first_to_the_last(write_video):
+    source = open_source(write_video(frames=60), rotate=90)
+    pairs = glance(source)
+    assert len(pairs) == GLANCES
+    numbers = [first.index for first, _ in pairs]
+    assert numbers == sorted(set(numbers))
+    assert numbers[0] < 10
+    assert numbers[-1] > 40
+    for first, second in pairs:
+        assert 4 <= second.index - first.index <= 6  # 0.2 s
+        assert first.size_px == source.size_px
+    assert glance(open_source(write_video(frames=3))) == []
 
 
 def test_a_truncated_video_gives_what_is_there_and_says_so(write_video):
