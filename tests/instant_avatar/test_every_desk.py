@@ -44,15 +44,18 @@ def is_ours(name):
     return name.startswith({root!r}) and ".venv" not in name
 
 def held_open(path):
-    "Whether this process holds the file open: another system would not let it be moved then."
-    real = os.path.realpath(path)
-    for number in os.listdir("/dev/fd"):
+    "Whether this process holds the file, or one in the folder: it could not be moved elsewhere."
+    if not os.path.isdir("/proc/self/fd"):
+        return False
+    real, used = os.path.realpath(path), []
+    for number in os.listdir("/proc/self/fd"):
         try:
-            if os.readlink("/dev/fd/" + number) == real:
-                return True
+            used.append(os.readlink("/proc/self/fd/" + number))
         except OSError:
             pass
-    return False
+    with open("/proc/self/maps", encoding="utf-8") as maps:
+        used += [line.rstrip().split(None, 5)[-1] for line in maps]
+    return any(name == real or name.startswith(real + "/") for name in used)
 
 def watch(event, values):
     path = os.fsdecode(values[0]) if values and isinstance(values[0], (str, bytes)) else ""
