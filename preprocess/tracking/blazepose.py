@@ -159,6 +159,7 @@ class BlazePoseTracker:
         self._crowded_frames = 0
         self._has_company = False
         self._mask_px = 0.0
+        self._is_replaced = False  # by another person at the same place
 
     def __call__(self, rgb: UInt8[np.ndarray, "height width 3"]) -> PersonKeypoints | None:
         """Find the person in the next frame; None where there is none."""
@@ -170,6 +171,7 @@ class BlazePoseTracker:
         if found is None or (jumps and self._is_strange(rgb, found)):
             self._look_for_who_hides(rgb)
             return None
+        self._is_replaced = False
         if jumps:
             self._frames_to_watch = 0
         self._last = LastPlace(square=found.square)
@@ -202,9 +204,9 @@ class BlazePoseTracker:
                 and self._is_strange(rgb, found)
             ):
                 self._company.learn(colors_of(rgb, found.keypoints))
-                self._crowded_frames = CROWD_MEMORY
-        if last.frames_ago > CROWD_MEMORY and not self._has_company:  # the film was cut
-            self._crowded_frames = 0
+                self._crowded_frames, self._is_replaced = CROWD_MEMORY, not self._has_company
+        if last.frames_ago > CROWD_MEMORY and self._is_replaced:  # the film was cut
+            self._crowded_frames, self._has_company, self._is_replaced = 0, False, False
         self._last = replace(last, frames_ago=last.frames_ago + 1)
 
     def _is_a_thing(self, rgb: UInt8[np.ndarray, "height width 3"], found: FoundLandmarks) -> bool:

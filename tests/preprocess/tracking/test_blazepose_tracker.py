@@ -221,6 +221,17 @@ def test_a_person_who_leaves_and_returns_is_found_again(plain):
 # --- parts ------------------------------------------------------------------------------------
 
 
+def test_after_a_cut_to_other_light_and_another_distance_the_person_is_found_again(plain):
+    """For a while it is taken for another one, who stands in front."""
+    near = scene((plain, 0))
+    shrink = np.array([[0.6, 0.0, 0.2 * SIZE[0]], [0.0, 0.6, 0.2 * SIZE[1]]])
+    far = cv2.warpAffine(near, shrink, SIZE, borderMode=cv2.BORDER_REPLICATE)
+    tracker = BlazePoseTracker()
+    assert all(tracker(near) is not None for _ in range(6))
+    dark = (0.35 * far).astype(np.uint8)
+    assert [tracker(dark) is not None for _ in range(24)][-1]
+
+
 def test_anchors_are_the_middles_of_their_cells():
     places = anchors(224)
     assert places.shape == (2254, 2)
