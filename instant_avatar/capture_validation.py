@@ -38,7 +38,6 @@ from preprocess.capture_inputs import CaptureInputs
 from preprocess.capture_session import Capture
 from preprocess.masks.mask_files import Masks
 from preprocess.masks.mask_sources import StoredMasks
-from preprocess.observation import associate_cameras
 from preprocess.open_capture import ImportedCapture, align_capture
 from preprocess.poses.plausibility import implausibility_reason
 
@@ -246,14 +245,9 @@ def mask_files(capture: Capture) -> Masks | None:
 
 def _sample_masks(capture: Capture, count: int = SAMPLED_FRAMES) -> SilhouetteObjective:
     masks = capture.masks
-    return sample_masks(
-        capture.source,
-        masks.in_order_at_worst() if isinstance(masks, StoredMasks) else masks,
-        associate_cameras(capture.cameras, capture.source),
-        SkinPoints.of(capture.shaped),
-        count=count,
-        excluded_frames=capture.cameras.frames_without_camera,
-    )
+    masks = masks.in_order_at_worst() if isinstance(masks, StoredMasks) else masks
+    skin = SkinPoints.of(capture.shaped)
+    return sample_masks(capture.source, masks, capture.cameras, skin, count=count)
 
 
 def _stored_geometry(capture: Capture) -> CaptureGeometry:

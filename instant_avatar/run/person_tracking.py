@@ -15,7 +15,6 @@ from capture.input_error import InputError
 from capture.source import FrameSource
 from capture.source_opening import open_source, reopen
 from instant_avatar.cli.console import Console
-from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.silhouette_objective import sample_masks
 from preprocess.body.body_pose import Motion
 from preprocess.body.body_surface import SkinPoints
@@ -28,7 +27,6 @@ from preprocess.fitting.capture_fitting import fit_capture, fitted_motion
 from preprocess.masks.mask_files import open_masks
 from preprocess.masks.mask_refinement import MaskRefiner
 from preprocess.masks.mask_sources import associate_masks
-from preprocess.observation import associate_cameras
 from preprocess.open_capture import ImportedCapture, align_capture, import_capture
 from preprocess.plugins import DEFAULT_TRACKER, PersonTracker, make_tracker, segmenter_name
 from preprocess.poses.pose_file import as_stored, read_motion, write_motion
@@ -106,7 +104,9 @@ def track_person(
         for warning in source.warnings:
             console.warning(warning)
         if tracked.interrupted:  # the frames after it have no masks
-            inputs = replace(inputs, frames=_frames_up_to(source, max(tracked.frame_times_s)))
+            chosen = source.selection
+            until = slice(chosen.start, max(tracked.frame_times_s) + 1, chosen.step)
+            inputs = replace(inputs, frames=until)
             source = reopen(source, inputs.frames)
         with console.status("fitting body and poses to key points and masks"):
             there = tracked_inputs(replace(inputs, height_m=None), poses, part)
@@ -166,11 +166,6 @@ def _check_parts(source: FrameSource, inputs: CaptureInputs, masks: Path | None)
     assume_camera(inputs.video, inputs.cameras, source)
     if masks is not None:
         associate_masks(open_masks(masks, invert=False), source)
-
-
-def _frames_up_to(source: FrameSource, last: int) -> slice:
-    """The wanted frames up to one of them."""
-    return slice(source.selection.start, last + 1, source.selection.step)
 
 
 def masks_to_use(inputs: CaptureInputs, written: Path) -> Path | None:
@@ -309,15 +304,9 @@ def _grade(capture: Capture, frame_times_s: Mapping[int, float]) -> TrackingGrad
     """Grade tracked poses; `frame_times_s` are the times of frames looked at, by their numbers."""
     source, keypoints = capture.source, capture.motion.keypoints
     assert keypoints is not None
-    sampled = sample_masks(
-        source,
-        capture.masks,
-        associate_cameras(capture.cameras, source),
-        SkinPoints.of(capture.shaped),
-        count=GRADED_FRAMES,
-        excluded_frames=capture.cameras.frames_without_camera,
-    )
-    scores = sampled.frame_scores(CaptureGeometry.of(capture.motion, capture.cameras, source))
+    skin = SkinPoints.of(capture.shaped)
+    sampled = sample_masks(source, capture.masks, capture.cameras, skin, count=GRADED_FRAMES)
+    scores = sampled.frame_scores(capture.geometry())
     return grade_tracking(
         capture.motion,
         keypoints,

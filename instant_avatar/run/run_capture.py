@@ -91,14 +91,11 @@ def _open_stream(
     arguments: IngestArguments, inputs: CaptureInputs, run: RunFolder, *, resumes: bool
 ) -> ObservationSource:
     tracker = make_tracker(inputs.tracker or DEFAULT_TRACKER, person_number(inputs.person))
+    person = run.body_file if resumes and run.body_file.is_file() else None
     return open_tracked_stream(
-        inputs,
-        tracker,
-        MaskRefiner,
-        run.tracked_poses,
-        longer_side_px=arguments.longer_side_px,
-        avatar_body=run.body_file if resumes and run.body_file.is_file() else None,
-    )
+        inputs, tracker, MaskRefiner, run.tracked_poses,
+        longer_side_px=arguments.longer_side_px, avatar_body=person,
+    )  # fmt: skip
 
 
 def _describe(capture: Capture, console: Console) -> None:

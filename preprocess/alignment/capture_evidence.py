@@ -171,10 +171,8 @@ class CaptureEvidence(NamedTuple):
             if self.masks is None:
                 images = sample_video(geometry, skin, self.cameras, self.source)
                 return estimate_silhouettes(geometry, skin, images)
-            camera_row = associate_cameras(self.cameras, self.source)
             return sample_masks(
-                self.source, self.masks, camera_row, skin, count=count, person_px=person_px,
-                excluded_frames=self.cameras.frames_without_camera,
-            )  # fmt: skip
+                self.source, self.masks, self.cameras, skin, count=count, person_px=person_px
+            )
         except InputError:
             return None

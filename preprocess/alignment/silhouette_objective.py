@@ -1,6 +1,6 @@
 """The silhouette objective: IoU of posed bodies with the small masks of a few frames."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -17,7 +17,9 @@ from preprocess.body.body_surface import (
     soft_iou,
     splat_silhouette,
 )
+from preprocess.cameras.camera_file import CameraTrack
 from preprocess.masks.mask_sources import MaskSource
+from preprocess.observation import associate_cameras
 
 GOOD_IOU = 0.7
 """Mean IoU of body and masks from which a capture is good."""
@@ -178,28 +180,27 @@ def spaced_indices(total: int, count: int) -> list[int]:
 def sample_masks(
     source: FrameSource,
     masks: MaskSource,
-    camera_row: Callable[[int], int],
+    cameras: CameraTrack,
     skin: SkinPoints,
     *,
     count: int = SAMPLED_FRAMES,
     person_px: int = SILHOUETTE_PERSON_PX,
-    excluded_frames: frozenset[int] = frozenset(),
 ) -> SilhouetteObjective:
-    """Read a few masks; images are decoded only where their alpha channel is the mask.
+    """Read a few given masks; images are decoded only where their alpha channel is the mask.
 
-    Args:
-        masks: Given masks.
-        camera_row: From a frame number to its camera.
-        person_px: Height of the person in the reduced masks, px.
+    `person_px` is the height of the person in the reduced masks.
 
     Raises:
-        InputError: If no mask shows a person.
+        InputError: If no mask shows a person, or masks or cameras do not belong to the frames.
     """
     start, step = source.selection.start, source.selection.step
     usable = [start + step * n for n in range(source.frame_count or 1)]
-    usable = [frame for frame in usable if frame not in excluded_frames] or usable
+    usable = [frame for frame in usable if frame not in cameras.frames_without_camera] or usable
     frames = [usable[n] for n in spaced_indices(len(usable), count)]
-    size_px = _scaled_size(source.size_px, COARSE_MASK_PX)
+    size_px, camera_row = (
+        _scaled_size(source.size_px, COARSE_MASK_PX),
+        associate_cameras(cameras, source),
+    )
     masks.check()
     found, refused = _read_masks(masks, frames, size_px)
     found = [(index, alpha) for index, alpha in found if (alpha > 0.5).any()]
