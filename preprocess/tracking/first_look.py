@@ -111,7 +111,9 @@ class FirstLook:
                 "that --person names; frames in which they are near each other may be lost."
             )
         for border, count in self.cut.items():
-            yield f"{border.value} in {count} {of}; what is outside will be a guess.".capitalize()
+            what = f"{border.value} in {count} {of}".capitalize()
+            most = "If so in most of the video, it is refused: film again, or choose --frames."
+            yield f"{what}. {most if 2 * count > self.found else 'What is outside is a guess.'}"
         if self.level < DARK_LEVEL:
             yield (
                 f"The film is dark: its lightest parts reach {self.level:.0f} of 255. It is "
