@@ -17,7 +17,7 @@ COMMANDS = {
 }  # fmt: skip
 
 OTHERS = (
-    "poses.npz", "cameras.npz", "report.json", "report.html", "avatar.iavatar", "avatar.webm",
+    "poses.npz", "cameras.npz", "report.json", "report.html", "avatar.iavatar", "avatar.mp4",
     "checkpoint/state.pt", "checkpoint/step_100.ckpt", "video.mp4", "masks/0000.png",
     "images/0000.png", "cameras/01/intri.yml", "0000.png", "dance.npz", "truth/poses.npz",
     "mesh.glb", "clip.webm", "letter.txt", "runs/a.png", ".avatar.iavatar.swp", "grade.json",
