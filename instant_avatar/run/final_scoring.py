@@ -132,10 +132,11 @@ class TrainingResult:
         return self.trainer.steps > 0 and self.frames_added > 0
 
     def all_round_verdict(self) -> AllRoundVerdict:
-        """The verdict on the avatar from all sides, by what is known of it so far."""
+        """The verdict on the avatar from all sides; there is none until those were looked at."""
         scores, exported = self.scores, self.exported
+        held_out = better_verdict(overall_verdict(scores.given), overall_verdict(scores.fitted))
         return AllRoundVerdict.of(
-            better_verdict(overall_verdict(scores.given), overall_verdict(scores.fitted)),
+            None if scores.half_transparent is None else held_out,
             seen=self.coverage.seen_share,
             mean_cosine=self.coverage.mean_cosine,
             half_transparent=scores.half_transparent,
@@ -176,6 +177,11 @@ def score_finally(
     while not is_left_out() and (one := next(given, None)) is not None:
         scored.append(one)
         report_progress(f"scoring {len(held_out)} held-out frames", len(scored) / len(held_out))
+    half_transparent = None
+    if not is_left_out():
+        half_transparent = half_transparent_share(
+            render_unfilmed_views(trainer.avatar, reduction=UNFILMED_REDUCTION)
+        )
     if fit_poses:
         with suppress(KeyboardInterrupt):
             for score in _score_in_fitted_poses(
@@ -189,11 +195,7 @@ def score_finally(
         sampled=tuple(scored[i].sampled for i in order),
         fitted=tuple(sorted(fitted, key=lambda score: score.frame)),
         renderings={one.given.frame: one.rendering for one in shown if one.rendering is not None},
-        half_transparent=None
-        if is_left_out()
-        else half_transparent_share(
-            render_unfilmed_views(trainer.avatar, reduction=UNFILMED_REDUCTION)
-        ),
+        half_transparent=half_transparent,
     )
 
 
@@ -235,7 +237,7 @@ def _score_in_fitted_poses(
         report_progress("fitting poses to the held-out frames", min(done, 1.0))
 
     for first in range(0, len(scored), FRAMES_PER_FIT):
-        if first and time.perf_counter() > until:
+        if is_left_out() or (first and time.perf_counter() > until):
             return
         some = scored[first : first + FRAMES_PER_FIT]
         fitted = fit_test_poses(trainer, [one.frame for one in some], progress=check)

@@ -50,7 +50,8 @@ def held_out() -> list[HeldOutFrame]:
 def score(held_out, monkeypatch):
     """Scores black renderings, in no time or after all time is spent."""
 
-    def scored(*, steps: int | None, limit_s: float, fit_poses: bool = False):
+    def scored(*, steps: int | None, limit_s: float, fit_poses=False, left_out_after=COUNT):
+        done = []
         black = np.zeros((24, 16, 4), dtype=np.float32)
         black[..., 3] = held_out[0].observation.alpha
         worse = replace(score_rendering(black, held_out[0]), psnr=0.0)
@@ -64,7 +65,11 @@ def score(held_out, monkeypatch):
         monkeypatch.setattr(final_scoring, "SCORING_LIMIT_S", limit_s)
         trainer = Trainer.__new__(Trainer)
         trainer.config, trainer.avatar = TrainConfig(steps=steps), Avatar.__new__(Avatar)
-        return score_finally(trainer, held_out, fit_poses=fit_poses)
+        return score_finally(
+            trainer, held_out, fit_poses=fit_poses,
+            report_progress=lambda *_: done.append(1),
+            is_left_out=lambda: left_out_after < COUNT and len(done) >= left_out_after,
+        )  # fmt: skip
 
     return scored
 
@@ -99,6 +104,13 @@ def test_without_time_poses_are_fitted_to_some_frames_that_are_spread_over_the_v
     assert len(frames) == FRAMES_PER_FIT
     assert frames == sorted(frames)
     assert np.diff(frames).max() <= 10 * (COUNT // 4)
+
+
+def test_what_is_left_out_ends_at_once_and_keeps_what_was_scored(score):
+    scores = score(steps=10, limit_s=1e9, fit_poses=True, left_out_after=3)
+    assert len(scores.given) == 3
+    assert scores.fitted == ()
+    assert scores.half_transparent is None
 
 
 def test_a_frame_that_scores_lower_in_its_fitted_pose_keeps_the_given_one(score):
