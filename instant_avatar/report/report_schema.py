@@ -237,16 +237,15 @@ class Report:
     frames: FrameStats
     training: TrainingStats
     held_out: HeldOutStats
+    held_out_refined: HeldOutStats | None = None
+    all_round: AllRoundVerdict
     curve: tuple[CurvePoint, ...]
     stream: StreamStats
     package: PackageStats | None
-    all_round: AllRoundVerdict
-    held_out_refined: HeldOutStats | None = None
     coverage: CoverageStats | None = None
     earlier_videos: ForgettingStats | None = None
     cameras: dict[str, Any] | None = None
     tracking: dict[str, Any] | None = None
-    format: int = REPORT_FORMAT
 
     @property
     def verdict(self) -> SharpnessVerdict | None:
@@ -255,11 +254,8 @@ class Report:
 
     def to_json(self) -> str:
         """Return the text of report.json; NaN and infinity become null."""
-        content = to_json_value(dataclasses.asdict(self) | {"verdict": self.verdict})
-        order = ("format", "verdict", "command", "recipe", "machine", "frames", "training")
-        order += ("held_out", "held_out_refined", "all_round", "curve", "stream", "package")
-        order += ("coverage", "earlier_videos", "cameras", "tracking")
-        return json.dumps({key: content[key] for key in order}, indent=1, allow_nan=False) + "\n"
+        content = {"format": REPORT_FORMAT, "verdict": self.verdict} | dataclasses.asdict(self)
+        return json.dumps(to_json_value(content), indent=1, allow_nan=False) + "\n"
 
 
 def provisional_verdict(verdict: str | None) -> str | None:
