@@ -127,7 +127,7 @@ def fit_capture(capture: Capture, *, fit_body: bool = True) -> CaptureFit | None
     share = 1.0 if tracked else share_beyond_noise(fitter.corrections, after * pixel_cm)
     keypoint_share = 0.0
     if not tracked and share:
-        keypoint_share = _take_keypoints(capture, fitter)
+        keypoint_share = _take_keypoints(capture, fitter, share)
     corrections = fitter.corrections
     return CaptureFit(
         coefficients=share * fitter.coefficients,
@@ -141,17 +141,17 @@ def fit_capture(capture: Capture, *, fit_body: bool = True) -> CaptureFit | None
     )
 
 
-def _take_keypoints(capture: Capture, fitter: ClipFitter) -> float:
+def _take_keypoints(capture: Capture, fitter: ClipFitter, share: float) -> float:
     """Fit poses once more, near given ones and those by key points; return the latter's weight."""
-    evidence = weigh_keypoint_poses(capture, fitter)
+    evidence = weigh_keypoint_poses(capture, fitter, share)
     if evidence is None:
         return 0.0
-    turns, share = fitter.camera_rotations, evidence.share
-    fitter.expect(blend_poses(fitter.given, evidence.poses, share, turns))
-    fitter.poses = blend_poses(fitter.poses, evidence.poses, share, turns)
+    turns, weight = fitter.camera_rotations, evidence.weight
+    fitter.expect(blend_poses(fitter.given, evidence.poses, weight, turns))
+    fitter.poses = blend_poses(fitter.poses, evidence.poses, weight, turns)
     for _ in range(BLENDED_ITERATIONS):
         fitter.iterate(FitParameters(proportions=False, focal=False))
-    return share
+    return weight
 
 
 def share_beyond_noise(corrections: Float[np.ndarray, "frames 75"], error_cm: float) -> float:

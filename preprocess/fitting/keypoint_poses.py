@@ -47,35 +47,41 @@ class KeypointEvidence(NamedTuple):
 
     Attributes:
         poses: Pose of each frame of the fit.
-        share: Weight against the fitted given poses, in [0, 1].
+        weight: Weight against the fitted given poses, in [0, 1].
     """
 
     poses: ClipPoses
-    share: float
+    weight: float
 
 
-def weigh_keypoint_poses(capture: Capture, fitter: ClipFitter) -> KeypointEvidence | None:
+def weigh_keypoint_poses(
+    capture: Capture, fitter: ClipFitter, share: float
+) -> KeypointEvidence | None:
     """Estimate poses by key points, and their weight beside given poses that were fitted.
 
     Args:
         fitter: A fit of the capture's given poses to outlines; it is not changed.
+        share: Share of its changes that is no noise, in [0, 1].
 
-    Returns None if the person is not found.
+    Returns None if the person is not found, or key points would count by less than a twentieth.
     """
-    error = ERROR_PER_TURN * _mean_turn(fitter.corrections)
-    expected = error**2 / (error**2 + LEAST_ERROR_RAD**2)
-    track = _find_keypoints(capture, fitter, _spread_frames(fitter.frames, expected))
+    error2 = share * (ERROR_PER_TURN * _mean_turn(fitter.corrections)) ** 2
+    expected = error2 / (error2 + LEAST_ERROR_RAD**2)
+    count = round(expected * MOST_FRAMES)
+    if count < MIN_TRACKED_FRAMES:
+        return None
+    track = _find_keypoints(capture, fitter, _spread_frames(fitter.frames, count))
     if len(track) < MIN_TRACKED_FRAMES:
         return None
     beside = _fit_keypoints(capture, fitter, track)
     rows = np.searchsorted(_numbers(fitter.frames), _numbers(beside.frames)).tolist()
     steps = beside.poses.steps_from(_select(fitter.poses, rows), beside.camera_rotations)
-    share = error**2 / max(_mean_turn(steps) ** 2, error**2 + LEAST_ERROR_RAD**2)
+    weight = error2 / max(_mean_turn(steps) ** 2, error2 + LEAST_ERROR_RAD**2)
     everywhere = [
         np.interp(_numbers(fitter.frames), _numbers(beside.frames), each) for each in steps.T
     ]
     poses = fitter.poses.moved(np.column_stack(everywhere), fitter.camera_rotations)
-    return KeypointEvidence(poses, share)
+    return KeypointEvidence(poses, weight)
 
 
 def blend_poses(
@@ -88,9 +94,8 @@ def blend_poses(
     return one.moved(share * other.steps_from(one, camera_rotations), camera_rotations)
 
 
-def _spread_frames(frames: Sequence[ClipFrame], share: float) -> list[ClipFrame]:
-    """A share of `MOST_FRAMES`, evenly spread, those with outlines first."""
-    count = max(MIN_TRACKED_FRAMES, round(share * MOST_FRAMES))
+def _spread_frames(frames: Sequence[ClipFrame], count: int) -> list[ClipFrame]:
+    """As many frames, evenly spread, those with outlines first."""
     outlined = [frame for frame in frames if frame.mask is not None]
     others = [frame for frame in frames if frame.mask is None]
     chosen = [outlined[n] for n in spaced_indices(len(outlined), count)] if outlined else []
