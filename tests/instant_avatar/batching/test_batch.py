@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from instant_avatar import batch
+from instant_avatar.cli import command_line
 
 ROOT = Path(batch.__file__).parents[1]
 HOOK = """
@@ -71,7 +72,7 @@ def test_what_cannot_be_done_is_refused_before_anything_starts(
 
 
 def test_without_ray_it_says_what_to_install(monkeypatch, capsys):
-    monkeypatch.setattr(batch, "find_spec", lambda module: None if module == "ray" else True)
+    monkeypatch.setattr(command_line, "find_spec", lambda module: None if module == "ray" else True)
     assert batch.main(["films", "--out", "o"]) == 2
     assert "[learn,cluster]" in capsys.readouterr().err
 
