@@ -90,6 +90,7 @@ def call_elsewhere(*commands: list[object], folder: Path) -> tuple[list[str], st
     return ended, done.stderr
 
 
+@pytest.mark.slow
 def test_a_folder_with_spaces_and_umlauts_is_tracked_learnt_and_played(film, tmp_path):
     place = tmp_path / "Maßband & Größe, 'März'"
     place.mkdir()

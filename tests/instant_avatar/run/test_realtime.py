@@ -55,6 +55,7 @@ def waits(monkeypatch):
     return found
 
 
+@pytest.mark.slow
 def test_what_a_resumed_run_saw_before_is_not_played_again(play, film, request):
     before = play(film, "--frames", ":12", "--seconds", "0.5")
     waits = request.getfixturevalue("waits")

@@ -117,6 +117,7 @@ def walk_past_the_plant_and_back():
     return pictures
 
 
+@pytest.mark.slow
 def test_a_person_who_passes_in_front_is_named_and_in_no_mask_that_is_learnt_from(
     track_film, tmp_path
 ):

@@ -156,6 +156,7 @@ def error_deg(motion, truth) -> float:
     return float(np.degrees(np.linalg.norm(vectors, axis=-1)).mean())
 
 
+@pytest.mark.slow
 def test_key_points_bring_coarse_poses_nearer_to_the_truth(coarse, monkeypatch):
     capture, truth = coarse
     with_keypoints = fit_capture(capture)
