@@ -96,7 +96,7 @@ class ImportedCapture:
         return AlphaChannelMasks(self.source, refine) if self.segmenter is None else None
 
     def transposed(self) -> "ImportedCapture":
-        """The same with the video's width and height exchanged, as if it had been rotated."""
+        """Exchange the video's width and height, as if it had been rotated."""
         return replace(self, source=TransposedSource(self.source))
 
 

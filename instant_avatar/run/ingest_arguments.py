@@ -82,8 +82,8 @@ class IngestArguments(CaptureArguments):
     duration)."""
     steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Number of training steps instead of --seconds, so that the result does not depend on the
-    speed of the machine. Two cores make about 50 per second. Every frame takes at least one
-    step."""
+    speed of the machine, but for rounding. Two cores make about 50 per second. Every frame takes
+    at least one step."""
     realtime: Flag = False
     """Simulate a live camera: deliver frames at their timestamps. The avatar is ready when the
     video ends; extra --seconds continue training after the last frame."""

@@ -28,8 +28,8 @@ from preprocess.observation import associate_cameras
 from preprocess.tracking.keypoints import MIN_PRESENCE, KeypointTrack, PersonKeypoints
 
 MOST_FRAMES = 80
-"""Frames in which key points are found where given poses are not believed at all; 30 core-ms each.
-Of poses that are believed in part they are as many fewer as their weight will be smaller."""
+"""Frames in which key points would be found if they alone counted, 30 core-ms each. The number is
+this times the weight that they are expected to get."""
 MIN_TRACKED_FRAMES = 4
 """Fewest frames with key points that tell poses."""
 ITERATIONS = (4, 3)
@@ -38,8 +38,8 @@ ERROR_PER_TURN = 1.2
 """Error that outlines leave in given poses, per rotation by which they turned them: 0.9 to 1.3 in
 films of studio motions, 1.7 to 2.3 in real ones."""
 LEAST_ERROR_RAD = math.radians(5.0)
-"""Error of poses by key points that is expected: 3.5 degrees in films of studio motions, 8 to 14 in
-real ones."""
+"""Least error of poses by key points that is assumed: it is 3.5 degrees in films of studio motions,
+10 to 14 in real ones."""
 
 
 class KeypointEvidence(NamedTuple):
@@ -95,7 +95,7 @@ def blend_poses(
 
 
 def _spread_frames(frames: Sequence[ClipFrame], count: int) -> list[ClipFrame]:
-    """As many frames, evenly spread, those with outlines first."""
+    """Choose `count` frames, evenly spread, those with outlines first."""
     outlined = [frame for frame in frames if frame.mask is not None]
     others = [frame for frame in frames if frame.mask is None]
     chosen = [outlined[n] for n in spaced_indices(len(outlined), count)] if outlined else []

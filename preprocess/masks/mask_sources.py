@@ -139,7 +139,7 @@ class StoredMasks(GivenMasks):
         return self.files.alpha(row, size_px)
 
     def in_order_at_worst(self) -> "StoredMasks":
-        """The same; if there are more or fewer than frames, they are taken in order."""
+        """These masks, taken in order if there are more or fewer of them than frames."""
         masks = StoredMasks(self.files, self._source, self._refine)
         try:
             masks.check()

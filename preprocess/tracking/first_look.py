@@ -38,7 +38,7 @@ PERSON_MARGIN = 0.1
 STILL_SHARE = 0.01
 """Most that the background shifts from place to place before a camera that stands, longer sides."""
 HELD_SHARE = 0.08
-"""The same of a camera that is held by someone who stands."""
+"""Most that the background shifts if the camera is held by someone who stands, longer sides."""
 MIN_PARALLAX_SHARE = 0.02
 """Least shift between two frames that tells turning from walking, longer sides."""
 TURNING_SHARE, WALKING_SHARE = 0.9, 0.75
