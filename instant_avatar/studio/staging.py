@@ -65,12 +65,17 @@ def _turning_gesture(
     )
 
 
-def gesturing_motion(actor: Actor, *, frames: int, fps: float, turns: float, seed: int) -> Motion:
-    """Gesture on the spot for a moving camera: arms, knees, a slow turn, small shifts."""
+def gesturing_motion(
+    actor: Actor, *, frames: int, fps: float, turns: float, seed: int, crossing_m: float = 0.0
+) -> Motion:
+    """Gesture for a moving camera: arms, knees, a slow turn, shifts, `crossing_m` sideways."""
     phases = np.random.default_rng([seed, 8]).uniform(0.0, 2.0 * np.pi, 12)
-    return _motion_from_gestures(
-        actor, [_waving_gesture(i / frames, turns, phases) for i in range(frames)], fps
-    )
+    gestures = []
+    for share in np.arange(frames) / frames:
+        gesture = _waving_gesture(share, turns, phases)
+        aside = -0.5 * crossing_m * np.cos(np.pi * share)
+        gestures.append(replace(gesture, shift=(gesture.shift[0] + aside, gesture.shift[1])))
+    return _motion_from_gestures(actor, gestures, fps)
 
 
 def _waving_gesture(share: float, turns: float, phases: Float[np.ndarray, "12"]) -> Gesture:
@@ -295,9 +300,14 @@ SHAKE_FRAMES = 2.5
 
 
 def handheld_cameras(
-    actor_xz_m: Float[np.ndarray, "frames 2"], height_m: float, size: int, seed: int
+    actor_xz_m: Float[np.ndarray, "frames 2"],
+    height_m: float,
+    size: int,
+    seed: int,
+    *,
+    arc_deg: float = ARC_DEG,
 ) -> tuple[Camera, ...]:
-    """Return one camera a frame, on an arc of `ARC_DEG` around the actor, the actor in the image.
+    """Return one camera a frame, on an arc around the actor, the actor in the image.
 
     `size` is the images' width in pixels; the height is 9/16 of it.
     """
@@ -306,13 +316,14 @@ def handheld_cameras(
     shake = _smooth_gaussian_noise(generator, frames, 6, SHAKE_FRAMES)
     slow = _smooth_gaussian_noise(generator, frames, 3, max(frames / 6.0, 1.0))
     share = np.linspace(0.0, 1.0, frames) + 0.02 * np.sin(2.0 * np.pi * np.linspace(0, 1, frames))
-    angles = np.deg2rad(ARC_DEG) * (share - 0.5)
+    angles = np.deg2rad(arc_deg) * (share - 0.5)
     steps = np.arange(frames) * (2.0 * np.pi / 16.0)  # a step lifts the hand, twice a second
-    away = WALK_DISTANCE_HEIGHTS * height_m + 0.05 * np.tanh(slow[:, 0])
+    walks = float(arc_deg > 0.0)
+    away = WALK_DISTANCE_HEIGHTS * height_m + walks * 0.05 * np.tanh(slow[:, 0])
     eyes = np.column_stack(
         [away * np.sin(angles), np.full(frames, HANDHELD_HEIGHT_M), away * np.cos(angles)]
     )
-    eyes[:, 1] += 0.03 * np.tanh(slow[:, 1]) + 0.012 * np.sin(steps)
+    eyes[:, 1] += walks * (0.03 * np.tanh(slow[:, 1]) + 0.012 * np.sin(steps))
     eyes += SHAKE_M * shake[:, :3]
     turned = np.deg2rad(SHAKE_DEG) * shake[:, 3:]
     turned[:, 2] += np.deg2rad(1.5) * np.tanh(slow[:, 2])
