@@ -171,10 +171,8 @@ def _parse_tiers(content: dict[str, Any]) -> dict[str, TierInfo]:
 
 
 def _parse_tier(note: dict[str, Any]) -> TierInfo:
-    layout = _parse_record(TableLayout, note["layout"])
-    layout.check()
     return TierInfo(
-        layout=layout,
+        layout=_parse_record(TableLayout, note["layout"]),
         settings=_parse_record(RenderSettings, note["settings"]),
         psnr_to_renderer=float(note["psnr_to_renderer"]),
         largest_difference=float(note["largest_difference"]),

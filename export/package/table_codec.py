@@ -6,24 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int32, Shaped, UInt8, UInt16
 
-from capture.input_error import InputError
 from export.package.player_tables import (
     BRICK_NODES,
     BRICK_SIZE,
-    SURFEL_BITS,
     WEIGHT_SCALE,
     BrickTable,
     PlayerTables,
     SkinningGrid,
     SurfelTable,
 )
-
-MAX_BRICKS = 1 << 16
-"""Largest number of bricks that is read; a person of 2 m at 4 mm has 5,000."""
-MAX_BLOCKS = 1 << 20
-"""Largest number of cells of a grid's index that is read."""
-MAX_SKIN_NODES = 1 << 17
-"""Largest number of stored skinning nodes that is read; a person of 2 m has 15,000."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -75,23 +66,6 @@ class TableLayout:
             reach_m=tables.reach_m,
         )
 
-    def check(self) -> None:
-        """Refuse tables larger than the player can use, before anything is allocated."""
-        sound = (
-            0 < self.surfels < 1 << SURFEL_BITS
-            and 0 <= self.bricks <= MAX_BRICKS
-            and 0 < self.skin_nodes <= MAX_SKIN_NODES
-            and _within_block_limit(self.brick_counts)
-            and _within_block_limit(self.skin_counts)
-        )
-        if not sound:
-            raise InputError(
-                f"The package claims {self.surfels} surfels, {self.bricks} bricks on "
-                f"{self.brick_counts} blocks and {self.skin_nodes} nodes of "
-                f"{self.skin_counts}; at most {1 << SURFEL_BITS}, {MAX_BRICKS}, {MAX_BLOCKS}, "
-                f"{MAX_SKIN_NODES} and {MAX_BLOCKS} are possible. The file is damaged."
-            )
-
     def stream_types(self) -> dict[str, tuple[str, tuple[int, ...]]]:
         """Return element type and shape of every stream."""
         x, y, z = self.brick_counts
@@ -105,11 +79,6 @@ class TableLayout:
             "skin_nodes": ("u1", ((i * j * k + 7) // 8,)),
             "skin_weights": ("<u2", (24, self.skin_nodes)),
         }
-
-
-def _within_block_limit(counts: tuple[int, int, int]) -> bool:
-    x, y, z = counts
-    return min(counts) > 0 and max(counts) <= MAX_BLOCKS and x * y * z <= MAX_BLOCKS
 
 
 def _triple(vector: Shaped[np.ndarray, "3"]) -> tuple[float, float, float]:
@@ -145,7 +114,7 @@ def estimate_brick_bytes(bricks: BrickTable) -> float:
 
 
 def decode_tables(streams: dict[str, bytes], layout: TableLayout) -> PlayerTables:
-    """Decode the streams of `encode_tables`, whose sizes are already checked."""
+    """Decode the streams of `encode_tables`; `ValueError` if they are of other sizes."""
     arrays = {
         name: np.frombuffer(streams[name], dtype=dtype).reshape(shape)
         for name, (dtype, shape) in layout.stream_types().items()
@@ -239,8 +208,5 @@ def _number_set_bits(
     """Number the set bits from 1 in C order; 0 for the others."""
     used = np.unpackbits(bits)[: int(np.prod(counts))].astype(np.int32)
     if used.sum() != expected:
-        raise InputError(
-            f"The package marks {used.sum()} places of a grid {counts} as used but holds "
-            f"{expected}. The file is damaged."
-        )
+        raise ValueError(f"{used.sum()} places of a grid {counts} are marked, {expected} stored")
     return (np.cumsum(used, dtype=np.int32) * used).reshape(counts)

@@ -105,23 +105,11 @@ def test_a_missing_file_and_a_missing_entry_are_named(exported, tmp_path):
         read_package(path)
 
 
-@pytest.mark.parametrize("name", ["../evil", "/evil", "a/../../evil", "..\\evil", "C:evil"])
-def test_paths_out_of_the_archive_are_refused(exported, tmp_path, name):
-    path = tmp_path / "x.iavatar"
-    path.write_bytes(exported.path.read_bytes())
-    with zipfile.ZipFile(path, "a") as archive:
-        archive.writestr(name, b"evil")
-    with pytest.raises(InputError, match="outside"):
-        read_package(path)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["x.iavatar"]
-
-
 def test_an_entry_that_unpacks_to_too_much_is_refused_unread(exported, tmp_path):
-    def change(name, content):
-        return bytes(200 << 20) if name == "hq/thickness.bin" else content
-
-    path = rewritten(exported.path, tmp_path / "bomb.iavatar", change)
-    with pytest.raises(InputError, match=r"thickness\.bin claims 209715200 bytes"):
+    path = tmp_path / "bomb.iavatar"
+    path.write_bytes(exported.path.read_bytes())
+    with_directory_field(path, "preview.png", 24, (1 << 30).to_bytes(4, "little"))
+    with pytest.raises(InputError, match="unpacks to 10"):
         read_package(path)
 
 
@@ -135,12 +123,12 @@ def test_an_entry_that_unpacks_to_too_much_is_refused_unread(exported, tmp_path)
         {"skin_counts": [10**6, 10**6, 1]},
     ],
 )
-def test_sizes_that_cannot_be_are_refused_before_anything_is_allocated(exported, tmp_path, change):
+def test_sizes_that_are_not_those_of_the_entries_are_refused(exported, tmp_path, change):
     with zipfile.ZipFile(exported.path) as archive:
         tiers = json.loads(archive.read("manifest.json"))["tiers"]
     tiers["hq"]["layout"] |= change
     path = rewritten(exported.path, tmp_path / "x.iavatar", with_manifest(tiers=tiers))
-    with pytest.raises(InputError, match="claims"):
+    with pytest.raises(InputError, match="is damaged"):
         read_package(path)
 
 
@@ -243,42 +231,21 @@ def test_a_stranger_with_numpy_reads_a_package_by_its_documentation(exported):
     np.testing.assert_allclose(places, tables.surfels.positions, atol=1e-5)
 
 
-def with_flag(path, name, offset, value):
-    """Writes two bytes of an entry's line in the zip's list of entries."""
-    content = bytearray(path.read_bytes())
-    place = content.rfind(name.encode()) - 46
-    assert content[place : place + 4] == b"PK\1\2"
-    content[place + offset : place + offset + 2] = value.to_bytes(2, "little")
-    path.write_bytes(content)
+def with_directory_field(path, name, offset, content):
+    """Writes bytes into an entry's line in the zip's list of entries."""
+    package = bytearray(path.read_bytes())
+    place = package.rfind(name.encode()) - 46
+    assert package[place : place + 4] == b"PK\1\2"
+    package[place + offset : place + offset + len(content)] = content
+    path.write_bytes(package)
 
 
-@pytest.mark.parametrize(("offset", "value"), [(8, 1), (10, zipfile.ZIP_LZMA), (10, 99)])
+@pytest.mark.parametrize(("offset", "value"), [(8, 1), (10, 99)])
 def test_encrypted_and_strangely_compressed_entries_are_refused(exported, tmp_path, offset, value):
     path = tmp_path / "x.iavatar"
     path.write_bytes(exported.path.read_bytes())
-    with_flag(path, "preview.png", offset, value)
-    with pytest.raises(InputError, match="encrypted or compressed in a way"):
-        read_package(path)
-
-
-def test_a_list_of_a_million_entries_is_refused_before_it_is_read(tmp_path, monkeypatch):
-    line = b"PK\1\2" + bytes(24) + (1).to_bytes(2, "little") + bytes(16) + b"a"
-    directory = line * (1 << 20)
-    end = b"PK\5\6" + bytes(4) + b"\xff\xff" * 2 + len(directory).to_bytes(4, "little") + bytes(6)
-    path = tmp_path / "x.iavatar"
-    path.write_bytes(directory + end)
-    built = []
-    monkeypatch.setattr(zipfile, "ZipInfo", lambda *a: built.append(a))
-    with pytest.raises(InputError, match="longer than any package's"):
-        read_package(path)
-    assert not built
-
-
-def test_a_file_that_is_far_too_large_is_not_opened_as_a_zip(tmp_path):
-    path = tmp_path / "x.iavatar"
-    with path.open("wb") as file:
-        file.truncate(1 << 40)  # a hole: it takes no room
-    with pytest.raises(InputError, match="no package has"):
+    with_directory_field(path, "preview.png", offset, bytes([value, 0]))
+    with pytest.raises(InputError, match="truncated or altered"):
         read_package(path)
 
 

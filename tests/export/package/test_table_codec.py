@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from capture.input_error import InputError
 from export.bake.bake_tables import encode_weights
 from export.package.player_tables import (
     LOG_DENSITY_RANGE,
@@ -104,7 +103,7 @@ def test_places_that_do_not_match_what_is_there_are_refused(stream):
     tables = random_tables(0, 5, (2, 2, 2), 0.5)
     streams = encode_tables(tables)
     streams[stream] = bytes([255])
-    with pytest.raises(InputError, match="places"):
+    with pytest.raises(ValueError, match="places"):
         decode_tables(streams, TableLayout.of(tables))
 
 
