@@ -26,6 +26,7 @@ class SparseModel:
         size_px: Width and height of the images.
         observation_camera, observation_point: Rows of each observation's camera and point.
         pixels: Place of each observation in its image.
+        only_turns: Whether all cameras are at the origin; then the points are unit directions.
     """
 
     frames: Int[np.ndarray, "cameras"]
@@ -38,6 +39,7 @@ class SparseModel:
     observation_camera: Int[np.ndarray, "observations"]
     observation_point: Int[np.ndarray, "observations"]
     pixels: Float[np.ndarray, "observations 2"]
+    only_turns: bool = False
 
     def camera(self, camera_from_world: Float[np.ndarray, "4 4"]) -> Camera:
         """The lens as a camera with a pose."""
@@ -53,6 +55,11 @@ class SparseModel:
         """Positions of the cameras in the world."""
         turned, moved = self.camera_from_world[:, :3, :3], self.camera_from_world[:, :3, 3]
         return -np.einsum("cba,cb->ca", turned, moved)
+
+    def turn_deg(self) -> float:
+        """Largest turn from the first camera to another, degrees."""
+        turns = Rotation.from_matrix(self.camera_from_world[:, :3, :3])
+        return float(np.degrees((turns * turns[0].inv()).magnitude().max()))
 
     def reprojection_errors_px(self) -> Float[np.ndarray, "observations"]:
         """Distance of each observation from the projection of its point, pixels."""
@@ -159,6 +166,13 @@ MIN_REGISTERED_FRACTION = 0.9
 MAX_REPROJECTION_PX = 0.6
 """Largest median reprojection error, pixels."""
 
+MAX_TURNING_ERROR = 0.0015
+"""Largest mean reprojection error of a camera that only turns: a hand turns it, and takes it along
+by centimetres; a fraction of the longer side."""
+
+MIN_TURN_DEG = 5.0
+"""Smallest turn that tells a focal length."""
+
 MIN_OBSERVATION_RATIO = 0.4
 """Fewest observations of a camera, as a fraction of the median camera's: with fewer it may rest on
 a few wrong matches."""
@@ -191,7 +205,7 @@ def evaluate_gates(model: SparseModel, keys: int) -> list[QualityGate]:
     registered = len(model.frames) / keys
     residual = float(np.mean(model.reprojection_errors_px())) if len(model.pixels) else np.inf
     focal = model.focal_px / max(model.size_px)
-    angle = _median_angle(model)
+    largest = MAX_TURNING_ERROR * max(model.size_px) if model.only_turns else MAX_REPROJECTION_PX
     return [
         QualityGate(
             name="registered", value=registered, bound=MIN_REGISTERED_FRACTION,
@@ -205,8 +219,7 @@ def evaluate_gates(model: SparseModel, keys: int) -> list[QualityGate]:
             failure_reason=f"only {len(model.points)} points of the surroundings were found",
         ),
         QualityGate(
-            name="reprojection_px", value=residual, bound=MAX_REPROJECTION_PX,
-            passed=residual < MAX_REPROJECTION_PX,
+            name="reprojection_px", value=residual, bound=largest, passed=residual < largest,
             failure_reason=f"points are seen {residual:.2f} px beside where they should be",
         ),
         QualityGate(
@@ -214,13 +227,25 @@ def evaluate_gates(model: SparseModel, keys: int) -> list[QualityGate]:
             passed=FOCAL_RANGE[0] <= focal <= FOCAL_RANGE[1],
             failure_reason=f"the focal length came out as {focal:.2f} times the longer side",
         ),
-        QualityGate(
-            name="angle_deg", value=angle, bound=MIN_TRIANGULATION_ANGLE_DEG,
-            passed=angle >= MIN_TRIANGULATION_ANGLE_DEG,
-            failure_reason="the camera hardly changes its place (points are seen under "
-            f"{angle:.1f}°)",
-        ),
+        _turn_gate(model) if model.only_turns else _angle_gate(model),
     ]  # fmt: skip
+
+
+def _turn_gate(model: SparseModel) -> QualityGate:
+    turn = model.turn_deg()
+    return QualityGate(
+        name="turn_deg", value=turn, bound=MIN_TURN_DEG, passed=turn >= MIN_TURN_DEG,
+        failure_reason=f"the camera turns by {turn:.1f}° only, which tells no focal length",
+    )  # fmt: skip
+
+
+def _angle_gate(model: SparseModel) -> QualityGate:
+    angle = _median_angle(model)
+    return QualityGate(
+        name="angle_deg", value=angle, bound=MIN_TRIANGULATION_ANGLE_DEG,
+        passed=angle >= MIN_TRIANGULATION_ANGLE_DEG,
+        failure_reason=f"the camera hardly changes its place (points are seen under {angle:.1f}°)",
+    )  # fmt: skip
 
 
 def _rotation_jumps(model: SparseModel) -> Bool[np.ndarray, "cameras"]:

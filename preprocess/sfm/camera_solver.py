@@ -23,6 +23,7 @@ from preprocess.sfm.camera_solution import (
     INTERPOLATED,
     KEY,
     MIN_REGISTERED_FRACTION,
+    MIN_TURN_DEG,
     MISSING,
     PLACED,
     CameraSolution,
@@ -44,6 +45,7 @@ from preprocess.sfm.point_tracking import (
     detect_static_camera,
     resect_intermediate_frames,
 )
+from preprocess.sfm.turning_camera import solve_turning_camera
 
 MIN_PARALLAX_FRACTION = 0.02
 """Fraction of matched image pairs that must show parallax, not one plane or a mere rotation."""
@@ -129,14 +131,12 @@ def _solve(
         images=folder / "images", masks=folder / "masks", database=folder / "matches.db",
         focal_px=None if ratio is None else ratio * longer_px, threads=settings.threads,
     )  # fmt: skip
-    colmap_mapping.extract_features(workspace, stage("features"))
-    colmap_mapping.match_features(workspace, stage("matches"))
-    parallax = _parallax(workspace, len(keys))
-    if not parallax.passed:
-        raise _unsolved_error([parallax])
-    model, gates = _map(workspace, folder / "models", keys, settings.seed, stage("mapping"))
+    model = solve_turning_camera(keys, workspace.focal_px)
+    gates = [] if model is None else evaluate_gates(model, len(keys))
+    if model is None or not all(gate.passed for gate in gates):
+        model, gates = _solve_path(workspace, folder / "models", keys, settings.seed, stage)
     between = resect_intermediate_frames(source, model, keys, stage("frames between"))
-    gates = [parallax, *gates, _tracking_gate(between, len(model.frames))]
+    gates.append(_tracking_gate(between, len(model.frames)))
     if not gates[-1].passed:
         raise _unsolved_error([gates[-1]])
     cameras, status = _cameras_of_all_frames(source, model, between)
@@ -151,6 +151,23 @@ def _solve(
         is_static=False, background_motion=rest.background_motion, gates=tuple(gates), model=model,
         camera_from_solved=cameras, frame_status=status, keyframe_count=len(keys),
     )  # fmt: skip
+
+
+def _solve_path(
+    workspace: ColmapWorkspace,
+    folder: Path,
+    keys: list[SfmKeyframe],
+    seed: int,
+    stage: Callable[[str], Callable[[float], None]],
+) -> tuple[SparseModel, list[QualityGate]]:
+    """Solve the key frames of a camera that is carried around; return the gates passed, too."""
+    colmap_mapping.extract_features(workspace, stage("features"))
+    colmap_mapping.match_features(workspace, stage("matches"))
+    parallax = _parallax(workspace, len(keys))
+    if not parallax.passed:
+        raise _unsolved_error([parallax])
+    model, gates = _map(workspace, folder, keys, seed, stage("mapping"))
+    return model, [parallax, *gates]
 
 
 def _report_stage(report_progress: Callable[[float], None], name: str, share: float) -> None:
@@ -170,8 +187,8 @@ def _parallax(workspace: ColmapWorkspace, keys: int) -> QualityGate:
     return QualityGate(
         name="pairs_with_parallax", value=share, bound=MIN_PARALLAX_FRACTION,
         passed=share >= MIN_PARALLAX_FRACTION,
-        failure_reason="the camera turns on the spot, or sees one flat wall, so that nothing shows "
-        "depth",
+        failure_reason="nothing shows depth, as before one flat wall, and the camera does not just "
+        f"turn by {MIN_TURN_DEG:.0f}° or more",
     )  # fmt: skip
 
 
@@ -200,9 +217,9 @@ def _unsolved_error(failed: list[QualityGate]) -> InputError:
     return InputError(
         "The cameras could not be solved with certainty: "
         f"{reasons or 'no two images fit together'}. Leave out --cameras solve to train without "
-        "them, each pose in its own frame's camera (of a camera that only turns, this is the only "
-        "way); give cameras (--cameras FILE, docs/formats.md); or film with the surroundings in "
-        "view (textured, not repeating, well lit), walking slowly and without sudden turns."
+        "them, each pose in its own frame's camera; give cameras (--cameras FILE, "
+        "docs/formats.md); or film with the surroundings in view (textured, not repeating, well "
+        "lit), walking slowly and without sudden turns, or turning on the spot."
     )
 
 

@@ -86,7 +86,7 @@ def apply_camera_solution(capture: Capture, solved: CameraSolution) -> Capture:
         solved, capture.motion, _tracker_camera(capture), capture.shaped, capture.source
     )
     report = solution_report(solved, placement, capture.source)
-    note = _describe_solution(report, placement)
+    note = _describe_solution(report, placement, solved)
     return capture.with_part(
         Provenance("cameras", "solved", (note,), figures=report),
         cameras=placement.cameras,
@@ -101,11 +101,17 @@ def _tracker_camera(capture: Capture) -> Camera | None:
     return camera if stated or capture.cameras.source != ASSUMED_CAMERA_SOURCE else None
 
 
-def _describe_solution(report: dict[str, Any], placement: MetricPlacement) -> str:
+def _describe_solution(
+    report: dict[str, Any], placement: MetricPlacement, solved: CameraSolution
+) -> str:
     frames, scale = report["frames"], report["scale"]
     several = f"{frames['interpolated']} interpolated, " if frames["interpolated"] else ""
+    size = f"size by {' and '.join(scale['cues'])}"
+    if solved.model is not None and solved.model.only_turns:
+        size = f"the camera only turns, by {solved.model.turn_deg():.0f}°; {size}"
+    else:
+        size = f"{size}, {placement.floor_points} points of the floor seen"
     return (
         f"Cameras: {frames['key']} key frames solved, {frames['placed']} placed between them, "
-        f"{several}{frames['missing']} missing; focal length {report['focal_px']:.0f} px; size by "
-        f"{' and '.join(scale['cues'])}, {placement.floor_points} points of the floor seen."
+        f"{several}{frames['missing']} missing; focal length {report['focal_px']:.0f} px; {size}."
     )

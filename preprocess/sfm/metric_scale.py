@@ -177,7 +177,7 @@ class MetricScale:
     """Metres per unit of the solved world.
 
     Attributes:
-        cues: The cues that made it: "ground", "in place".
+        cues: The cues that made it: "ground", "in place"; "the person" if the camera only turns.
         ground, place: The scale by each alone; None where it says nothing.
         spread: Of the frames' own values by ground contact, relative; NaN without ground.
         rejection_reason: Why it is not to be believed; None if it is.
@@ -189,6 +189,13 @@ class MetricScale:
     place: float | None
     spread: float
     rejection_reason: str | None = None
+
+    @classmethod
+    def of_person(cls) -> "MetricScale":
+        """The scale of a world without any path of the camera: the person's."""
+        return cls(
+            metres_per_unit=1.0, cues=("the person",), ground=None, place=None, spread=float("nan")
+        )
 
 
 def estimate_metric_scale(standing: PersonInCameras, floor: FloorPlane | None) -> MetricScale:

@@ -106,8 +106,11 @@ def place_in_metric_world(
     standing = _person_in_cameras(solved, motion, frames, np.flatnonzero(usable), shaped)
     assert solved.model is not None
     up = _estimate_up(solved, motion, frames, usable)
-    floor = fit_floor_plane(solved.model, up)
-    scale = estimate_metric_scale(standing, floor)
+    if solved.model.only_turns:  # in one place: the person's own metres are the world's
+        floor, scale = None, MetricScale.of_person()
+    else:
+        floor = fit_floor_plane(solved.model, up)
+        scale = estimate_metric_scale(standing, floor)
     if scale.rejection_reason is not None:
         raise InputError(f"The cameras were solved, but {scale.rejection_reason}.")
     turned = np.einsum("nab,nb->na", standing.world_from_camera, standing.pelvis_positions)

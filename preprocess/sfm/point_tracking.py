@@ -8,11 +8,12 @@ by something else than the matches it was made from.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
+from scipy.spatial.transform import Rotation
 
 from capture.camera import Camera
 from capture.source import FrameSource
@@ -145,6 +146,9 @@ INLIER_PX = 2.0
 MIN_INLIER_FRACTION = 0.5
 """Fraction of the tracked points that must be inliers."""
 
+RESECTION_ITERATIONS = 10
+"""Rounds of reweighted least squares for the turn of a camera; far points weigh less."""
+
 MAX_BUFFERED_FRAMES = 256
 """Most frames between two key frames that are kept in memory; the middle of more is skipped."""
 
@@ -181,6 +185,7 @@ def resect_intermediate_frames(
     ]
     placed: dict[int, np.ndarray] = {}
     bridges: dict[int, float] = {}
+    resect = resect_turn if model.only_turns else resect_camera
     total = max(source.frame_count or source.frames_in_file, 1)
     for before, after, stretch in _frames_between_keyframes(source, anchors, model.size_px):
         if stretch:
@@ -194,7 +199,8 @@ def resect_intermediate_frames(
         if after is not None:
             after.follow(stretch[::-1], seen)
         for frame, _ in stretch:
-            found = resect_camera(*seen.of(frame), (before or after).camera)  # type: ignore[union-attr]
+            lens = (before or after).camera  # type: ignore[union-attr]
+            found = resect(*seen.of(frame), lens)
             if found is not None:
                 placed[frame] = found
     return ResectionResult(cameras=placed, keyframe_errors_px=bridges)
@@ -226,6 +232,22 @@ def resect_camera(
         near = np.flatnonzero(np.linalg.norm(drawn[:, 0] - pixels, axis=1) < reach)
         inliers = near if len(near) >= MIN_PNP_POINTS else inliers
     return rigid_transform(np.asarray(cv2.Rodrigues(turn)[0]), np.asarray(shift)[:, 0])
+
+
+def resect_turn(
+    directions: Float[np.ndarray, "points 3"], pixels: Float[np.ndarray, "points 2"], lens: Camera
+) -> Float[np.ndarray, "4 4"] | None:
+    """The camera at the origin that sees known directions where they were seen; else None."""
+    if len(directions) < MIN_PNP_POINTS:
+        return None
+    rays = replace(lens, camera_from_world=np.eye(4)).ray_directions(pixels)
+    far = np.ones(len(rays))
+    for _ in range(RESECTION_ITERATIONS):
+        turn = Rotation.align_vectors(rays, directions, 1.0 / np.maximum(far, 1.0) ** 2)[0]
+        far = np.linalg.norm(rays - turn.apply(directions), axis=1) * lens.focal_px[0] / INLIER_PX
+    if (far < 1.0).mean() < MIN_INLIER_FRACTION:
+        return None
+    return rigid_transform(turn.as_matrix(), np.zeros(3))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

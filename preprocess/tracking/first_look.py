@@ -123,16 +123,16 @@ class FirstLook:
 
     def _camera_advice(self) -> Iterator[str]:
         shift = f"its background shifts by up to {self.shift:.0%} of the longer side in 0.2 s"
-        if self.motion is CameraMotion.WALKS:
+        solved = {
+            CameraMotion.WALKS: "its way",
+            CameraMotion.TURNS: "how it turns, and its focal length",
+            CameraMotion.MOVES: "how it moves",
+        }
+        if self.motion in solved:
             yield (
-                f"The camera is carried around ({shift}). Poses are found for each frame's own "
-                "camera; --cameras solve finds its way, too, if the background has structure."
-            )
-        if self.motion in (CameraMotion.TURNS, CameraMotion.MOVES):
-            kind = "turns on the spot" if self.motion is CameraMotion.TURNS else "moves"
-            yield (
-                f"The camera {kind} ({shift}). Poses are found for each frame's own camera. "
-                "--cameras solve works if it is carried around, not if it only turns."
+                f"{self.motion.value.capitalize()} ({shift}). Poses are found for each frame's own "
+                f"camera; --cameras solve finds {solved[self.motion]}, too, if the background has "
+                "structure."
             )
 
 

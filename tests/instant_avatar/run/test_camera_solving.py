@@ -118,6 +118,25 @@ def test_poses_of_an_unknown_lens_are_right_for_the_solved_one(
         np.testing.assert_allclose(*seen, atol=0.5)
 
 
+def test_a_camera_that_only_turns_stays_in_one_place_of_a_metric_world(walkaround, solution):
+    still = open_capture(inputs_of(walkaround))
+    turned = solution.camera_from_solved.copy()
+    turned[:, :3, 3] = 0.0
+    model = replace(solution.model, only_turns=True)
+    found = apply_camera_solution(still, replace(solution, camera_from_solved=turned, model=model))
+    centers = np.stack([camera.center_world for camera in found.cameras.cameras])
+    np.testing.assert_allclose(centers, centers[:1].repeat(FRAMES, axis=0), atol=1e-9)
+    assert 1.2 < centers[0, 1] < 1.7  # held by a person, above a floor below the soles
+    for row in (0, 6, 13):
+        before, after = (
+            each.cameras[row].project(each.shaped.with_pose(each.motion[row]).joints())
+            for each in (still, found)
+        )
+        np.testing.assert_allclose(before, after, atol=1.5)
+    assert found.figures("cameras")["scale"]["cues"] == ["the person"]
+    assert "the camera only turns, by" in found.notes[-1]
+
+
 def test_a_stated_height_is_the_size_of_everything(walkaround, solution):
     plain = open_capture(inputs_of(walkaround))
     tall = body_height_m(plain.shaped)

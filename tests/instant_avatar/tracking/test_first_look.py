@@ -79,7 +79,7 @@ def test_a_dark_film_is_named_with_its_brightness(look, frames):
 def test_a_camera_that_turns_on_the_spot_is_no_camera_that_stands(look, frames):
     seen = look(list(seen_through_a_turning_camera(frames, 80.0)))
     assert seen.motion is CameraMotion.TURNS
-    assert "not if it only turns" in list(seen.advice())[-1]
+    assert "--cameras solve finds how it turns, and its focal" in list(seen.advice())[-1]
 
 
 def test_a_camera_that_is_carried_past_near_and_far_things_walks():

@@ -92,19 +92,67 @@ def test_pictures_that_have_nothing_in_common_are_refused(tmp_path, rng):
         solve_cameras(source, no_person, SolverSettings(), lambda share: None)
 
 
-def test_a_camera_that_turns_on_the_spot_is_refused_by_name(room, walked, tmp_path, monkeypatch):
-    monkeypatch.setattr(colmap_mapping, "map_incrementally", None)  # before anything is mapped
+def turning(here, degrees, shake_m=0.0):
+    """Cameras that turn about the vertical where `here` is, in an unsteady hand."""
+    rng = np.random.default_rng(4)
+    cameras = []
+    for angle in degrees:
+        view = np.eye(4)
+        view[:3, :3] = Rotation.from_euler("yz", [angle, 0.05 * angle], degrees=True).as_matrix()
+        view = view @ here.camera_from_world
+        view[:3, 3] += shake_m * rng.normal(size=3)
+        cameras.append(replace(here, camera_from_world=view))
+    return cameras
+
+
+@pytest.mark.parametrize(("shake_m", "most_deg"), [(0.0, 0.1), (0.01, 0.4)])
+def test_a_camera_that_turns_on_the_spot_is_solved_as_one(
+    room, walked, tmp_path, monkeypatch, shake_m, most_deg
+):
+    monkeypatch.setattr(colmap_mapping, "extract_features", None)  # no need of it
     here = walked(1, degrees=0.0, size_px=SIZE, focal_px=260.0)[0]
-    pictures = []
-    for degrees in np.linspace(-14.0, 14.0, 8):
-        turn = np.eye(4)
-        turn[:3, :3] = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
-        view = turn @ here.camera_from_world
-        pictures.append(room.seen(replace(here, camera_from_world=view)))
-    with pytest.raises(InputError, match="turns on the spot"):
+    cameras = turning(here, np.linspace(-24.0, 24.0, FRAMES), shake_m)
+    source = filmed(tmp_path / "film", [room.seen(camera) for camera in cameras])
+    settings = SolverSettings(max_keyframes=KEYS)
+    solved = solve_cameras(source, no_person, settings, lambda share: None)
+    assert solved.model.only_turns
+    assert not (solved.frame_status < PLACED).any()
+    views = solved.camera_from_solved
+    assert not views[:, :3, 3].any()
+    rotations = np.stack([camera.camera_from_world[:3, :3] for camera in cameras])
+    from_first = rotations @ rotations[0].T @ views[0, :3, :3]
+    angles = Rotation.from_matrix(from_first @ views[:, :3, :3].transpose(0, 2, 1)).magnitude()
+    assert np.degrees(angles).max() < most_deg
+    assert solved.lens(SIZE).focal_px[0] == pytest.approx(260.0, rel=0.02)
+    stated = replace(settings, focal_ratio=262.0 / SIZE[0])
+    again = solve_cameras(source, no_person, stated, lambda share: None)
+    assert again.lens(SIZE).focal_px[0] == pytest.approx(262.0)
+
+
+def test_a_walk_along_a_flat_wall_is_not_taken_for_a_turn(room, walked, tmp_path, monkeypatch):
+    def goes_on(*given):
+        raise InputError("solved as a path")
+
+    monkeypatch.setattr(camera_solver, "_solve_path", goes_on)
+    here = walked(1, degrees=0.0, size_px=SIZE, focal_px=400.0)[0]
+    cameras = turning(here, np.zeros(KEYS))
+    for camera, aside in zip(cameras, np.linspace(-0.6, 0.6, KEYS), strict=True):
+        camera.camera_from_world[0, 3] += aside
+    with pytest.raises(InputError, match="solved as a path"):
         solve_cameras(
-            filmed(tmp_path / "film", pictures), no_person, SolverSettings(), lambda share: None
-        )
+            filmed(tmp_path / "film", [room.seen(camera) for camera in cameras]), no_person,
+            SolverSettings(), lambda share: None,
+        )  # fmt: skip
+
+
+def test_a_turn_that_tells_no_focal_length_is_not_believed(room, walked, tmp_path):
+    here = walked(1, degrees=0.0, size_px=SIZE, focal_px=260.0)[0]
+    cameras = turning(here, np.linspace(-1.5, 1.5, KEYS))
+    with pytest.raises(InputError, match="does not just turn by 5°"):
+        solve_cameras(
+            filmed(tmp_path / "film", [room.seen(camera) for camera in cameras]), no_person,
+            SolverSettings(), lambda share: None,
+        )  # fmt: skip
 
 
 def test_a_wrong_world_is_refused_by_points_that_are_followed(walk, monkeypatch):
