@@ -19,6 +19,10 @@ from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
 from preprocess.poses.motion_builder import place_by_pixels
 
+FIRST_NOVEL_FRAME = 1_000_000
+"""Number of the first pose that was never filmed: no frame of the film is near it, whose errors of
+pose and exposure would be taken for its own."""
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ComparedCapture:
@@ -104,7 +108,7 @@ def novel_observations(
     true_body = body if body.exists() else None
     inputs = CaptureInputs(video=novel, cameras=cameras, body=true_body, refine_masks=False)
     found = [
-        seen
+        replace(seen, frame=replace(seen.frame, index=FIRST_NOVEL_FRAME + seen.frame.index))
         for seen in open_capture(inputs, size_px=size_px).observations()
         if isinstance(seen, Observation)
     ]

@@ -3,10 +3,14 @@
 import json
 import math
 
+import numpy as np
 import pytest
 
+from avatar.training.pose_correction import interpolate_correction
 from baselines import compare, comparison_scores
+from baselines.systems.compared_capture import FIRST_NOVEL_FRAME, novel_observations
 from instant_avatar.studio.shoot import ShootConfig, film_capture
+from preprocess.body.parametric_body import load_body_model
 
 
 @pytest.fixture(scope="module")
@@ -36,9 +40,16 @@ def test_it_writes_scores_table_and_pictures(compared):
         for kind in ("novel", "novel_fitted"):
             assert len(each[kind]["frames"]) == 12
             pictures = {path.name for path in (out / each["method"] / kind).glob("*.png")}
-            assert pictures == {f"{index:04d}.png" for index in range(12)}
+            assert pictures == {f"{FIRST_NOVEL_FRAME + index}.png" for index in range(12)}
     assert (out / "pictures.png").stat().st_size > 0
     assert "| ours |" in (out / "table.md").read_text()
+
+
+def test_a_pose_never_filmed_starts_from_no_frames_correction(compared):
+    person = load_body_model().with_shape()
+    corrections = {frame: np.ones((25, 3)) for frame in range(11)}
+    for seen in novel_observations(compared[0] / "sample", person):
+        assert not interpolate_correction(seen.frame.index, corrections).any()
 
 
 def test_what_is_done_is_not_trained_again(compared, monkeypatch):
