@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float32, Int64, UInt8
 from scipy.ndimage import label
 from torch import Tensor
 
+from avatar.kernels import numba_priors
 from avatar.kernels.operands import MAX_LOG_DENSITY, DensityGrid
 from avatar.rig import CLOTHING_BAND_M, HEAD_JOINT, Rig
 
@@ -88,8 +89,9 @@ class OccupancyGrid:
             drop_floaters: Drops small components, and those off the skin. (The paper's code keeps
                 the largest component only, but a foot may be one of its own.)
         """
-        chosen = self._draw_cells(self.band_cells, int(len(self.band_cells) * share), generator)
-        log_density = log_density_at(self._jittered_points(chosen, generator))
+        count = int(len(self.band_cells) * share)
+        chosen, points = self._draw_points(self.band_cells, count, generator)
+        log_density = log_density_at(points)
         density = torch.exp(log_density.clamp(max=MAX_LOG_DENSITY))
         flat = self.density_grid.density.view(-1)
         flat[chosen] = torch.maximum(flat[chosen] * decay, density)
@@ -128,24 +130,20 @@ class OccupancyGrid:
 
     def sample_empty(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
         """Random points in unoccupied cells of the band, at most `count`."""
-        return self._jittered_points(
-            self._draw_cells(self._empty_cells(), count, generator), generator
-        )
+        return self._draw_points(self._empty_cells(), count, generator)[1]
 
     def sample_off_skin(
         self, count: int, generator: torch.Generator
     ) -> Float32[Tensor, "points 3"]:
         """Random points of the band that lie off the skin, at most `count`."""
-        return self._jittered_points(
-            self._draw_cells(self._off_skin_cells, count, generator), generator
-        )
+        return self._draw_points(self._off_skin_cells, count, generator)[1]
 
     def sample_interior(
         self, count: int, generator: torch.Generator, *, of_head: bool = False
     ) -> Float32[Tensor, "points 3"]:
         """Random points deep under the skin, or under the head's, at most `count`."""
         cells = self._head_cells if of_head else self._interior_cells
-        return self._jittered_points(self._draw_cells(cells, count, generator), generator)
+        return self._draw_points(cells, count, generator)[1]
 
     def _empty_cells(self) -> Int64[Tensor, "cells"]:
         """Unoccupied cells of the band, cached until the occupancy changes."""
@@ -155,20 +153,18 @@ class OccupancyGrid:
             self._cached_empty_cells = version, cells
         return self._cached_empty_cells[1]
 
-    def _draw_cells(
+    def _draw_points(
         self, cells: Int64[Tensor, "cells"], count: int, generator: torch.Generator
-    ) -> Int64[Tensor, "drawn"]:
-        count = count if len(cells) else 0
-        drawn = torch.randint(max(len(cells), 1), (count,), generator=generator)
-        return cells[drawn]
-
-    def _jittered_points(
-        self, cells: Int64[Tensor, "cells"], generator: torch.Generator
-    ) -> Float32[Tensor, "cells 3"]:
-        _, ny, nz = self.density_grid.occupied.shape
-        corner = torch.stack([cells // (ny * nz), cells // nz % ny, cells % nz], dim=1)
-        within = torch.rand(len(cells), 3, generator=generator)
-        return (corner + within) / self.density_grid.cells_per_m + self.density_grid.low
+    ) -> tuple[Int64[Tensor, "drawn"], Float32[Tensor, "drawn 3"]]:
+        """Cells drawn at random, at most `count`, and a random point in each."""
+        count, grid = count if len(cells) else 0, self.density_grid
+        chances, points = torch.rand(count, 4, generator=generator), torch.empty(count, 3)
+        drawn = torch.empty(count, dtype=torch.int64)
+        numba_priors.points_in_cells(
+            chances.numpy(), cells.numpy(), tuple(grid.occupied.shape), grid.low.numpy(),
+            grid.cells_per_m.numpy(), drawn.numpy(), points.numpy(),
+        )  # fmt: skip
+        return drawn, points
 
 
 def in_occupied_cells(

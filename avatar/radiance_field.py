@@ -8,17 +8,23 @@ returns the gradient of a mean over points with respect to the raw outputs.
 
 import copy
 import math
-from typing import Literal, NamedTuple, final
+from collections.abc import Callable
+from typing import NamedTuple, final
 
+import numpy as np
 import torch
 from jaxtyping import Float32, Int64
 from torch import Tensor
 
 from avatar.config import TrainConfig
-from avatar.kernels import operations
-from avatar.kernels.operands import FEATURES_PER_LEVEL, MAX_LOG_DENSITY, HashLevels
+from avatar.kernels import numba_priors, operations
+from avatar.kernels.operands import (
+    FEATURES_PER_LEVEL,
+    HIDDEN_WIDTH,
+    HashLevels,
+    NetworkLayers,
+)
 
-HIDDEN_WIDTH = 64
 INITIAL_LOG_DENSITY = 0.0
 """Raw density of an untrained field: 1 per metre, a fog thin enough to be cleared quickly."""
 POINTS_PER_CHUNK = 1 << 13
@@ -26,45 +32,11 @@ POINTS_PER_CHUNK = 1 << 13
 
 
 class Activations(NamedTuple):
-    """Values of the forward pass that the backward pass needs; `hidden` is that after the ReLU."""
+    """Values of the forward pass that the backward pass needs."""
 
     points: Float32[Tensor, "points 3"]
     features: Float32[Tensor, "points width"]
-    hidden: Float32[Tensor, "points hidden"]
     raw: Float32[Tensor, "points 4"]
-
-    def rows(self, points: Int64[Tensor, "some"]) -> "Activations":
-        """The values of some of the points."""
-        return Activations(*(part.index_select(0, points) for part in self))
-
-
-HAS_ONEDNN = torch.backends.mkldnn.is_available() and hasattr(torch.ops.mkldnn, "_linear_pointwise")
-"""Availability of oneDNN's matrix products on the CPU."""
-ROWS_PER_PRODUCT = 1024
-"""Rows are padded to a multiple of this number, because oneDNN compiles a kernel for each size."""
-
-
-def _padded(values: Float32[Tensor, "points width"]) -> Float32[Tensor, "rows width"]:
-    return torch.nn.functional.pad(values, (0, 0, 0, -len(values) % ROWS_PER_PRODUCT))
-
-
-def _linear(
-    values: Float32[Tensor, "points inputs"],
-    weight: Float32[Tensor, "inputs outputs"],
-    bias: Float32[Tensor, "outputs"] | None = None,
-    activation: Literal["none", "relu"] = "none",
-) -> Float32[Tensor, "points outputs"]:
-    """A layer of the network, or its transpose; by oneDNN where torch has it.
-
-    torch takes MKL for single precision, which takes twice as long on AMD's processors.
-    """
-    if HAS_ONEDNN:
-        product: Tensor = torch.ops.mkldnn._linear_pointwise(
-            values, weight.T, bias, activation, [], ""
-        )
-        return product
-    product = values @ weight if bias is None else torch.addmm(bias, values, weight)
-    return product.relu_() if activation == "relu" else product
 
 
 @final
@@ -119,6 +91,12 @@ class RadianceField:
         return [self.table, *self.layers]
 
     @property
+    def network(self) -> NetworkLayers:
+        """Weights and biases of both layers."""
+        first, first_bias, second, second_bias = self.layers
+        return first, first_bias, second, second_bias
+
+    @property
     def table_grad(self) -> Float32[Tensor, "entries 4"]:
         """Gradient of the table, which accumulates until it is zeroed."""
         assert self.table.grad is not None, "the table's gradient is zeroed, never taken away"
@@ -127,34 +105,33 @@ class RadianceField:
     @torch.no_grad()
     def forward(self, points: Float32[Tensor, "points 3"]) -> Activations:
         """Raw outputs at canonical points, and what their gradient will need."""
-        first, first_bias, second, second_bias = self.layers
-        features = operations.encode(points, self.table, self.levels)
-        hidden = _linear(_padded(features), first, first_bias, "relu")
-        raw = _linear(hidden, second, second_bias)
-        return Activations(points, features, hidden[: len(points)], raw[: len(points)])
+        return Activations(
+            points, *operations.field_forward(points, self.table, self.levels, self.network)
+        )
 
     @torch.no_grad()
     def backward(
-        self, activations: Activations, grad_raw: Float32[Tensor, "points 4"]
-    ) -> Float32[Tensor, "points width"]:
+        self,
+        activations: Activations,
+        grad_raw: Float32[Tensor, "some 4"],
+        rows: Int64[Tensor, "some"] | None = None,
+    ) -> Float32[Tensor, "some width"]:
         """Writes the gradient of every parameter (the table's is added), unless it is frozen.
 
-        Returns the gradient of the grid's features.
+        `grad_raw` is the gradient of the outputs of the points in `rows`, all points if None; the
+        others have none. Returns the gradient of these points' features.
         """
-        first, _, second, _ = self.layers
-        padded = _linear(_padded(grad_raw), second.T)
-        grad_hidden = padded[: len(grad_raw)].mul_(activations.hidden.sign())
-        grad_features = _linear(padded, first.T)[: len(grad_raw)]
-        if self.is_frozen:
+        points, features, _ = activations
+        rows = torch.arange(len(points)) if rows is None else rows
+        grad_features, grads = operations.network_backward(
+            features, rows, grad_raw, self.network, is_frozen=self.is_frozen
+        )
+        if grads is None:
             return grad_features
-        grads = (
-            activations.features.T @ grad_hidden, grad_hidden.sum(dim=0),
-            (grad_raw.T @ activations.hidden).T, grad_raw.sum(dim=0),
-        )  # fmt: skip
         for parameter, grad in zip(self.layers, grads, strict=True):
             assert parameter.grad is not None, "a gradient is overwritten, never taken away"
             parameter.grad.copy_(grad)
-        operations.encode_backward(activations.points, grad_features, self.levels, self.table_grad)
+        operations.encode_backward(points, rows, grad_features, self.levels, self.table_grad)
         return grad_features
 
     @torch.no_grad()
@@ -164,8 +141,6 @@ class RadianceField:
         return torch.cat(chunks) if chunks else points.new_empty(0, 4)
 
 
-OPACITY_LENGTH_M = 0.01
-"""Length over which opacity is measured, metres."""
 TV_PAIR_SIGMA_M = 0.01
 """Standard deviation of the offset within a total-variation pair, metres per axis."""
 MIN_OPACITY = 1e-6
@@ -191,25 +166,34 @@ class OpacityWithSlope(NamedTuple):
     @classmethod
     def of(cls, raw: Float32[Tensor, "points 4"]) -> "OpacityWithSlope":
         """Opacity and slope of a field's raw outputs."""
-        optical = torch.exp(raw[:, 3].clamp(max=MAX_LOG_DENSITY)) * OPACITY_LENGTH_M
-        through = torch.exp(-optical)
-        return cls(1.0 - through, optical * through)
+        value, slope = torch.empty(2, len(raw))
+        numba_priors.opacities(raw.numpy(), value.numpy(), slope.numpy())
+        return cls(value, slope)
+
+
+def _gradient(
+    add: Callable[..., None],
+    raw: Float32[Tensor, "points 4"],
+    *arguments: Float32[np.ndarray, "..."] | float,
+) -> Float32[Tensor, "points 4"]:
+    """What a kernel of `numba_priors` adds to zeros."""
+    grad = torch.zeros_like(raw)
+    add(raw.numpy(), *(np.float32(argument) for argument in arguments), grad.numpy())
+    return grad
 
 
 def empty_space_gradient(
     raw: Float32[Tensor, "points 4"], weight: float
 ) -> Float32[Tensor, "points 4"]:
     """Gradient of the mean α in space that should be empty (the paper's §3.4)."""
-    return _log_density_only(raw, weight / max(len(raw), 1) * OpacityWithSlope.of(raw).slope)
+    return _gradient(numba_priors.empty_space, raw, weight)
 
 
 def interior_gradient(
     raw: Float32[Tensor, "points 4"], weight: float
 ) -> Float32[Tensor, "points 4"]:
     """Gradient of the mean -log α in the interior; cross-entropy acts at zero opacity as well."""
-    opacity = OpacityWithSlope.of(raw)
-    slope = opacity.slope / opacity.value.clamp(min=MIN_OPACITY)
-    return _log_density_only(raw, -weight / max(len(raw), 1) * slope)
+    return _gradient(numba_priors.interior, raw, weight, MIN_OPACITY)
 
 
 def log_density_l1_gradient(
@@ -220,7 +204,7 @@ def log_density_l1_gradient(
     Density that a ray needs withstands the small gradient; under Adam, density that no ray needs
     vanishes however small the gradient is.
     """
-    return _log_density_only(raw, weight / max(len(raw), 1) * (raw[:, 3] > 0.0))
+    return _gradient(numba_priors.log_density_l1, raw, weight)
 
 
 def sample_tv_pairs(
@@ -242,11 +226,12 @@ def sample_smoothness_pairs(
 def _sample_pairs(
     points: Float32[Tensor, "samples 3"], count: int, sigma_m: float, generator: torch.Generator
 ) -> Float32[Tensor, "points 3"]:
-    size = (count if len(points) else 0, 3)
-    chosen = torch.randint(max(len(points), 1), size[:1], generator=generator)
-    apart = sigma_m * torch.randn(size, generator=generator)
-    first = points[chosen]
-    return torch.cat([first, first + apart])
+    count = count if len(points) else 0
+    chances = torch.rand(count, generator=generator)
+    apart = sigma_m * torch.randn(count, 3, generator=generator)
+    pairs = torch.empty(2 * count, 3)
+    numba_priors.draw_pairs(chances.numpy(), apart.numpy(), points.numpy(), pairs.numpy())
+    return pairs
 
 
 def density_tv_gradient(
@@ -259,9 +244,7 @@ def density_tv_gradient(
     penalise sharp edges, but it does not penalise thick, half-transparent layers either. `raw` has
     the first points of the pairs, then the second.
     """
-    count, opacity = len(raw) // 2, OpacityWithSlope.of(raw)
-    sign = torch.sign(opacity.value[:count] - opacity.value[count:])
-    return _log_density_only(raw, weight / max(count, 1) * torch.cat([sign, -sign]) * opacity.slope)
+    return _gradient(numba_priors.density_tv, raw, weight)
 
 
 def double_well_gradient(
@@ -272,10 +255,7 @@ def double_well_gradient(
     Together with the total variation it minimises fog and surface area, as between two phases of a
     fluid (Modica and Mortola 1977).
     """
-    opacity = OpacityWithSlope.of(raw)
-    return _log_density_only(
-        raw, weight / max(len(raw), 1) * (1.0 - 2.0 * opacity.value) * opacity.slope
-    )
+    return _gradient(numba_priors.double_well, raw, weight)
 
 
 def density_slope_gradient(
@@ -292,25 +272,17 @@ def density_slope_gradient(
     `MAX_USEFUL_LOG_DENSITY` is penalised too, since it only steepens the edge. Pairs are as in
     `density_tv_gradient`; k is `max_slope_per_m`.
     """
-    count, logs = len(raw) // 2, raw[:, 3]
-    change = logs[:count] - logs[count:]
-    allowed = max_slope_per_m * (points[:count] - points[count:]).norm(dim=1)
-    seen = torch.maximum(logs[:count], logs[count:]) > 0.0
-    pull = torch.sign(change) * (seen & (change.abs() > allowed)) / max(count, 1)
-    needless = EXCESS_DENSITY_FACTOR / max(len(raw), 1) * (logs > MAX_USEFUL_LOG_DENSITY)
-    return _log_density_only(raw, weight * (torch.cat([pull, -pull]) + needless))
+    return _gradient(
+        numba_priors.density_slope, raw, points.numpy(), max_slope_per_m, MAX_USEFUL_LOG_DENSITY,
+        EXCESS_DENSITY_FACTOR, weight,
+    )  # fmt: skip
 
 
 def color_tv_gradient(
     raw: Float32[Tensor, "points 4"], weight: float
 ) -> Float32[Tensor, "points 4"]:
     """Gradient of the mean |c - c'| of visible pairs, as in `density_tv_gradient`."""
-    count, color = len(raw) // 2, torch.sigmoid(raw[:, :3])
-    seen = torch.maximum(raw[:count, 3:], raw[count:, 3:]) > VISIBLE_LOG_DENSITY
-    pull = weight / max(count, 1) * seen * torch.sign(color[:count] - color[count:])
-    grad = torch.zeros_like(raw)
-    grad[:, :3] = torch.cat([pull, -pull]) * color * (1.0 - color)
-    return grad
+    return _gradient(numba_priors.color_tv, raw, VISIBLE_LOG_DENSITY, weight)
 
 
 def source_gradient(
@@ -323,19 +295,4 @@ def source_gradient(
     color counts as far as they are opaque. `raw` has the points, then their sources; `weights` are
     the pairs' own, in [0, 1].
     """
-    count, color = len(weights), torch.sigmoid(raw[:, :3])
-    opacity = OpacityWithSlope.of(raw).value
-    scale = weight * weights
-    source = (0.5 + SOURCE_STEEPNESS * (opacity[count:] - 0.5)).clamp(0.0, 1.0)
-    grad = torch.zeros_like(raw)
-    grad[:count, :3] = (scale * opacity[count:])[:, None] * (color[:count] - color[count:])
-    grad[:count, 3] = scale * (opacity[:count] - source)
-    return grad
-
-
-def _log_density_only(
-    raw: Float32[Tensor, "points 4"], slope: Float32[Tensor, "points"]
-) -> Float32[Tensor, "points 4"]:
-    grad = torch.zeros_like(raw)
-    grad[:, 3] = slope
-    return grad
+    return _gradient(numba_priors.toward_sources, raw, weights.numpy(), weight, SOURCE_STEEPNESS)

@@ -106,11 +106,12 @@ def encode_marks(seen: LoadedTrainer) -> list[Measurement]:
     points = training_points(seen, POINTS)
     grad = torch.randn(POINTS, field.levels.feature_width, generator=_seeded())
     table = field.table.detach().clone().requires_grad_()
+    rows = torch.arange(POINTS)
 
     def ours() -> None:
         field.table_grad.zero_()
         operations.encode(points, field.table, field.levels)
-        operations.encode_backward(points, grad, field.levels, field.table_grad)
+        operations.encode_backward(points, rows, grad, field.levels, field.table_grad)
 
     def plain() -> None:
         torch.autograd.grad(torch_reference.encode(points, table, field.levels), table, grad)

@@ -1,7 +1,8 @@
-"""Compiles Python to machine code with numba, and gives kernels a type of four float32.
+"""Compiles Python to machine code with numba, and gives kernels types of four and eight float32.
 
 LLVM vectorises a loop over points, but not four numbers that are gathered and scattered, such as an
-entry of the hash grid. As an explicit vector they make its kernels two to three times faster.
+entry of the hash grid. As an explicit vector they make its kernels two to three times faster. Eight
+are a register of AVX; products of small matrices keep their sums in them.
 """
 
 import functools
@@ -63,26 +64,26 @@ def _source_digest(folder: Path) -> str:
 
 FAST_MATH_FLAGS = ("fast",)
 """LLVM flags of `FAST_MATH`: a product and a sum may become one instruction."""
-FLOAT4 = ir.VectorType(ir.FloatType(), 4)
 
 
-class Vector4(Type):
-    """Numba's type of four float32 side by side."""
+class FloatVector(Type):
+    """Numba's type of several float32 side by side."""
 
-    def __init__(self) -> None:
-        """The one type of this class."""
-        super().__init__(name="Vector4")
+    def __init__(self, lanes: int) -> None:
+        """The type of `lanes` numbers."""
+        super().__init__(name=f"FloatVector{lanes}")
+        self.ir_type = ir.VectorType(ir.FloatType(), lanes)
 
 
-@register_model(Vector4)
-class _Vector4Model(models.PrimitiveModel):
-    """Data model of a `Vector4`: LLVM's vector."""
+@register_model(FloatVector)
+class _FloatVectorModel(models.PrimitiveModel):
+    """Data model of a `FloatVector`: LLVM's vector."""
 
     def __init__(self, data_model_manager, numba_type):
-        super().__init__(data_model_manager, numba_type, FLOAT4)
+        super().__init__(data_model_manager, numba_type, numba_type.ir_type)
 
 
-vector4 = Vector4()
+vector4, vector8 = FloatVector(4), FloatVector(8)
 
 
 def operation(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -90,32 +91,127 @@ def operation(function: Callable[..., Any]) -> Callable[..., Any]:
     return intrinsic(function)
 
 
-def _row_pointer(context, builder, signature, arguments):
-    """Pointer to the four numbers that begin at `array[row, column]`."""
+def _item_pointer(context, builder, signature, arguments, ir_type):
+    """Pointer to the numbers of an LLVM type that begin at `array[row, column]`."""
     array_type = signature.args[0]
     array = context.make_array(array_type)(context, builder, arguments[0])
     pointer = cgutils.get_item_pointer(
         context, builder, array_type, array, arguments[1:3], wraparound=False
     )
-    return builder.bitcast(pointer, FLOAT4.as_pointer())
+    return builder.bitcast(pointer, ir_type.as_pointer())
 
 
-def _broadcast(builder, number):
-    """A vector of one number four times."""
-    nothing = ir.Constant(FLOAT4, ir.Undefined)
-    first = ir.Constant(ir.VectorType(ir.IntType(32), 4), [0, 0, 0, 0])
+def _broadcast(builder, number, lanes):
+    """A vector of one number, `lanes` times."""
+    nothing = ir.Constant(ir.VectorType(ir.FloatType(), lanes), ir.Undefined)
+    first = ir.Constant(ir.VectorType(ir.IntType(32), lanes), [0] * lanes)
     start = builder.insert_element(nothing, number, ir.Constant(ir.IntType(32), 0))
     return builder.shuffle_vector(start, nothing, first)
+
+
+def _load(vector, array):
+    def code(context, builder, signature, arguments):
+        place = _item_pointer(context, builder, signature, arguments, vector.ir_type)
+        return builder.load(place, align=4)
+
+    return vector(array, intp, intp), code
+
+
+def _store(vector, array):
+    def code(context, builder, signature, arguments):
+        place = _item_pointer(context, builder, signature, arguments, vector.ir_type)
+        builder.store(arguments[3], place, align=4)
+        return context.get_dummy_value()
+
+    return none(array, intp, intp, vector), code
 
 
 @operation
 def load4(typing_context, array, row, column):
     """`array[row, column : column + 4]`; row and column are not negative, and not checked."""
+    return _load(vector4, array)
+
+
+@operation
+def store4(typing_context, array, row, column, values):
+    """`array[row, column : column + 4] = values`; row and column are not checked."""
+    return _store(vector4, array)
+
+
+@operation
+def load8(typing_context, array, row, column):
+    """`array[row, column : column + 8]`; row and column are not negative, and not checked."""
+    return _load(vector8, array)
+
+
+@operation
+def store8(typing_context, array, row, column, values):
+    """`array[row, column : column + 8] = values`; row and column are not checked."""
+    return _store(vector8, array)
+
+
+@operation
+def repeat8(typing_context, array, row, column):
+    """`array[row, column]`, eight times; row and column are not checked."""
 
     def code(context, builder, signature, arguments):
-        return builder.load(_row_pointer(context, builder, signature, arguments), align=4)
+        place = _item_pointer(context, builder, signature, arguments, ir.FloatType())
+        return _broadcast(builder, builder.load(place, align=4), 8)
 
-    return vector4(array, intp, intp), code
+    return vector8(array, intp, intp), code
+
+
+@operation
+def zeros8(typing_context):
+    """Eight zeros."""
+
+    def code(context, builder, signature, arguments):
+        return ir.Constant(vector8.ir_type, [0.0] * 8)
+
+    return vector8(), code
+
+
+@operation
+def multiply_add8(typing_context, one, other, total):
+    """`one * other + total`."""
+
+    def code(context, builder, signature, arguments):
+        product = builder.fmul(*arguments[:2], flags=FAST_MATH_FLAGS)
+        return builder.fadd(product, arguments[2], flags=FAST_MATH_FLAGS)
+
+    return vector8(vector8, vector8, vector8), code
+
+
+@operation
+def where_positive8(typing_context, condition, values):
+    """`values` where `condition` is above 0, and 0 elsewhere."""
+
+    def code(context, builder, signature, arguments):
+        zero = ir.Constant(vector8.ir_type, [0.0] * 8)
+        return builder.select(builder.fcmp_ordered(">", arguments[0], zero), arguments[1], zero)
+
+    return vector8(vector8, vector8), code
+
+
+@operation
+def sum8(typing_context, values):
+    """The sum of the eight numbers."""
+
+    def code(context, builder, signature, arguments):
+        values, lanes = arguments[0], 8
+        while lanes > 1:
+            lanes //= 2
+            low, high = (
+                builder.shuffle_vector(
+                    values, values,
+                    ir.Constant(ir.VectorType(ir.IntType(32), lanes), list(range(n, n + lanes))),
+                )
+                for n in (0, lanes)
+            )  # fmt: skip
+            values = builder.fadd(low, high, flags=FAST_MATH_FLAGS)
+        return builder.extract_element(values, ir.Constant(ir.IntType(32), 0))
+
+    return float32(vector8), code
 
 
 @operation
@@ -129,7 +225,7 @@ def prefetch(typing_context, array, row, column):
             ir.FunctionType(ir.VoidType(), [byte, number, number, number]),
             "llvm.prefetch.p0",
         )
-        place = builder.bitcast(_row_pointer(context, builder, signature, arguments), byte)
+        place = _item_pointer(context, builder, signature, arguments, ir.IntType(8))
         builder.call(fetch, [place, *(ir.Constant(number, n) for n in (0, 3, 1))])
         return context.get_dummy_value()
 
@@ -137,22 +233,12 @@ def prefetch(typing_context, array, row, column):
 
 
 @operation
-def store4(typing_context, array, row, column, values):
-    """`array[row, column : column + 4] = values`; row and column are not checked."""
-
-    def code(context, builder, signature, arguments):
-        builder.store(arguments[3], _row_pointer(context, builder, signature, arguments), align=4)
-        return context.get_dummy_value()
-
-    return none(array, intp, intp, vector4), code
-
-
-@operation
 def scale4(typing_context, factor, values):
     """`factor * values`."""
 
     def code(context, builder, signature, arguments):
-        return builder.fmul(_broadcast(builder, arguments[0]), arguments[1], flags=FAST_MATH_FLAGS)
+        factors = _broadcast(builder, arguments[0], 4)
+        return builder.fmul(factors, arguments[1], flags=FAST_MATH_FLAGS)
 
     return vector4(float32, vector4), code
 

@@ -36,6 +36,15 @@ def _box_coordinates(points, start, stop, low, places):
 
 
 @compile_kernel(inline="always")
+def _box_coordinates_of_rows(points, rows, start, stop, low, places):
+    """Offsets of the points in a block of `rows` from the box's corner, metres."""
+    for i in range(stop - start):
+        row = rows[start + i]
+        for axis in range(3):
+            places[axis, i] = points[row, axis] - low[axis]
+
+
+@compile_kernel(inline="always")
 def _locate_cells(places, number, scale, counts, cells, within):
     """The cell of each place on one level, and the place's offset in it, in cells."""
     for axis in range(3):
@@ -82,35 +91,39 @@ def _trilinear_weights(within, number, weights):
         weights[4, i], weights[5, i], weights[6, i], weights[7, i] = a * z, b * z, c * z, d * z
 
 
+@compile_kernel(inline="always")
+def encode_block(points, start, stop, low, cells_per_m, counts, dense, offsets, table, features):
+    """Features of the points from `start` to `stop`, at most `POINTS_PER_BLOCK`, as `encode`."""
+    number = stop - start
+    places, within = np.empty((3, POINTS_PER_BLOCK), F32), np.empty((3, POINTS_PER_BLOCK), F32)
+    cells = np.empty((3, POINTS_PER_BLOCK), I32)
+    entries, weights = np.empty((8, POINTS_PER_BLOCK), I32), np.empty((8, POINTS_PER_BLOCK), F32)
+    _box_coordinates(points, start, stop, low, places)
+    for level in range(cells_per_m.shape[0]):
+        first, size = offsets[level], offsets[level + 1] - offsets[level]
+        _locate_cells(places, number, cells_per_m[level], counts[level], cells, within)
+        _corner_entries(cells, number, counts[level], dense[level], first, size, entries)
+        _trilinear_weights(within, number, weights)
+        for i in range(number):
+            total = scale4(weights[0, i], load4(table, entries[0, i], 0))
+            for corner in range(1, 8):
+                entry = load4(table, entries[corner, i], 0)
+                total = add4(total, scale4(weights[corner, i], entry))
+            store4(features, start + i, level * FEATURES_PER_LEVEL, total)
+
+
 @compile_kernel(parallel=True, **FAST_MATH)
 def encode(points, low, cells_per_m, counts, dense, offsets, table, features):
     """Trilinear features of all levels; points outside the box extrapolate from its border."""
     for block in prange((points.shape[0] + POINTS_PER_BLOCK - 1) // POINTS_PER_BLOCK):
         start = block * POINTS_PER_BLOCK
-        number = min(points.shape[0] - start, POINTS_PER_BLOCK)
-        places, within = np.empty((3, POINTS_PER_BLOCK), F32), np.empty((3, POINTS_PER_BLOCK), F32)
-        cells = np.empty((3, POINTS_PER_BLOCK), I32)
-        entries, weights = (
-            np.empty((8, POINTS_PER_BLOCK), I32),
-            np.empty((8, POINTS_PER_BLOCK), F32),
-        )
-        _box_coordinates(points, start, start + number, low, places)
-        for level in range(cells_per_m.shape[0]):
-            first, size = offsets[level], offsets[level + 1] - offsets[level]
-            _locate_cells(places, number, cells_per_m[level], counts[level], cells, within)
-            _corner_entries(cells, number, counts[level], dense[level], first, size, entries)
-            _trilinear_weights(within, number, weights)
-            for i in range(number):
-                total = scale4(weights[0, i], load4(table, entries[0, i], 0))
-                for corner in range(1, 8):
-                    entry = load4(table, entries[corner, i], 0)
-                    total = add4(total, scale4(weights[corner, i], entry))
-                store4(features, start + i, level * FEATURES_PER_LEVEL, total)
+        stop = min(start + POINTS_PER_BLOCK, points.shape[0])
+        encode_block(points, start, stop, low, cells_per_m, counts, dense, offsets, table, features)
 
 
 @compile_kernel(parallel=True, **FAST_MATH)
 def _encode_backward(
-    points, low, cells_per_m, counts, dense, offsets, grad_features, grad_table, threads
+    points, rows, low, cells_per_m, counts, dense, offsets, grad_features, grad_table, threads
 ):
     for thread in prange(threads):
         places, within = np.empty((3, POINTS_PER_BLOCK), F32), np.empty((3, POINTS_PER_BLOCK), F32)
@@ -119,9 +132,9 @@ def _encode_backward(
             np.empty((8, POINTS_PER_BLOCK), I32),
             np.empty((8, POINTS_PER_BLOCK), F32),
         )
-        for start in range(0, points.shape[0], POINTS_PER_BLOCK):
-            number = min(points.shape[0] - start, POINTS_PER_BLOCK)
-            _box_coordinates(points, start, start + number, low, places)
+        for start in range(0, rows.shape[0], POINTS_PER_BLOCK):
+            number = min(rows.shape[0] - start, POINTS_PER_BLOCK)
+            _box_coordinates_of_rows(points, rows, start, start + number, low, places)
             for level in range(thread, cells_per_m.shape[0], threads):
                 first, size = offsets[level], offsets[level + 1] - offsets[level]
                 _locate_cells(places, number, cells_per_m[level], counts[level], cells, within)
@@ -136,11 +149,11 @@ def _encode_backward(
 
 
 def encode_backward(
-    points, low, cells_per_m, counts, dense, offsets, grad_features, grad_table
+    points, rows, low, cells_per_m, counts, dense, offsets, grad_features, grad_table
 ) -> None:
-    """Adds the gradient of `encode` with respect to its table to `grad_table`."""
+    """Adds the gradient of `encode` at the points in `rows`, by its table, to `grad_table`."""
     _encode_backward(
-        points, low, cells_per_m, counts, dense, offsets, grad_features, grad_table,
+        points, rows, low, cells_per_m, counts, dense, offsets, grad_features, grad_table,
         get_num_threads(),
     )  # fmt: skip
 
@@ -177,16 +190,20 @@ def _add_point_gradient(within, corner_gradients, number, scale, total):
 
 @compile_kernel(parallel=True, **FAST_MATH)
 def encode_points_backward(
-    points, low, cells_per_m, counts, dense, offsets, table, grad_features, grad_points
-):
-    """Gradient of `encode` with respect to its points, written to `grad_points`."""
-    for block in prange((points.shape[0] + POINTS_PER_BLOCK - 1) // POINTS_PER_BLOCK):
+    points, rows, low, cells_per_m, counts, dense, offsets, table, grad_features, factor,
+    grad_points,
+):  # fmt: skip
+    """Gradient of `encode` times a factor, by the points in `rows`, written to `grad_points`.
+
+    `grad_features` has the features of these points, and may have more levels than `cells_per_m`.
+    """
+    for block in prange((rows.shape[0] + POINTS_PER_BLOCK - 1) // POINTS_PER_BLOCK):
         start = block * POINTS_PER_BLOCK
-        number = min(points.shape[0] - start, POINTS_PER_BLOCK)
+        number = min(rows.shape[0] - start, POINTS_PER_BLOCK)
         places, within = np.empty((3, POINTS_PER_BLOCK), F32), np.empty((3, POINTS_PER_BLOCK), F32)
         cells, entries = np.empty((3, POINTS_PER_BLOCK), I32), np.empty((8, POINTS_PER_BLOCK), I32)
         pulls, total = np.empty((8, POINTS_PER_BLOCK), F32), np.zeros((3, POINTS_PER_BLOCK), F32)
-        _box_coordinates(points, start, start + number, low, places)
+        _box_coordinates_of_rows(points, rows, start, start + number, low, places)
         for level in range(cells_per_m.shape[0]):
             first, size = offsets[level], offsets[level + 1] - offsets[level]
             _locate_cells(places, number, cells_per_m[level], counts[level], cells, within)
@@ -197,8 +214,19 @@ def encode_points_backward(
                     pulls[corner, i] = dot4(load4(table, entries[corner, i], 0), grad)
             _add_point_gradient(within, pulls, number, cells_per_m[level], total)
         for i in range(number):
+            row = rows[start + i]
             for axis in range(3):
-                grad_points[start + i, axis] = total[axis, i]
+                grad_points[row, axis] = factor * total[axis, i]
+
+
+@compile_kernel(inline="always", **FAST_MATH)
+def _adam_block(g, m, v, p, rate, new_share, new_square_share, scale, eps):
+    for i in range(p.shape[0]):
+        here = g[i]
+        m[i] += (here - m[i]) * new_share
+        v[i] += (here * here - v[i]) * new_square_share
+        p[i] -= rate * m[i] / (np.sqrt(v[i]) * scale + eps)
+        g[i] = F32(0)
 
 
 @compile_kernel(parallel=True, **FAST_MATH)
@@ -209,10 +237,13 @@ def adam_step(grad, mean, square, parameter, rate, new_share, new_square_share, 
     """
     for block in prange((parameter.shape[0] + ENTRIES_PER_BLOCK - 1) // ENTRIES_PER_BLOCK):
         part = slice(block * ENTRIES_PER_BLOCK, (block + 1) * ENTRIES_PER_BLOCK)
-        g, m, v, p = grad[part], mean[part], square[part], parameter[part]
-        for i in range(p.shape[0]):
-            here = g[i]
-            m[i] += (here - m[i]) * new_share
-            v[i] += (here * here - v[i]) * new_square_share
-            p[i] -= rate * m[i] / (np.sqrt(v[i]) * scale + eps)
-            g[i] = F32(0)
+        _adam_block(
+            grad[part], mean[part], square[part], parameter[part],
+            rate, new_share, new_square_share, scale, eps,
+        )  # fmt: skip
+
+
+@compile_kernel(**FAST_MATH)
+def adam_block_step(grad, mean, square, parameter, rate, new_share, new_square_share, scale, eps):
+    """`adam_step` on one block, for which threads are not worth waking."""
+    _adam_block(grad, mean, square, parameter, rate, new_share, new_square_share, scale, eps)

@@ -189,10 +189,10 @@ def update_roots(
                         roots[n, 2] = z + dz
 
 
-@compile_kernel(**FAST_MATH)
+@compile_kernel(parallel=True, **FAST_MATH)
 def add_rays(
     slots, wrenches, loss, min_loss, scale, room, parents, turns, places, root_turns,
-    counts, gradients, curvatures, moments, powers,
+    counts, gradients, curvatures, moments, powers, threads,
 ):  # fmt: skip
     """Adds rays to the normal equations of their slots' poses, in units of the prior's sigmas.
 
@@ -200,7 +200,7 @@ def add_rays(
     dL/dω = -Σ (M - c × F) over these bones' wrenches (F, M), in body-frame axes. It is expressed in
     the axes of the joint, in which the corrections are. The root's shift is in the given body
     frame, the forces are in the corrected one. Each ray's loss ℓ is half of a square, ℓ = ρ²/2, so
-    that its curvature is ∇ℓ ∇ℓᵀ / 2ℓ.
+    that its curvature is ∇ℓ ∇ℓᵀ / 2ℓ. Each of `threads` threads adds to slots of its own.
 
     Args:
         wrenches: Of each ray's bones (rays, 24, 6).
@@ -216,49 +216,50 @@ def add_rays(
         moments: Sums of ∇ℓ ∇ℓᵀ, alike; of zero slots if they are not needed.
         powers: Sums of |∇ℓ|² and of |∇ℓ|² / 2ℓ (slots, 2).
     """
-    total, g = np.empty((JOINTS, 6), F32), np.zeros(PADDED, F32)
-    for ray in range(slots.shape[0]):
-        slot = slots[ray]
-        if counts[slot] >= room[slot]:
-            continue
-        counts[slot] += 1
-        total[:] = wrenches[ray]
-        # the wrench of the whole branch below each joint
-        for joint in range(JOINTS - 1, 0, -1):
-            for q in range(6):
-                total[parents[joint], q] += total[joint, q]
-        for joint in range(JOINTS):
-            x, y, z = places[slot, joint, 0], places[slot, joint, 1], places[slot, joint, 2]
-            fx, fy, fz = total[joint, 0], total[joint, 1], total[joint, 2]
-            # u = c × F - M, and its derivative by the correction, σ Rᵀ u
-            ux = y * fz - z * fy - total[joint, 3]
-            uy = z * fx - x * fz - total[joint, 4]
-            uz = x * fy - y * fx - total[joint, 5]
+    for thread in prange(threads):
+        total, g = np.empty((JOINTS, 6), F32), np.zeros(PADDED, F32)
+        for ray in range(slots.shape[0]):
+            slot = slots[ray]
+            if slot % threads != thread or counts[slot] >= room[slot]:
+                continue
+            counts[slot] += 1
+            total[:] = wrenches[ray]
+            # the wrench of the whole branch below each joint
+            for joint in range(JOINTS - 1, 0, -1):
+                for q in range(6):
+                    total[parents[joint], q] += total[joint, q]
+            for joint in range(JOINTS):
+                x, y, z = places[slot, joint, 0], places[slot, joint, 1], places[slot, joint, 2]
+                fx, fy, fz = total[joint, 0], total[joint, 1], total[joint, 2]
+                # u = c × F - M, and its derivative by the correction, σ Rᵀ u
+                ux = y * fz - z * fy - total[joint, 3]
+                uy = z * fx - x * fz - total[joint, 4]
+                uz = x * fy - y * fx - total[joint, 5]
+                for a in range(3):
+                    g[3 * joint + a] = F32(scale[0]) * (
+                        turns[slot, joint, 0, a] * ux
+                        + turns[slot, joint, 1, a] * uy
+                        + turns[slot, joint, 2, a] * uz
+                    )
+            # the shift moves the whole body: -σ R F, with R the root's correction
             for a in range(3):
-                g[3 * joint + a] = F32(scale[0]) * (
-                    turns[slot, joint, 0, a] * ux
-                    + turns[slot, joint, 1, a] * uy
-                    + turns[slot, joint, 2, a] * uz
+                g[72 + a] = -F32(scale[1]) * (
+                    root_turns[slot, a, 0] * total[0, 0]
+                    + root_turns[slot, a, 1] * total[0, 1]
+                    + root_turns[slot, a, 2] * total[0, 2]
                 )
-        # the shift moves the whole body: -σ R F, with R the root's correction
-        for a in range(3):
-            g[72 + a] = -F32(scale[1]) * (
-                root_turns[slot, a, 0] * total[0, 0]
-                + root_turns[slot, a, 1] * total[0, 1]
-                + root_turns[slot, a, 2] * total[0, 2]
-            )
-        weight, power = F32(0.5) / (max(loss[ray], F32(0)) + F32(min_loss)), F32(0)
-        for i in range(75):
-            power += g[i] * g[i]
-            gradients[slot, i] += g[i]
-            weighted = weight * g[i]
-            for k in range(PADDED):
-                curvatures[slot, i, k] += weighted * g[k]
-            if moments.shape[0] > 0:
+            weight, power = F32(0.5) / (max(loss[ray], F32(0)) + F32(min_loss)), F32(0)
+            for i in range(75):
+                power += g[i] * g[i]
+                gradients[slot, i] += g[i]
+                weighted = weight * g[i]
                 for k in range(PADDED):
-                    moments[slot, i, k] += g[i] * g[k]
-        powers[slot, 0] += power
-        powers[slot, 1] += weight * power
+                    curvatures[slot, i, k] += weighted * g[k]
+                if moments.shape[0] > 0:
+                    for k in range(PADDED):
+                        moments[slot, i, k] += g[i] * g[k]
+            powers[slot, 0] += power
+            powers[slot, 1] += weight * power
 
 
 @compile_kernel(**FAST_MATH)

@@ -8,6 +8,7 @@ from jaxtyping import Float32, Int32, Int64, UInt8
 from torch import Tensor
 
 FEATURES_PER_LEVEL = 4
+HIDDEN_WIDTH = 64
 """Features per entry. Fixed: the kernels are compiled for it (16 bytes are one vector)."""
 PRIMES = (1, 2654435761, 805459861)
 """Müller et al. 2022, eq. 4: h(x) = (⊕ x_i π_i) mod T."""
@@ -94,6 +95,13 @@ Features = Float32[Tensor, "points width"]
 """Hash-grid features at points."""
 HashTable = Float32[Tensor, "entries 4"]
 """The hash grid's entries, level after level."""
+NetworkLayers = tuple[
+    Float32[Tensor, "width hidden"],
+    Float32[Tensor, "hidden"],
+    Float32[Tensor, "hidden 4"],
+    Float32[Tensor, "4"],
+]
+"""Weights and biases of the network's two layers, or their gradients."""
 RawOutputs = Float32[Tensor, "samples 4"]
 """The network's outputs: color logits and log density (log 1/m)."""
 PremultipliedPixels = Float32[Tensor, "rays 4"]

@@ -8,6 +8,7 @@ except for the serial `solve_correspondences`. `baselines.torch_reference` and
 
 import threading
 
+import numba
 import numpy as np
 import torch
 from jaxtyping import Float32, Int32, Int64
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from avatar.kernels import (
     numba_correspondence,
+    numba_field,
     numba_hash_grid,
     numba_pose,
     numba_rendering,
@@ -28,6 +30,7 @@ from avatar.kernels.operands import (
     HashLevels,
     HashTable,
     MarchSettings,
+    NetworkLayers,
     NormalVolume,
     Points,
     PremultipliedPixels,
@@ -53,24 +56,78 @@ def encode(points: Points, table: HashTable, levels: HashLevels) -> Features:
 
 
 def encode_backward(
-    points: Points, grad_features: Features, levels: HashLevels, grad_table: HashTable
+    points: Points,
+    rows: Int64[Tensor, "some"],
+    grad_features: Float32[Tensor, "some width"],
+    levels: HashLevels,
+    grad_table: HashTable,
 ) -> None:
-    """Adds the table's gradient to `grad_table`."""
+    """Adds the table's gradient to `grad_table`; `grad_features` are of the points in `rows`."""
     numba_hash_grid.encode_backward(
-        points.numpy(), *_level_arrays(levels), grad_features.numpy(), grad_table.numpy()
-    )
+        points.numpy(), rows.numpy(), *_level_arrays(levels), grad_features.numpy(),
+        grad_table.numpy(),
+    )  # fmt: skip
 
 
 def encode_points_backward(
-    points: Points, grad_features: Features, table: HashTable, levels: HashLevels
+    points: Points,
+    rows: Int64[Tensor, "some"],
+    grad_features: Float32[Tensor, "some width"],
+    table: HashTable,
+    levels: HashLevels,
+    factor: float = 1.0,
 ) -> Points:
-    """Gradient of the features with respect to the points."""
-    grad = torch.empty_like(points)
+    """Gradient of the features with respect to the points, times a factor; zero but in `rows`.
+
+    `grad_features` are of these points, and may have finer levels than `levels`, which do not
+    count.
+    """
+    grad = torch.zeros_like(points)
     numba_hash_grid.encode_points_backward(
-        points.numpy(), *_level_arrays(levels), table.detach().numpy(), grad_features.numpy(),
-        grad.numpy(),
+        points.numpy(), rows.numpy(), *_level_arrays(levels), table.detach().numpy(),
+        grad_features.numpy(), np.float32(factor), grad.numpy(),
     )  # fmt: skip
     return grad
+
+
+def field_forward(
+    points: Points, table: HashTable, levels: HashLevels, network: NetworkLayers
+) -> tuple[Features, RawOutputs]:
+    """Hash-grid features and raw outputs."""
+    rows = -(-len(points) // 4) * 4
+    features, raw = torch.empty(rows, levels.feature_width), torch.empty(len(points), 4)
+    first, bias, second, second_bias = (part.detach().numpy() for part in network)
+    numba_field.forward(
+        points.numpy(), *_level_arrays(levels), table.detach().numpy(), first, bias[None],
+        np.ascontiguousarray(second.T), second_bias, features.numpy(), raw.numpy(),
+    )  # fmt: skip
+    return features[: len(points)], raw
+
+
+def network_backward(
+    features: Features,
+    rows: Int64[Tensor, "some"],
+    grad_raw: Float32[Tensor, "some 4"],
+    network: NetworkLayers,
+    *,
+    is_frozen: bool = False,
+) -> tuple[Float32[Tensor, "some width"], NetworkLayers | None]:
+    """Gradients of the features of the points in `rows`, and of the layers unless frozen."""
+    first, bias, second, _ = (part.detach().numpy() for part in network)
+    (width, hidden), threads = first.shape, numba.get_num_threads()
+    transposed = np.zeros((hidden, -(-width // 8) * 8), dtype=np.float32)
+    transposed[:, :width] = first.T
+    grad_features = torch.empty(len(rows), width)
+    sizes = (0, 0, 0) if is_frozen else (width, 4, 2)
+    sums = [np.zeros((threads, size, hidden), dtype=np.float32) for size in sizes]
+    numba_field.backward(
+        features.numpy(), rows.numpy(), grad_raw.numpy(), first, bias[None],
+        np.ascontiguousarray(second.T), transposed, grad_features.numpy(), *sums,
+    )  # fmt: skip
+    if is_frozen:
+        return grad_features, None
+    grad_first, grad_second, grad_biases = (torch.from_numpy(part.sum(axis=0)) for part in sums)
+    return grad_features, (grad_first, grad_biases[0], grad_second.T, grad_biases[1, :4])
 
 
 def _level_arrays(
@@ -93,7 +150,9 @@ def adam_step(
     `mean` and `square` are the running means of the gradient and of its square.
     """
     (first, second), (rate, scale) = how.betas, how.scales
-    numba_hash_grid.adam_step(
+    is_small = parameter.numel() <= numba_hash_grid.ENTRIES_PER_BLOCK
+    step = numba_hash_grid.adam_block_step if is_small else numba_hash_grid.adam_step
+    step(
         *(part.detach().view(-1).numpy() for part in (grad, mean, square, parameter)),
         *map(np.float32, (rate, 1.0 - first, 1.0 - second, scale, how.eps)),
     )

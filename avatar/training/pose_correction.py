@@ -15,6 +15,7 @@ import math
 from collections.abc import Mapping
 from typing import NamedTuple, final
 
+import numba
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
 
@@ -263,7 +264,7 @@ class RaySums:
         numba_pose.add_rays(
             slots, wrenches, loss, MIN_RAY_LOSS, (PRIOR_SIGMA_RAD, PRIOR_SIGMA_M), room,
             self._parents, *joints, self.counts, self._gradients, self._curvatures,
-            self._moments, self._powers,
+            self._moments, self._powers, numba.get_num_threads(),
         )  # fmt: skip
 
     def equations(self, slot: int) -> NormalEquations:

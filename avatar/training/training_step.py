@@ -140,7 +140,7 @@ def compute_gradients(
     weight = config.unseen_weight / config.unseen_points
     grads += [radiance_field.source_gradient(raw_asked[-1], pairs.weights, weight)]
     drawn, drawn_grads = draw_by_strength(torch.cat(grads), config.faint_gradient_share, generator)
-    grad_features = field.backward(seen.rows(drawn), drawn_grads)
+    grad_features = field.backward(seen, drawn_grads, drawn)
     if poses is not None and count:
         drawn = drawn[drawn < count]
         _accumulate_pose_gradients(
@@ -249,10 +249,13 @@ def _accumulate_pose_gradients(
     """Adds the wrenches that the samples exert on the bones of their frames' poses."""
     levels = field.levels.coarser_than(poses.min_gradient_cell_m)
     # undo the mean over rays: a pose is judged by the loss of each of its rays
-    each = grad_features[: len(drawn), : levels.feature_width] * len(loss)
-    grad_points = torch.zeros_like(samples.points)
-    grad_points[drawn] = operations.encode_points_backward(
-        samples.points[drawn], each, field.table, levels
+    grad_points = operations.encode_points_backward(
+        samples.points,
+        drawn,
+        grad_features[: len(drawn)],
+        field.table,
+        levels,
+        factor=float(len(loss)),
     )
     wrenches = operations.bone_wrenches(
         samples, grad_points, slots, cells, poses.skinning, poses.bones

@@ -7,7 +7,8 @@ import torch
 
 from avatar import radiance_field
 from avatar.config import TrainConfig
-from avatar.radiance_field import OPACITY_LENGTH_M, OpacityWithSlope
+from avatar.kernels.numba_priors import OPACITY_LENGTH_M
+from avatar.radiance_field import OpacityWithSlope
 
 
 def raw_of(*opacities: float) -> torch.Tensor:

@@ -68,7 +68,7 @@ def test_compiled_table_gradient_agrees_with_autograd(levels, generator, count):
     points = points_in(levels, count, generator)
     slope = torch.randn(count, levels.feature_width, generator=generator)
     ours = torch.zeros(levels.entries, FEATURES_PER_LEVEL)
-    operations.encode_backward(points, slope, levels, ours)
+    operations.encode_backward(points, torch.arange(count), slope, levels, ours)
     leaf = torch.zeros_like(ours, requires_grad=True)
     (theirs,) = torch.autograd.grad(torch_reference.encode(points, leaf, levels), leaf, slope)
     torch.testing.assert_close(ours, theirs, atol=1e-4, rtol=1e-4)

@@ -1,4 +1,4 @@
-"""Whatever needs no BLAS is bit-equal for any number of threads."""
+"""Whatever does not sum over points is bit-equal for any number of threads."""
 
 import numba
 import pytest
@@ -8,8 +8,9 @@ from avatar.kernels import operations
 from avatar.kernels.operands import AdamSettings, MarchSettings
 
 OPERATIONS = (
-    "encode", "encode_backward", "encode_points_backward", "march", "composite", "composite_loss",
-    "scatter_max_density", "bone_wrenches", "update_roots", "mean_normals", "adam_step",
+    "encode", "field_forward", "encode_backward", "encode_points_backward", "march", "composite",
+    "composite_loss", "scatter_max_density", "bone_wrenches", "update_roots", "mean_normals",
+    "adam_step",
 )  # fmt: skip
 
 
@@ -25,8 +26,12 @@ def results_of(learnt) -> dict[str, list[torch.Tensor]]:
     raw = torch.randn(count, 4, generator=generator)
     slope = torch.randn(count, field.levels.feature_width, generator=generator)
     grad_table = torch.zeros_like(field.table)
-    operations.encode_backward(points, slope, field.levels, grad_table)
-    grad_points = operations.encode_points_backward(points, slope, field.table, field.levels)
+    rows = torch.arange(0, count, 2)
+    operations.encode_backward(points, rows, slope[rows], field.levels, grad_table)
+    grad_points = operations.encode_points_backward(
+        points, rows, slope[rows], field.table, field.levels
+    )
+    features, outputs = operations.field_forward(points, field.table, field.levels, field.network)
     operations.scatter_max_density(points, raw[:, 3].contiguous(), grid)
     wrenches = operations.bone_wrenches(
         samples, grad_points, batch.rays.slots, cells, poses.skinning, poses.bones
@@ -41,6 +46,7 @@ def results_of(learnt) -> dict[str, list[torch.Tensor]]:
         "mean_normals": [normals],
         "adam_step": stepped[1:],
         "encode": [operations.encode(points, field.table, field.levels)],
+        "field_forward": [features, outputs],
         "encode_backward": [grad_table],
         "encode_points_backward": [grad_points],
         "march": list(samples),

@@ -83,8 +83,10 @@ def test_the_features_gradient_for_the_points_is_that_of_autograd(levels, genera
     leaf = points.clone().requires_grad_()
     features = torch_reference.encode(leaf, table, levels)
     (expected,) = torch.autograd.grad(features, leaf, slope)
-    found = operations.encode_points_backward(points, slope, table, levels)
-    torch.testing.assert_close(found, expected, atol=1e-2, rtol=1e-4)
+    rows = torch.randperm(500, generator=generator)[:300].sort().values
+    found = operations.encode_points_backward(points, rows, slope[rows], table, levels, factor=3.0)
+    torch.testing.assert_close(found[rows], 3.0 * expected[rows], atol=3e-2, rtol=1e-4)
+    assert int((found != 0.0).any(dim=1).sum()) == len(rows)
 
 
 def test_compiled_wrenches_agree_with_their_meaning(rig, table, generator):

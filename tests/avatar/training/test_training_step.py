@@ -9,6 +9,7 @@ import torch
 from avatar import radiance_field
 from avatar.config import MAX_SAMPLE_STEP_M, TrainConfig
 from avatar.kernels import operations
+from avatar.kernels.numba_priors import OPACITY_LENGTH_M
 from avatar.kernels.operands import MarchSettings, RaySamples
 from avatar.training.frame_stream import prepare_frame
 from avatar.training.pose_optimizer import PoseOptimizer
@@ -60,7 +61,7 @@ def mean_loss(trainer, parameters, samples, empty, pairs, solid, close, gaps, ba
     parts = [len(part) for part in (empty, pairs, solid, close, gaps)]
     loss = loss + FIRM_SHARE * of_close_pairs(raw[count:].split(parts)[3], close)
     density = torch.exp(raw[count:, 3].clamp(max=torch_reference.MAX_LOG_DENSITY))
-    opacity = 1.0 - torch.exp(-density * radiance_field.OPACITY_LENGTH_M)
+    opacity = 1.0 - torch.exp(-density * OPACITY_LENGTH_M)
     of_empty, of_pairs, of_solid, *_ = opacity.split(parts)
     loss = loss + CONFIG.empty_space_weight * of_empty.mean()
     if len(gaps):
@@ -100,10 +101,7 @@ def one_step(trainer):
     cells = trainer.replay.correspondences
     samples = operations.march(batch.rays, cells, occupancy.density_grid, how)
     empty = occupancy.sample_empty(CONFIG.empty_space_points, generator)
-    drawn = CONFIG.density_tv_pairs if len(samples.points) else 0
-    chosen = torch.randint(max(len(samples.points), 1), (drawn,), generator=generator)
-    apart = radiance_field.TV_PAIR_SIGMA_M * torch.randn(drawn, 3, generator=generator)
-    pairs = torch.cat([samples.points[chosen], samples.points[chosen] + apart])
+    pairs = radiance_field.sample_tv_pairs(samples.points, CONFIG, generator)
     solid = occupancy.sample_interior(CONFIG.interior_points, generator)
     close = radiance_field.sample_smoothness_pairs(samples.points, CONFIG, generator)
     gaps = occupancy.sample_off_skin(CONFIG.off_skin_points, generator)
@@ -111,9 +109,7 @@ def one_step(trainer):
     return grads, (samples, empty, pairs, solid, close, gaps, batch)
 
 
-@pytest.mark.parametrize("has_onednn", [radiance_field.HAS_ONEDNN, False])
-def test_the_steps_gradient_is_that_of_autograd(trainer, has_onednn, monkeypatch):
-    monkeypatch.setattr(radiance_field, "HAS_ONEDNN", has_onednn)
+def test_the_steps_gradient_is_that_of_autograd(trainer):
     grads, drawn = one_step(trainer)
     parameters = [p.detach().clone().requires_grad_() for p in trainer.avatar.field.parameters()]
     expected = torch.autograd.grad(mean_loss(trainer, parameters, *drawn), parameters)
