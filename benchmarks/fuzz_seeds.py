@@ -152,12 +152,7 @@ def _masks(folder: Path, film: Path) -> None:
     """Everything that holds masks."""
     masks = open_masks(film / "masks")
     stack = np.stack([masks.alpha(row, masks.size_px) > 0.5 for row in range(masks.count)])
-    runs = [_coded(mask) for mask in stack]
-    files = {
-        "masks.npz": npz_bytes(masks=stack), "masks.npy": npy_bytes(stack.astype(np.uint8)),
-        "coded.json": json.dumps(runs).encode(), "coded.pkl": pickle.dumps(runs),
-        "coded.npy": npy_bytes(np.array(runs, dtype=object)),
-    }  # fmt: skip
+    files = {"masks.npz": npz_bytes(masks=stack), "masks.npy": npy_bytes(stack.astype(np.uint8))}
     for name, data in files.items():
         (folder / name).write_bytes(data)
     shutil.copy(sorted((film / "masks").iterdir())[0], folder / "mask.png")
@@ -167,14 +162,6 @@ def _masks(folder: Path, film: Path) -> None:
     for mask in stack:
         writer.write(np.repeat(255 * mask[..., None].astype(np.uint8), 3, axis=2))
     writer.release()
-
-
-def _coded(mask: np.ndarray) -> dict[str, Any]:
-    """COCO's run lengths, down the columns, not compressed."""
-    flat = np.concatenate([[False], mask.T.ravel(), [False]])
-    edges = np.flatnonzero(np.diff(flat.astype(np.int8)))
-    lengths = np.diff(np.concatenate([[0], edges, [mask.size]]))
-    return {"size": list(mask.shape), "counts": lengths.tolist()}
 
 
 def _cameras(folder: Path, film: Path) -> None:

@@ -36,7 +36,7 @@ from preprocess.capture_paths import (
     find_stream_cameras,
 )
 from preprocess.capture_session import Capture, Provenance
-from preprocess.masks.mask_files import Masks, open_masks, open_tracker_masks
+from preprocess.masks.mask_files import Masks, open_masks
 from preprocess.masks.mask_refinement import GivenMaskRefiner
 from preprocess.masks.mask_sources import (
     AlphaChannelMasks,
@@ -131,19 +131,16 @@ def read_capture(inputs: CaptureInputs) -> ImportedCapture:
 def import_capture(
     inputs: CaptureInputs, paths: CapturePaths, source: FrameSource, body: BodyModel, motion: Motion
 ) -> ImportedCapture:
-    """Join poses with the masks of files or alpha channels, which may lie in the poses' file."""
+    """Join poses with the masks of files or alpha channels."""
     segmenter = _choose_segmenter(inputs, paths.masks, source)
     masks, error = None, ""
-    if segmenter is not None and inputs.masks is None:
-        masks = open_tracker_masks(paths.poses, source, person=inputs.person)
-        segmenter = segmenter if masks is None else None
-    elif segmenter is None and (path := inputs.masks or paths.masks) is not None:
+    if segmenter is None and (path := inputs.masks or paths.masks) is not None:
         try:
-            masks = open_masks(path, invert=inputs.invert_masks, person=inputs.person)
+            masks = open_masks(path, invert=inputs.invert_masks)
         except InputError as unclear:
             if inputs.invert_masks is not None:
                 raise
-            masks = open_masks(path, invert=False, person=inputs.person)
+            masks = open_masks(path, invert=False)
             error = str(unclear)
     paths = replace(paths, masks=None if masks is None else masks.path)
     return ImportedCapture(

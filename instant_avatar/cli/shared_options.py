@@ -40,8 +40,8 @@ class CaptureArguments:
     """Person ID in the pose file (default: the longest track); without poses, which person to
     track: 1 is the leftmost (default: the largest)."""
     masks: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
-    """Masks, one per frame, 255 where the person is: a folder of images, a video, an .npz, or COCO
-    run-length codes. Default: tracked with the poses, or estimated from images and given poses
+    """Masks, one per frame, 255 where the person is: a folder of images, a video, or an .npz.
+    Default: tracked with the poses, or estimated from images and given poses
     (segmenter:blazepose); segmenter:NAME selects another installed segmenter."""
     mask_invert: Flag = False
     """Masks are dark where the person is (default: detected automatically)."""

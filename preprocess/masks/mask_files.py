@@ -4,7 +4,7 @@ Which side of the masks is the person, and whether they hold brightness or objec
 detected from a few samples. Files that hold no readable masks raise `InputError`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -20,10 +20,9 @@ from capture.image_folder import (
     refuse_pipe,
 )
 from capture.input_error import InputError
-from capture.source import FrameSource
-from capture.video import VIDEO_SUFFIXES
-from preprocess.file_content import read_npz, read_untrusted_file
-from preprocess.masks.encoded_masks import is_phalp_tracks, open_mask_video, open_rle_masks
+from capture.source import FrameSelection
+from capture.video import VIDEO_SUFFIXES, DecodedFrame, VideoFile
+from preprocess.file_content import read_npz
 
 MAX_PERSON_FRACTION = 0.5
 """Largest median fraction of the image, and of its rim, that a person covers."""
@@ -33,6 +32,10 @@ MIN_OBJECT_AREA = 0.01
 """Least median fraction of the image that objects cover: compression artifacts cover less."""
 SOFT_MIN, SOFT_MAX = 0.1, 0.9
 """Range of alpha that only the borders of soft masks have."""
+VIDEO_BLACK = 16.0
+"""Brightness of a video up to which alpha is 0: compression rings around edges."""
+VIDEO_WHITE = 239.0
+"""Brightness of a video from which alpha is 1."""
 
 
 def shows_background(samples: list[Float32[np.ndarray, "_ _"]], path: Path) -> bool:
@@ -78,14 +81,6 @@ def _coverage(alpha: Float32[np.ndarray, "height width"]) -> Float[np.ndarray, "
     rim = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])
     return np.array([alpha.mean(), rim.mean()], dtype=np.float64)
 
-
-MALFORMED_TRACK_ERRORS = (
-    ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError,
-)  # fmt: skip
-"""Errors that a malformed file of tracks raises."""
-
-RLE_SUFFIXES = frozenset({".json", ".npy", ".pkl", ".pickle", ".pth", ".pt"})
-"""Suffixes of files that may hold run-length encoded masks."""
 
 POLARITY_SAMPLES = 9
 """Number of masks from which polarity and kind are detected."""
@@ -159,18 +154,17 @@ class Masks:
         return alpha
 
 
-def open_masks(path: Path, *, invert: bool | None = None, person: str | None = None) -> Masks:
-    """Open a folder of images or .npy files, a video, arrays (N, H, W), or run-length codes.
+def open_masks(path: Path, *, invert: bool | None = None) -> Masks:
+    """Open a folder of images or .npy files, a video, or arrays (N, H, W).
 
-    With `invert` the person is dark; None detects it from a few masks. `person` selects one of
-    several people's tracks in a file, None the longest.
+    With `invert` the person is dark; None detects it from a few masks.
     """
     if not path.exists():
         raise InputError(f"There are no masks {path}; expected a folder of images, or an .npz.")
     refuse_pipe(path)
     if path.is_dir():
         return _open_folder(path, invert)
-    count, read = _open_file(path, person)
+    count, read = _open_file(path)
     return Masks(path, count, read, invert=invert)
 
 
@@ -186,58 +180,52 @@ def _open_folder(path: Path, invert: bool | None) -> Masks:
     return Masks(path, len(files), lambda row: read_mask(files[row]), invert=invert, names=names)
 
 
-def open_tracker_masks(
-    path: Path, source: FrameSource, *, person: str | None = None
-) -> Masks | None:
-    """Masks of a track (None: the longest) in a PHALP file, if they match the video; else None."""
-    if path.suffix.lower() not in (".pkl", ".pickle"):
-        return None
-    if not is_phalp_tracks(content := read_untrusted_file(path)):
-        return None
-    try:
-        coded = open_rle_masks(content, path, person)
-        if coded is None or coded[0] != source.frames_in_file:
-            return None
-        count, decode = coded
-        if not any(decode(row).any() for row in range(count)):
-            return None
-        masks = Masks(path, count, lambda row: _to_alpha(decode(row), path), invert=False)
-    except (InputError, *MALFORMED_TRACK_ERRORS):
-        return None
-    return masks if same_aspect_ratio(masks.size_px, source.size_px) else None
-
-
-def _open_rle(path: Path, person: str | None) -> tuple[int, MaskReader] | None:
-    try:
-        return open_rle_masks(read_untrusted_file(path), path, person)
-    except MALFORMED_TRACK_ERRORS as cause:
-        raise InputError(f"{path} holds tracks whose masks cannot be read ({cause}).") from cause
-
-
-def _open_file(path: Path, person: str | None) -> tuple[int, MaskReader]:
-    if path.suffix.lower() in VIDEO_SUFFIXES:
-        count, read = open_mask_video(path)
-        return count, lambda row: _to_alpha(read(row), path)
-    stack = _load_npy(path) if path.suffix.lower() == ".npy" else None
-    if path.suffix.lower() in RLE_SUFFIXES and stack is None:
-        coded = _open_rle(path, person)
-        if coded is None:
-            raise InputError(
-                f"{path} holds no masks: no run-length encoded masks, one or more per frame."
-            )
-        count, decode = coded
-        return count, lambda row: _to_alpha(decode(row), path)
-    if path.suffix.lower() == ".npz":
+def _open_file(path: Path) -> tuple[int, MaskReader]:
+    kind = path.suffix.lower()
+    if kind in VIDEO_SUFFIXES:
+        video = VideoFile(path, FrameSelection())
+        return video.frames_in_file, _MaskVideo(video).read
+    if kind not in (".npz", ".npy"):
+        raise InputError(
+            f"{path} holds no masks that can be read; expected a folder of images, a video, or an "
+            ".npz or .npy (N, height, width). Run-length codes must be written as images first "
+            "(pycocotools.mask.decode)."
+        )
+    if kind == ".npy":
+        stack = _load_npy(path)
+    else:
         arrays = {key: a for key, a in read_npz(path).items() if a.ndim == 3}
         stack = arrays.get("masks", next(iter(arrays.values()), None))
-    elif stack is None:
-        raise InputError(
-            f"{path} holds no masks that can be read; expected a folder of images, a video, an "
-            ".npz or .npy (N, height, width), or COCO's run-length codes (.json, .npy, .pkl)."
-        )
     if stack is None or stack.ndim != 3 or not stack.size:
         raise InputError(f"{path} holds no array of masks (N, height, width).")
     return len(stack), lambda row: _to_alpha(stack[row], path)
+
+
+class _MaskVideo:
+    """Random access to a video's frames; fast in ascending order."""
+
+    def __init__(self, video: VideoFile) -> None:
+        self._video = video
+        self._frames: Iterator[tuple[int, DecodedFrame]] = iter(())
+        self._at = -1
+        self._last: Float32[np.ndarray, "height width"] | None = None
+
+    def read(self, row: int) -> Float32[np.ndarray, "height width"]:
+        """Read the mask of one frame."""
+        if row == self._at and self._last is not None:
+            return self._last
+        if row <= self._at or self._at < 0:
+            self._frames = self._video.numbered()
+        self._at, frame = next((item for item in self._frames if item[0] >= row), (-1, None))
+        image = frame.rgb() if frame is not None and self._at == row else None
+        if image is None:
+            self._at = -1  # the next call decodes from the start
+            raise InputError(f"Frame {row} of the masks {self._video.path} cannot be decoded.")
+        gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+        self._last = np.clip(
+            (gray - np.float32(VIDEO_BLACK)) / np.float32(VIDEO_WHITE - VIDEO_BLACK), 0.0, 1.0
+        )
+        return self._last
 
 
 def _load_npy(path: Path) -> Shaped[np.ndarray, "..."] | None:

@@ -1,20 +1,13 @@
 """Tests for masks in every container and polarity."""
 
-import json
-import pickle
-
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from PIL import Image
 
 from capture.image_folder import silence_opencv
 from capture.input_error import InputError
-from capture.source_opening import open_source
-from preprocess.masks.encoded_masks import decode_rle
-from preprocess.masks.mask_files import open_masks, open_tracker_masks
+from preprocess.masks.mask_files import open_masks
 
 SIZE = (30, 40)
 
@@ -167,135 +160,6 @@ def test_what_holds_no_masks_is_refused(tmp_path, name):
     path.write_bytes(b"junk")
     with pytest.raises(InputError, match=name.split("/")[0]):
         open_masks(tmp_path / name.split("/")[0])
-
-
-def text_of(mask: np.ndarray) -> bytes:
-    """COCO's text of a mask's run lengths, as its maskApi writes it."""
-    flat = mask.T.ravel() > 0
-    ends = np.flatnonzero(np.diff(np.concatenate([[False], flat]).astype(int))).tolist()
-    lengths = np.diff([0, *ends, flat.size]).tolist()
-    text = bytearray()
-    for place, length in enumerate(lengths):
-        value = length - lengths[place - 2] if place > 2 else length
-        more = True
-        while more:
-            group, value = value & 0x1F, value >> 5
-            more = value != (-1 if group & 0x10 else 0)
-            text.append((group | 0x20 if more else group) + 48)
-    return bytes(text)
-
-
-def test_run_lengths_are_those_of_the_standards_own_example():
-    """From the specification of COCO's maskApi: columns first, beginning with zeros."""
-    assert decode_rle({"size": [3, 4], "counts": [1, 2, 5, 4]}).tolist() == [
-        [0, 0, 0, 1], [1, 0, 0, 1], [1, 0, 1, 1]
-    ]  # fmt: skip
-    assert decode_rle({"size": [2, 2], "counts": "04"}).tolist() == [[1, 1], [1, 1]]
-
-
-@given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 2**32 - 1))
-def test_encoded_masks_of_any_shape_round_trip(height, width, seed):
-    rng = np.random.default_rng(seed)
-    mask = np.repeat(rng.random((height, width)) < rng.random(), rng.integers(1, 9), axis=0)
-    code = {"size": list(mask.shape), "counts": text_of(mask)}
-    np.testing.assert_array_equal(decode_rle(code), mask)
-
-
-@pytest.mark.parametrize("container", ["list", "names", "coco", "npy", "several"])
-def test_encoded_masks_are_read_from_every_container(tmp_path, container):
-    hard = [(person(i) > 200).astype(np.uint8) for i in range(12)]
-    codes = [{"size": [40, 30], "counts": text_of(mask).decode()} for mask in hard]
-    names = [f"mask_{i}.png" for i in range(12)]
-    path = tmp_path / ("masks.npy" if container == "npy" else "masks.json")
-    if container == "npy":
-        told = [{**code, "counts": code["counts"].encode()} for code in codes]
-        np.save(path, np.array(told, dtype=object))
-    elif container == "coco":
-        images = [{"id": i + 100, "file_name": names[i]} for i in reversed(range(12))]
-        listed = [
-            {"image_id": i + 100, "segmentation": codes[i]} for i in (3, 1, 2, 0, *range(4, 12))
-        ]
-        path.write_text(json.dumps({"images": images, "annotations": listed}))
-    elif container == "names":
-        path.write_text(json.dumps(dict(sorted(zip(names, codes, strict=True)))))
-    elif container == "several":
-        empty = {"size": [40, 30], "counts": [1200]}
-        path.write_text(json.dumps([[empty, code] if i else [] for i, code in enumerate(codes)]))
-    else:
-        path.write_text(json.dumps(codes))
-    masks = open_masks(path)
-    assert masks.count == 12
-    for row in (11, 0, 5):
-        expected = hard[row] if row or container != "several" else np.zeros((40, 30))
-        np.testing.assert_array_equal(masks.alpha(row, SIZE), expected)
-
-
-def tracks(count: int = 12) -> tuple[dict, list[np.ndarray]]:
-    """PHALP's file: person 7 in all frames but two, 2 in half of them; and the masks of 7."""
-    content, hard = {}, []
-    for row in range(count):
-        mask, other = ((person(row + shift) > 200).astype(np.uint8) for shift in (0, 5))
-        codes = [{"size": [40, 30], "counts": text_of(each)} for each in (other, mask)]
-        content[f"img/{row:06d}.jpg"] = {
-            "time": row, "tid": [2, 7], "mask": codes,
-            "tracked_time": [row % 2, 3 if row in (4, 5) else 0],
-        }  # fmt: skip
-        hard.append(np.zeros_like(mask) if row in (4, 5) else mask)
-    return content, hard
-
-
-def test_one_persons_masks_are_read_from_phalps_tracks(tmp_path):
-    content, hard = tracks()
-    path = tmp_path / "demo.pkl"
-    path.write_bytes(pickle.dumps(content))
-    masks = open_masks(path)
-    assert masks.count == 12
-    for row in range(12):
-        np.testing.assert_array_equal(masks.alpha(row, SIZE), hard[row])
-    second = open_masks(path, person="2").alpha(2, SIZE)
-    np.testing.assert_array_equal(second, person(7) > 200)
-    assert not open_masks(path, person="2").alpha(3, SIZE).any()
-    with pytest.raises(InputError):
-        open_masks(path, person="9")
-
-
-def test_masks_beside_poses_are_taken_only_where_they_fit_the_video(tmp_path):
-    content, hard = tracks()
-    path = tmp_path / "demo.pkl"
-    path.write_bytes(pickle.dumps(content))
-
-    def film(frames: int = 12, size_px: tuple[int, int] = SIZE):
-        folder = tmp_path / f"{frames}_{size_px[0]}"
-        folder.mkdir(exist_ok=True)
-        for row in range(frames):
-            Image.new("RGB", size_px).save(folder / f"{row}.png")
-        return open_source(folder)
-
-    masks = open_tracker_masks(path, film())
-    assert masks is not None
-    np.testing.assert_array_equal(masks.alpha(3, SIZE), hard[3])
-    assert open_tracker_masks(path, film(frames=13)) is None
-    assert open_tracker_masks(path, film(size_px=(64, 64))) is None
-    spoilt = {name: {**frame, "mask": [{"size": [40, 30], "counts": b"abc"}] * 2}
-              for name, frame in content.items()}  # fmt: skip
-    path.write_bytes(pickle.dumps(spoilt))
-    assert open_tracker_masks(path, film()) is None
-
-
-@pytest.mark.parametrize(
-    "code",
-    [
-        {"size": [3, 4], "counts": [5]},
-        {"size": [1 << 20, 1 << 20], "counts": [1 << 40]},
-        {"size": [3, 4], "counts": "o" * 40},
-        {"size": [3, 4], "counts": [-1, 13]},
-    ],
-)
-def test_codes_that_do_not_fill_their_image_are_refused(tmp_path, code):
-    path = tmp_path / "masks.json"
-    path.write_text(json.dumps([code, code]))
-    with pytest.raises(InputError, match="run-length code"):
-        open_masks(path)
 
 
 def test_a_video_of_masks_is_read_in_any_order(tmp_path):
