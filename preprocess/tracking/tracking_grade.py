@@ -29,12 +29,8 @@ MAX_DOUBTFUL_SHARE = 0.5
 """Largest share of doubtful frames of poses that are good enough for an avatar."""
 MIN_PERSON_PX = 96.0
 """Least median height of the person in the frames, px."""
-MIN_VISIBILITY = 0.1
-"""Mean visibility of elbow and wrist, or knee and ankle, below which a limb was guessed."""
-FAST_HEIGHTS_PER_S = 4.5
-"""Speed of a wrist or an ankle above which networks are often wrong, body heights per second."""
-MIN_SPEED_FRAMES = 16
-"""Fewest frames of which speeds are judged; a few photographs have no times."""
+MIN_CUT_FRAMES = 16
+"""Fewest frames in which cuts are looked for; a few photographs have no times."""
 BRIDGED_S = 0.35
 """Gap between two doubtful stretches with the same reason that are joined, seconds."""
 MIN_STRETCH_FRAMES = 3
@@ -50,14 +46,6 @@ JUMP_STEPS = 8.0
 """The same, in medians of that way."""
 JUMPED = "the person jumps to another place; was the film cut here?"
 """Reason of the frames before and after a cut."""
-HIDDEN = "another person is in front"
-"""Reason of frames in which the person was not found, between others with another one near."""
-LIMBS = {
-    "left arm": (13, 15), "right arm": (14, 16), "left leg": (25, 27), "right leg": (26, 28),
-}  # fmt: skip
-"""Key points whose visibility tells whether a limb was seen."""
-ENDS = {"left wrist": 15, "right wrist": 16, "left ankle": 27, "right ankle": 28}
-"""Key points that move fast."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,8 +67,7 @@ class TrackingGrade:
     """Grades of tracked poses.
 
     Attributes:
-        doubtful_share: Share of frames that are doubtful for another reason than a limb that is
-            hidden or fast; those without the person included.
+        doubtful_share: Share of frames that are doubtful; those without the person included.
         iou_mean, iou_worst: IoU of posed body and mask; NaN where no mask could be compared.
         jitter_mm: Median second difference of joints relative to the root, mm per frame squared.
         person_px: Median height of the person in the frames, px.
@@ -203,19 +190,14 @@ def grade_tracking(
     """
     numbers = np.array(sorted(frame_times_s))
     reasons = _reasons_by_frame(keypoints, frame_times_s, iou_of_frame)
-    of_limbs = ("is a guess", "is fast")
-    serious = [
-        [each for each in reasons.get(int(number), ()) if not each.endswith(of_limbs)]
-        for number in numbers
-    ]
-    counts = Counter(each for row in serious for each in row)
+    counts = Counter(each for number in numbers for each in reasons.get(int(number), ()))
     ((main_doubt, main_doubt_frames),) = counts.most_common(1) or [("", 0)]
     ious = np.array([value for value in iou_of_frame.values() if np.isfinite(value)])
     heights, views = np.ptp(keypoints.image_px[:, :, 1], axis=1), _views(motion, camera)
     return TrackingGrade(
         frames=len(numbers),
         found_share=len(keypoints) / max(1, len(numbers)),
-        doubtful_share=float(np.mean([bool(row) for row in serious])),
+        doubtful_share=float(np.mean([int(number) in reasons for number in numbers])),
         iou_mean=float(ious.mean()) if len(ious) else float("nan"),
         iou_worst=float(ious.min()) if len(ious) else float("nan"),
         jitter_mm=_jitter_mm(motion, shaped),
@@ -243,11 +225,10 @@ def _reasons_by_frame(
         for number in keypoints.frames[rows].tolist():
             reasons.setdefault(int(number), []).append(reason)
 
-    tracked, hidden = set(keypoints.frames.tolist()), _frames_hidden_by_others(keypoints)
+    tracked = set(keypoints.frames.tolist())
     for number in frame_times_s:
         if number not in tracked:
-            is_hidden = any(begin < number < end for begin, end in hidden)
-            reasons[number] = [HIDDEN if is_hidden else "the person was not found"]
+            reasons[number] = ["the person was not found"]
     for number, iou in iou_of_frame.items():
         if iou < DOUBTFUL_IOU and number in tracked:
             reasons.setdefault(number, []).append("body and mask disagree")
@@ -255,21 +236,7 @@ def _reasons_by_frame(
         if keypoints.problems is not None:
             note((keypoints.problems & bit) > 0, problem.value)
     note(_jumps(keypoints), JUMPED)
-    for name, points in LIMBS.items():
-        hidden = keypoints.visibility[:, list(points)].mean(axis=1) < MIN_VISIBILITY
-        note(hidden, f"the {name} is hidden, its pose is a guess")
-    for name, point in ENDS.items() if len(keypoints) >= MIN_SPEED_FRAMES else ():
-        note(_speed(keypoints, point, frame_times_s) > FAST_HEIGHTS_PER_S, f"the {name} is fast")
     return reasons
-
-
-def _frames_hidden_by_others(keypoints: KeypointTrack) -> list[tuple[int, int]]:
-    """Frames before and after which another person is near, and between which none was found."""
-    if keypoints.problems is None:
-        return []
-    crowded = (keypoints.problems & PROBLEM_BITS[TrackingProblem.CROWDED]) > 0
-    gaps = np.flatnonzero((np.diff(keypoints.frames) > 1) & crowded[:-1] & crowded[1:])
-    return [(int(keypoints.frames[row]), int(keypoints.frames[row + 1])) for row in gaps]
 
 
 def _frames_to_leave_out(
@@ -286,7 +253,7 @@ def _frames_to_leave_out(
 def _jumps(keypoints: KeypointTrack) -> Bool[np.ndarray, "rows"]:
     """Rows on both sides of a cut in which the person goes on in another place."""
     jumps = np.zeros(len(keypoints), dtype=bool)
-    if len(keypoints) < MIN_SPEED_FRAMES:
+    if len(keypoints) < MIN_CUT_FRAMES:
         return jumps
     hips = keypoints.image_px[:, HIPS].mean(axis=1)
     tall = max(1.0, float(np.median(np.ptp(keypoints.image_px[:, :, 1], axis=1))))
@@ -302,21 +269,6 @@ def _breadth(shaped: ShapedBody) -> float:
     joints = shaped.joints
     shoulders, hips = (np.linalg.norm(joints[a] - joints[b]) for a, b in ((16, 17), (1, 2)))
     return float(np.sqrt(shoulders * hips) / np.ptp(joints[:, 1]))
-
-
-def _speed(
-    keypoints: KeypointTrack, point: int, frame_times_s: Mapping[int, float]
-) -> Float[np.ndarray, "rows"]:
-    """Speed of a key point relative to the hips, median body heights per second."""
-    if len(keypoints) < 2:
-        return np.zeros(len(keypoints))
-    hips = keypoints.image_px[:, HIPS].mean(axis=1)
-    place = keypoints.image_px[:, point] - hips
-    times = np.array([frame_times_s[int(number)] for number in keypoints.frames])
-    span = np.maximum(np.diff(times), 1e-3)
-    steps = np.linalg.norm(np.diff(place, axis=0), axis=1) / span
-    tall = max(1.0, float(np.median(np.ptp(keypoints.image_px[:, :, 1], axis=1))))
-    return np.maximum(np.append(steps, 0.0), np.append(0.0, steps)) / tall
 
 
 def _jitter_mm(motion: Motion, shaped: ShapedBody) -> float:

@@ -10,7 +10,7 @@ from capture.camera import Camera
 from preprocess.body.body_pose import Motion
 from preprocess.body.parametric_body import load_body_model
 from preprocess.tracking.keypoints import KeypointTrack
-from preprocess.tracking.tracking_grade import HIDDEN, TrackingGrade, grade_tracking
+from preprocess.tracking.tracking_grade import TrackingGrade, grade_tracking
 from preprocess.tracking.video_tracking import PROBLEM_BITS, TrackingProblem
 
 FRAMES = 60
@@ -143,16 +143,6 @@ def test_frames_with_another_person_near_are_left_out_unless_they_are_most(shape
     assert grade(shaped, keypoints=most).left_out == ()
 
 
-def test_frames_lost_between_others_with_another_person_near_are_hidden_by_it(shaped):
-    keep = np.r_[0:20, 30:FRAMES]
-    problems = np.where(np.abs(keep - 25) < 8, PROBLEM_BITS[TrackingProblem.CROWDED], 0)
-    arrays = ("frames", "image_px", "world_m", "visibility", "presence")
-    keypoints = some_keypoints()
-    some = {name: getattr(keypoints, name)[keep] for name in arrays}
-    doubts = grade(shaped, keypoints=replace(keypoints, problems=problems, **some)).doubts
-    assert {doubts[number] for number in range(20, 30)} == {HIDDEN}
-
-
 def test_lost_frames_are_reported_by_their_time(shaped):
     keep = np.r_[0:20, 35:FRAMES]
     keypoints = some_keypoints()
@@ -166,20 +156,3 @@ def test_lost_frames_are_reported_by_their_time(shaped):
     found = grade(shaped, keypoints=some)
     assert found.found_share == pytest.approx(45 / 60)
     assert found.stretches[0].describe().startswith("0.7 to 1.1 s")
-
-
-def test_hidden_fast_and_cut_limbs_are_reported(shaped):
-    keypoints = some_keypoints()
-    keypoints.visibility[10:20, [13, 15]] = 0.02
-    problems = np.zeros(FRAMES, dtype=np.int64)
-    problems[30:40] = PROBLEM_BITS[TrackingProblem.BOTTOM]
-    keypoints.image_px[45:50:2, 16, 0] += 150.0
-    reasons = {
-        each.reason
-        for each in grade(shaped, keypoints=replace(keypoints, problems=problems)).stretches
-    }
-    assert reasons == {
-        "the left arm is hidden, its pose is a guess",
-        "the person is cut by the picture's lower border",
-        "the right wrist is fast",
-    }
