@@ -16,7 +16,7 @@ from preprocess.alignment.correction_search import (
     MIN_GAIN,
     CaptureObjective,
     CorrectionResult,
-    find_corrections,
+    CorrectionSearch,
 )
 from preprocess.alignment.corrections import undo_pose_delay
 from preprocess.alignment.keypoint_objective import (
@@ -47,14 +47,11 @@ GOOD_KEYPOINT_SCORE = 0.5
 """Score of the key points from which poses without masks match the images: half of them are within
 4 % of the person's height."""
 NO_KNOWN_MISTAKE = (
-    "No known mistake explains this. Poses or masks may belong to another video or person, or "
-    "tracking may have failed. Recompute them from this video."
+    "No known mistake explains this. Poses or masks may belong to another video or person, "
+    "tracking may have failed, or the masks hold more than this person (another one, a thing that "
+    "touches them, very wide clothes). Recompute them from this video."
 )
 """Diagnosis if no correction helps."""
-MIN_EXCESS = 1.3
-"""Area of masks by the body's from which they hold more than the person."""
-MIN_COVERED = 0.85
-"""Share of the body that such masks cover."""
 QUICK_OFFSETS = (1, -1, 2, -2)
 """Delays of the poses, in frames, that are tested even if poses and masks match."""
 QUICK_GAIN = 0.75 * MIN_GAIN
@@ -106,21 +103,6 @@ class CaptureValidation:
         if self.objective.masks is None:
             return (self.keypoint_score(self.diagnosis.corrected) or 0.0) >= GOOD_KEYPOINT_SCORE
         return self.corrected_iou >= USABLE_IOU
-
-    @property
-    def unexplained(self) -> str:
-        """Sentence on what may be wrong if no correction helps."""
-        masks = self.objective.masks
-        if masks is None or masks.are_boxes:
-            return NO_KNOWN_MISTAKE
-        covered, areas = masks.excess(self.geometry)
-        if covered < MIN_COVERED or areas < MIN_EXCESS:
-            return NO_KNOWN_MISTAKE
-        return (
-            f"The masks show {areas:.1f} times the body's area, and the body lies within them: "
-            "another person or a thing that touches this person is in the masks, or clothes are "
-            "very wide. Give masks of this person alone (--masks)."
-        )
 
     @property
     def is_auto_corrected(self) -> bool:
@@ -206,14 +188,14 @@ def check_aligned_capture(capture: Capture, refused: str | None = None) -> Captu
     count = source.frame_count or len(capture.motion)
     chosen = source.selection
     frames = [chosen.start + chosen.step * number for number in range(count)]
-    diagnosis = find_corrections(
-        geometry, objective, capture.shaped.joints[0],
-        frames=count, mask_count=0 if files is None else files.count,
+    search = CorrectionSearch(
+        objective=objective, pelvis=capture.shaped.joints[0], frames=count,
+        mask_count=0 if files is None else files.count,
     )  # fmt: skip
     upright = replace(geometry, masks_inverted=False)
     return CaptureValidation(
         capture=capture, geometry=geometry, images=images, objective=objective,
-        diagnosis=diagnosis, refusal=refused,
+        diagnosis=search.run(geometry), refusal=refused,
         mask_iou=None if sampled is None else mean_score(sampled.frame_scores(upright)),
         anomalies=(
             *sanity_warnings(geometry, frames), *mask_warnings(sampled, source.size_px[1])
@@ -309,7 +291,7 @@ def correction_hint(imported: ImportedCapture) -> str:
 
 def _explain(check: CaptureValidation) -> str:
     if not check.causes:
-        return check.unexplained
+        return NO_KNOWN_MISTAKE
     words = "; and ".join(each.description for each in check.diagnosis.corrections)
     return f"Probable cause: {words}. {check.expected_improvement}".strip()
 

@@ -13,7 +13,12 @@ from tyro.conf import arg
 
 from capture.atomic_files import OutputFileList, write_text_atomically
 from capture.input_error import InputError
-from instant_avatar.capture_validation import CaptureValidation, check_capture, check_command
+from instant_avatar.capture_validation import (
+    NO_KNOWN_MISTAKE,
+    CaptureValidation,
+    check_capture,
+    check_command,
+)
 from instant_avatar.cli.command_line import BAD_INPUT, DONE, parse_arguments, run_command
 from instant_avatar.cli.console import Console
 from instant_avatar.cli.shared_options import (
@@ -43,7 +48,7 @@ class CheckArguments(CaptureArguments):
     The body is projected with the given poses and camera and compared with the masks, and with key
     points that the built-in tracker finds in 16 images. If they disagree, known mistakes are tested
     one by one: poses late, early, backwards or at another frame rate, OpenGL axes, images rotated
-    for the tracker, degrees, world and camera exchanged, a wrong focal length, left and right
+    for the tracker, world and camera exchanged, a wrong focal length, left and right
     exchanged, EasyMocap's root, another size or unit, masks of the background or of a second
     person, and a video that was rotated, mirrored, cropped or cut on its own. The report names the
     mistake and the IoU after its correction (intersection over union, 0 to 1; good poses reach 0.75
@@ -239,7 +244,7 @@ def _print_findings(check_result: CaptureValidation, console: Console) -> None:
     elif check_result.verdict != "good" and check_result.stored_iou >= GOOD_IOU:
         console.info("Poses and masks match where both exist; see the warnings above.")
     elif check_result.verdict != "good":
-        console.info(check_result.unexplained)
+        console.info(NO_KNOWN_MISTAKE)
 
 
 if __name__ == "__main__":

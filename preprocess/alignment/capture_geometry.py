@@ -192,13 +192,14 @@ def _row_frames(motion: Motion, source: FrameSource) -> Float[np.ndarray, "poses
 
 
 def relative_change(before: CaptureGeometry, after: CaptureGeometry) -> float:
-    """Relative change of focal length, distance or window, whichever is largest."""
+    """Relative change of lens, distance or window, whichever is largest."""
+    shift = np.abs(after.intrinsics[0, :2, 2] - before.intrinsics[0, :2, 2]) / before.size_px
     focal = after.intrinsics[0, 0, 0] / before.intrinsics[0, 0, 0]
     translations, valid = before.motion.root_translations, before.motion.valid
     moved = np.linalg.norm((after.motion.root_translations - translations)[valid])
     distance = moved / max(float(np.linalg.norm(translations[valid])), 1e-9)
     window = np.abs(np.subtract(after.video_transform.window, before.video_transform.window)).max()
-    return max(abs(float(np.log(focal))), float(distance), float(window))
+    return max(abs(float(np.log(focal))), float(shift.max()), float(distance), float(window))
 
 
 def sanity_warnings(geometry: CaptureGeometry, frames: list[int]) -> Iterator[str]:

@@ -163,13 +163,6 @@ def _pose_entries(motion: Motion, pelvis: Float[np.ndarray, "3"]) -> CatalogEntr
     def swapped(motion: Motion) -> Motion:
         return replace(motion, joint_rotations=motion.joint_rotations[:, MIRRORED_JOINTS])
 
-    parts = (motion.root_rotations, motion.joint_rotations)
-    root, joints = (
-        bool((np.linalg.norm(each[motion.valid], axis=-1) > 2.0 * np.pi).any()) for each in parts
-    )
-    if root or joints:
-        change = partial(_degrees_to_radians, root=root, joints=joints)
-        yield "root_rotation", "the rotations are in degrees, not in radians", _moves(change)
     for which, signs in AXIS_FLIPS.items():
         flipped = partial(_transform_translations, change=np.diag(np.array(signs)))
         yield "opengl_axes", f"the root's translation has the wrong sign of {which}", flipped
@@ -218,14 +211,6 @@ def _change_cameras(
 
 def _cameras_at_origin(geometry: CaptureGeometry) -> bool:
     return np.allclose(geometry.extrinsics, np.eye(4), atol=1e-6)
-
-
-def _degrees_to_radians(motion: Motion, root: bool, joints: bool) -> Motion:
-    return replace(
-        motion,
-        root_rotations=np.deg2rad(motion.root_rotations) if root else motion.root_rotations,
-        joint_rotations=np.deg2rad(motion.joint_rotations) if joints else motion.joint_rotations,
-    )
 
 
 def _rotate_camera_space(geometry: CaptureGeometry, turn: Rotation3) -> CaptureGeometry:

@@ -10,27 +10,17 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from preprocess.alignment.capture_geometry import CaptureGeometry, find_jumps, relative_change
+from preprocess.alignment.capture_geometry import CaptureGeometry, relative_change
 from preprocess.alignment.correction_catalog import body_corrections, video_corrections
 from preprocess.alignment.corrections import (
     CAUSES,
     Correction,
-    divide_distances,
-    fit_extrinsics,
-    fit_factor,
-    fit_principal_point,
     fit_to_keypoints,
-    scale_focal_length,
-    stretch_width,
     undo_pose_delay,
     undo_video_offset,
 )
 from preprocess.alignment.keypoint_objective import KeypointObjective
-from preprocess.alignment.silhouette_objective import (
-    SilhouetteObjective,
-    mean_score,
-    mean_with_missing,
-)
+from preprocess.alignment.silhouette_objective import SilhouetteObjective, mean_with_missing
 
 MIN_STANDARD_ERRORS = 3.0
 """Standard errors, over the frames, by which a gain must exceed 0."""
@@ -52,10 +42,6 @@ MIN_FITTED_CHANGE = 0.06
 """Relative change of its number that a fitted correction must make."""
 MIN_WINDOW_CHANGE = 0.02
 """Fraction of the image that a video must be cropped or padded by."""
-CAMERA_SEARCH_BELOW = 0.6
-"""Score below which the listed corrections explain too little: a camera is fitted as well."""
-CAMERA_SEARCH_MIN_GAIN = 0.05
-"""Gain in score that a fitted camera must bring; larger, as it has up to six parameters."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -105,58 +91,22 @@ class CorrectionResult:
     corrected: CaptureGeometry
 
 
-def find_corrections(
-    geometry: CaptureGeometry,
-    objective: CaptureObjective,
-    pelvis: Float[np.ndarray, "3"],
-    *,
-    frames: int,
-    mask_count: int,
-) -> CorrectionResult:
-    """Apply the best correction again and again while that helps significantly.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class CorrectionSearch:
+    """The corrections that are tried, and their scores.
 
-    A camera is fitted where the listed corrections explain too little.
-
-    Args:
-        geometry: The capture as its files state it.
+    Attributes:
         pelvis: Rest position of the pelvis.
         mask_count: Number of masks; 0 if images and masks cannot disagree.
     """
-    search = _CorrectionSearch(
-        objective=objective, pelvis=pelvis, frames=frames, mask_count=mask_count
-    )
-    chosen, corrected, candidates = search.run(geometry)
-    keypoints = objective.keypoints
-    fits = (fit_principal_point, fit_extrinsics) if keypoints is not None else ()
-    for fit in fits if not find_jumps(geometry)[0] else fits[:1]:
-        assert keypoints is not None
-        score = mean_score(objective.frame_scores(corrected))
-        if score >= CAMERA_SEARCH_BELOW:
-            break
-        camera = fit(geometry, keypoints)
-        if camera is None:
-            continue
-        others, better, _ = search.run(camera.apply(geometry))
-        gained = mean_score(objective.frame_scores(better)) - score
-        if gained > CAMERA_SEARCH_MIN_GAIN:
-            chosen, corrected = [camera, *others], better
-            candidates = best_per_cause([*candidates, *evaluate([camera], geometry, objective)])
-    return CorrectionResult(corrections=tuple(chosen), candidates=candidates, corrected=corrected)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _CorrectionSearch:
-    """The corrections that are tried, and their scores; see `find_corrections`."""
 
     objective: CaptureObjective
     pelvis: Float[np.ndarray, "3"]
     frames: int
     mask_count: int
 
-    def run(
-        self, geometry: CaptureGeometry
-    ) -> tuple[list[Correction], CaptureGeometry, tuple[CorrectionCandidate, ...]]:
-        """The corrections, the corrected geometry, and the first round's best candidates."""
+    def run(self, geometry: CaptureGeometry) -> CorrectionResult:
+        """Apply the best correction again and again while that helps significantly."""
         scores = self.objective.frame_scores(geometry)
         chosen: list[Correction] = []
         first: tuple[CorrectionCandidate, ...] = ()
@@ -171,7 +121,7 @@ class _CorrectionSearch:
             winner = min(tied, key=lambda each: CAUSES.index(each.correction.cause))
             chosen.append(winner.correction)
             geometry, scores = winner.correction.apply(geometry), winner.frame_scores
-        return chosen, geometry, first
+        return CorrectionResult(corrections=tuple(chosen), candidates=first, corrected=geometry)
 
     def _best_candidates(self, geometry: CaptureGeometry) -> list[CorrectionCandidate]:
         """The best candidates of the coarse scores, and the best of each cause, scored wholly."""
@@ -201,16 +151,11 @@ class _CorrectionSearch:
             yield from video_corrections(self.frames, self.mask_count)
 
     def _fitted(self, geometry: CaptureGeometry) -> Iterable[Correction]:
-        """The best focal length, size, aspect and window of the video."""
-        masks, keypoints = self.objective.masks, self.objective.keypoints
-        if keypoints is not None:
-            fitted = fit_to_keypoints(geometry, keypoints)
-            return (c for c in fitted if self.mask_count or c.cause != "video_crop")
-        if masks is None or masks.are_boxes:
+        """The best focal length, principal point, size, aspect and window of the video."""
+        if self.objective.keypoints is None:  # outlines alone would fit wide clothes
             return ()
-        few = masks.subset(COARSE_SAMPLES)
-        makers = (scale_focal_length, lambda f: divide_distances(f, self.pelvis), stretch_width)
-        return (fit_factor(make, geometry, few) for make in makers)
+        fitted = fit_to_keypoints(geometry, self.objective.keypoints)
+        return (c for c in fitted if self.mask_count or c.cause != "video_crop")
 
 
 def evaluate(

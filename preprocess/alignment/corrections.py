@@ -1,20 +1,18 @@
 """A mistake in a capture as the change that undoes it: those with a size, and how it is fitted.
 
-Key points give factors, windows and cameras in closed form; masks alone give factors, too.
+Key points give factors, shifts and windows in closed form.
 """
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-import cv2
 import numpy as np
 from jaxtyping import Float
 
 from preprocess.alignment.capture_geometry import FULL_WINDOW, CaptureGeometry
 from preprocess.alignment.keypoint_objective import KeypointObjective
 from preprocess.alignment.silhouette_objective import SilhouetteObjective, mean_with_missing
-from preprocess.body.kinematics import rigid_transform
 
 CAUSES = (
     "mask_polarity", "second_person", "world_frame", "opengl_axes", "root_rotation", "frame_offset",
@@ -28,10 +26,6 @@ MAX_CENTER_OFFSET = 0.45
 """Largest shift of the principal point, as a fraction of the image's sides."""
 MAX_LOG_WINDOW = 0.7
 """Largest logarithm of the size of a cropped or padded video relative to the masks' image."""
-CAMERA_ERROR_HEIGHTS = 0.06
-"""Distance at which a key point is an outlier of a fitted camera, in the person's height."""
-MIN_CAMERA_POINTS = 24
-"""Fewest key points to which a camera is fitted."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -42,7 +36,7 @@ class Correction:
         cause: The mistake, one of `CAUSES`.
         description: The mistake for people: ends the sentence "It looks as if …".
         apply: From the geometry as stated to the geometry as it should have been.
-        factor: The number that was fitted; None of a discrete mistake.
+        factor: The factor that was fitted (1 of a shift); None of a discrete mistake.
         frame_shift: Number of frames of an offset; None of any other mistake.
     """
 
@@ -155,6 +149,7 @@ def shift_principal_point(right_px: float, down_px: float) -> Correction:
         description=f"the principal point is {where}; was the video cropped after its poses or its "
         "camera were made?",
         apply=lambda c: _with_intrinsics(c, shift_px=(right_px, down_px)),
+        factor=1.0,
     )
 
 
@@ -228,7 +223,7 @@ def fit_factor(
 def fit_to_keypoints(
     geometry: CaptureGeometry, objective: KeypointObjective
 ) -> Iterator[Correction]:
-    """The best focal length, size, aspect and window of the video, each fitted alone."""
+    """The best focal length, principal point, size, aspect and window, each fitted alone."""
     bodies, found = objective.bodies(geometry), objective.found_px(geometry)
     if found is None:
         return
@@ -246,6 +241,10 @@ def fit_to_keypoints(
         factor = float(objective.fit(bodies, design[..., None], target)[0])
         if factor > 0.0:
             yield make(factor)
+    design = np.broadcast_to(np.eye(2), (*found.shape, 2))
+    right, down = objective.fit(bodies, design, found - bodies.pixels).tolist()
+    if (np.abs([right, down]) < MAX_CENTER_OFFSET * np.array(geometry.size_px)).all():
+        yield shift_principal_point(right, down)
     if geometry.video_transform.window == FULL_WINDOW:
         inside = (found / geometry.size_px)[..., None]
         axes = np.eye(2)
@@ -254,39 +253,3 @@ def fit_to_keypoints(
         if (np.abs(np.log(np.maximum(sides[2:] - sides[:2], 1e-9))) < MAX_LOG_WINDOW).all():
             left, top, right, bottom = sides.tolist()
             yield undo_video_crop((left, top, right, bottom))
-
-
-def fit_principal_point(
-    geometry: CaptureGeometry, objective: KeypointObjective
-) -> Correction | None:
-    """Fit the principal point that puts bodies on their key points; None if too far for a crop."""
-    bodies, found = objective.bodies(geometry), objective.found_px(geometry)
-    if found is None:
-        return None
-    design = np.broadcast_to(np.eye(2), (*found.shape, 2))
-    right, down = objective.fit(bodies, design, found - bodies.pixels).tolist()
-    near = np.abs([right, down]) < MAX_CENTER_OFFSET * np.array(geometry.size_px)
-    return shift_principal_point(right, down) if near.all() else None
-
-
-def fit_extrinsics(geometry: CaptureGeometry, objective: KeypointObjective) -> Correction | None:
-    """Solve the pose of a static camera from all key points; None if there are several cameras."""
-    bodies, found = objective.bodies(geometry), objective.found_px(geometry)
-    if len(geometry.extrinsics) > 1 or found is None:
-        return None
-    used = bodies.known[:, None] & (objective.confidence >= np.median(objective.confidence))
-    if used.sum() < MIN_CAMERA_POINTS:
-        return None
-    success, turn, shift, _ = cv2.solvePnPRansac(
-        bodies.world_m[used], found[used], geometry.intrinsics[0], np.array(geometry.distortion),
-        reprojectionError=CAMERA_ERROR_HEIGHTS * objective.person_px, flags=cv2.SOLVEPNP_SQPNP,
-    )  # fmt: skip
-    if not success:
-        return None
-    extrinsic = rigid_transform(cv2.Rodrigues(turn)[0], shift[:, 0])
-    return Correction(
-        cause="world_frame",
-        description="the poses are in world coordinates and no file gives the camera's position; "
-        "one that fits was found from the key points",
-        apply=lambda c: replace(c, extrinsics=extrinsic[None]),
-    )

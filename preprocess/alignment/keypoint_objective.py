@@ -7,7 +7,6 @@ by linear equations.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import final
 
 import cv2
 import numpy as np
@@ -25,20 +24,14 @@ from preprocess.fitting.clip_poses import ClipPoses
 from preprocess.fitting.keypoint_rows import KEYPOINT_JOINTS, KEYPOINT_OFFSETS_M, PIXEL_WEIGHTS
 from preprocess.masks.color_models import DarkFilmBrightener
 from preprocess.masks.mask_sources import alpha_channel_mask
-from preprocess.tracking.blazepose_networks import (
-    BlazePoseDetector,
-    BlazePoseLandmarks,
-    FoundLandmarks,
-    PersonSquare,
-)
-from preprocess.tracking.keypoints import MIN_PRESENCE, MIRRORED_POINTS
+from preprocess.tracking.blazepose_networks import FoundLandmarks
+from preprocess.tracking.first_look import PersonFinder
+from preprocess.tracking.keypoints import MIRRORED_POINTS
 
 TRACKED_IMAGES = 16
 """Images in which the person is tracked."""
 MAX_DECODED_FRAMES = 300
 """Frames at the beginning of a video over which they are spread: all of them are decoded."""
-MAX_STEP = 0.1
-"""Way of the person, in sides of its square, after which the network looks again in the new one."""
 THUMBNAIL_PX = 300
 """Height of the images that are kept to be shown."""
 HALF_SCORE_HEIGHTS = 0.04
@@ -71,52 +64,30 @@ def track_images(source: FrameSource) -> tuple[TrackedImage, ...]:
     first = spaced_indices(total, TRACKED_IMAGES)[0]
     begin, end = (chosen.start + chosen.step * place for place in (first, total))
     wanted = reopen(source, slice(begin, end, chosen.step * step))
-    find = _PersonFinder()
-    return tuple(find.track(frame) for frame in wanted.frames() if "corrupt" not in frame.flags)
+    finder, brighten = PersonFinder(), DarkFilmBrightener()
+    whole = (frame for frame in wanted.frames() if "corrupt" not in frame.flags)
+    return tuple(
+        _reduce_image(frame, next(iter(finder.persons(brighten(frame.rgb))), None))
+        for frame in whole
+    )
 
 
-@final
-class _PersonFinder:
-    """Finds one person in image after image, where it was in the one before or anywhere."""
-
-    def __init__(self) -> None:
-        self._detect, self._landmarks = BlazePoseDetector(), BlazePoseLandmarks()
-        self._brighten = DarkFilmBrightener()
-        self._square: PersonSquare | None = None
-
-    def track(self, frame: Frame) -> TrackedImage:
-        rgb = self._brighten(frame.rgb)
-        found = None if self._square is None else self._look(rgb, self._square)
-        if found is None:
-            persons = sorted(self._detect.find_all(rgb), key=lambda each: -each.square.side)
-            candidates = (self._look(rgb, each.square) for each in persons)
-            found = next((each for each in candidates if each is not None), None)
-        self._square = None if found is None else found.square
-        points, confidence = np.zeros((33, 2)), np.zeros(33)
-        if found is not None:
-            points = found.keypoints.image_px
-            confidence = PIXEL_WEIGHTS * found.keypoints.visibility
-        width, height = frame.size_px
-        size = max(1, round(THUMBNAIL_PX * width / height)), THUMBNAIL_PX
-        return TrackedImage(
-            index=frame.index,
-            thumbnail=np.asarray(cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA)),
-            alpha=None if frame.alpha is None else alpha_channel_mask(frame, size),
-            size_px=frame.size_px,
-            image_px=points,
-            confidence=confidence,
-        )
-
-    def _look(
-        self, rgb: UInt8[np.ndarray, "height width 3"], square: PersonSquare
-    ) -> FoundLandmarks | None:
-        """The person in a square; looked at again where that square fits badly."""
-        found = self._landmarks(rgb, square)
-        way = np.hypot(found.square.x - square.x, found.square.y - square.y) / square.side
-        change = abs(np.log(found.square.side / square.side))
-        if found.keypoints.presence >= MIN_PRESENCE and way + change > MAX_STEP:
-            found = self._landmarks(rgb, found.square)
-        return found if found.keypoints.presence >= MIN_PRESENCE else None
+def _reduce_image(frame: Frame, found: FoundLandmarks | None) -> TrackedImage:
+    """What is kept of a frame and of the person that was found in it."""
+    points, confidence = np.zeros((33, 2)), np.zeros(33)
+    if found is not None:
+        points = found.keypoints.image_px
+        confidence = PIXEL_WEIGHTS * found.keypoints.visibility
+    width, height = frame.size_px
+    size = max(1, round(THUMBNAIL_PX * width / height)), THUMBNAIL_PX
+    return TrackedImage(
+        index=frame.index,
+        thumbnail=np.asarray(cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA)),
+        alpha=None if frame.alpha is None else alpha_channel_mask(frame, size),
+        size_px=frame.size_px,
+        image_px=points,
+        confidence=confidence,
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -95,20 +95,6 @@ class SilhouetteObjective:
             drawn, components_touching(alpha, drawn) if geometry.keeps_person_only else alpha
         )
 
-    def excess(self, geometry: CaptureGeometry) -> tuple[float, float]:
-        """Share of the body that masks cover, and area of masks by that of the body; medians."""
-        found = [(0.0, 0.0)]
-        for sample in self.samples:
-            row = geometry.row_for_frame(sample.index)
-            if row is not None:
-                camera = geometry.camera_at(sample.camera_row, self.size_px)
-                drawn = splat_silhouette(self.posed_points(geometry.motion, row), camera)
-                alpha = np.abs(sample.alpha - np.float32(geometry.masks_inverted))
-                area = max(1.0, float(drawn.sum()))
-                found.append((float(alpha[drawn].sum()) / area, float(alpha.sum()) / area))
-        covered, areas = np.median(found[1:] or found, axis=0)
-        return float(covered), float(areas)
-
     def keep_person(
         self, geometry: CaptureGeometry, frame: int, alpha: Float32[np.ndarray, "height width"]
     ) -> Float32[np.ndarray, "height width"]:

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import final
 
 import cv2
 import numpy as np
@@ -138,7 +139,7 @@ class FirstLook:
 
 def look_at(source: FrameSource) -> FirstLook:
     """Look at a few frames of a recording; nothing else of it is decoded."""
-    pairs, finder = glance(source), _Finder()
+    pairs, finder = glance(source), PersonFinder()
     first = [pair[0] for pair in pairs]
     seen = [finder.find(frame.rgb) for frame in first]
     found = [each for each in seen if each.persons]
@@ -179,21 +180,21 @@ class _Glimpse:
         return mask
 
 
-class _Finder:
+@final
+class PersonFinder:
     """Finds the persons of single frames, whichever way up they are."""
 
     def __init__(self) -> None:
+        """Load the networks."""
         self._detect, self._landmarks = BlazePoseDetector(), BlazePoseLandmarks()
 
     def find(self, rgb: UInt8[np.ndarray, "height width 3"]) -> _Glimpse:
         """Find the persons; where none is upright, also in the frame turned by 90 degrees."""
-        persons = self._persons(rgb)
+        persons = self.persons(rgb)
         upright = [each for each in persons if _rotation(each) == 0]
         rotation = 0
         if not upright:
-            turned = [
-                (k, self._persons(np.ascontiguousarray(np.rot90(rgb, -k)))) for k in (1, 2, 3)
-            ]
+            turned = [(k, self.persons(np.ascontiguousarray(np.rot90(rgb, -k)))) for k in (1, 2, 3)]
             best, surest = max(
                 ((k, max((e.keypoints.presence for e in each if not _rotation(e)), default=0.0))
                  for k, each in turned), key=lambda pair: pair[1],
@@ -201,7 +202,8 @@ class _Finder:
             rotation = 90 * best if surest > MIN_PRESENCE else 0
         return _Glimpse(size_px=(rgb.shape[1], rgb.shape[0]), persons=persons, rotation=rotation)
 
-    def _persons(self, rgb: UInt8[np.ndarray, "height width 3"]) -> list[FoundLandmarks]:
+    def persons(self, rgb: UInt8[np.ndarray, "height width 3"]) -> list[FoundLandmarks]:
+        """Find the largest person and others nearly as large, the largest first."""
         persons: list[FoundLandmarks] = []
         for detection in self._detect.find_all(rgb):
             rough = self._landmarks(rgb, detection.square)

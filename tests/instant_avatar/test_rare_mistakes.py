@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,7 +11,8 @@ import pytest
 from capture.source_opening import open_source
 from instant_avatar import check
 from instant_avatar.studio.shoot import ShootConfig, film_capture
-from preprocess.poses.pose_file import read_motion, write_motion
+from preprocess.poses.pose_file import write_motion
+from preprocess.poses.pose_format_registry import read_poses
 
 SIDE, FRAMES = 96, 40
 
@@ -84,7 +84,7 @@ def test_a_cropped_video_is_detected_by_its_principal_point_and_corrected(
 
 @pytest.mark.slow
 def test_poses_of_another_person_from_the_middle_on_are_no_offset(capture, diagnosed):
-    motion = read_motion(capture / "poses.npz")
+    motion = read_poses(capture / "poses.npz")
     motion.root_translations[FRAMES // 2 :, 0] += 0.9
     write_motion(capture / "poses.npz", motion)
     code, found = diagnosed()
@@ -107,30 +107,13 @@ def test_boxes_are_called_boxes_and_no_focal_length_is_fitted_to_them(capture, d
 
 @pytest.mark.slow
 def test_a_reversed_video_is_detected_and_corrected(capture, diagnosed, tmp_path):
-    true = read_motion(capture / "poses.npz")
+    true = read_poses(capture / "poses.npz")
     back = true.select_rows(np.arange(FRAMES)[::-1], np.arange(FRAMES))
     write_motion(capture / "poses.npz", back)
     code, found = diagnosed("--fix", tmp_path / "mended")
     assert (code, found["cause"], len(found["corrections"])) == (0, "frame_rate", 1)
     assert found["iou"]["after_fix"] > found["iou"]["now"] + 0.1
-    mended = read_motion(tmp_path / "mended" / "poses.npz")
+    mended = read_poses(tmp_path / "mended" / "poses.npz")
     np.testing.assert_array_equal(mended.frames, np.arange(FRAMES))
     np.testing.assert_allclose(mended.joint_rotations, true.joint_rotations, atol=1e-9)
     np.testing.assert_allclose(mended.root_translations, true.root_translations, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_degrees_are_distinguished_from_radians_and_corrected(capture, diagnosed, tmp_path):
-    true = read_motion(capture / "poses.npz")
-    degrees = replace(
-        true,
-        root_rotations=np.rad2deg(true.root_rotations),
-        joint_rotations=np.rad2deg(true.joint_rotations),
-    )
-    write_motion(capture / "poses.npz", degrees)
-    code, found = diagnosed("--fix", tmp_path / "mended")
-    assert (code, found["cause"], len(found["corrections"])) == (0, "root_rotation", 1)
-    assert found["iou"]["after_fix"] > 0.75 > 0.5 > found["iou"]["now"]
-    mended = read_motion(tmp_path / "mended" / "poses.npz")
-    np.testing.assert_allclose(mended.root_rotations, true.root_rotations, atol=1e-12)
-    np.testing.assert_allclose(mended.joint_rotations, true.joint_rotations, atol=1e-12)
