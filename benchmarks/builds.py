@@ -14,7 +14,7 @@ from benchmarks.hardware import ROOT
 from benchmarks.measurements import Measurement
 from benchmarks.sample_training import open_sample
 from benchmarks.stopwatch import time_interleaved
-from preprocess.poses.pose_file import read_motion
+from preprocess.poses.pose_format_registry import read_poses
 
 BANDS_M = (0.08, 0.15)
 ROUNDS = 15
@@ -28,7 +28,7 @@ def built(capture: Path) -> dict[str, float]:
     """Milliseconds of CPU time in two poses, and how many roots there are, for each band."""
     recording = open_sample(capture)
     rig = Rig.from_shaped_body(recording.shaped)
-    novel = read_motion(capture / "truth" / "novel" / "poses.npz")
+    novel = read_poses(capture / "truth" / "novel" / "poses.npz")
     poses = {
         "training": recording.motion[len(recording.motion) // 3].joint_rotations,
         "novel": novel[len(novel) // 2].joint_rotations,

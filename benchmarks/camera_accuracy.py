@@ -30,7 +30,7 @@ from preprocess.cameras.camera_file import CameraTrack, read_cameras
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.capture_session import Capture
 from preprocess.open_capture import open_capture
-from preprocess.poses.pose_file import read_motion
+from preprocess.poses.pose_format_registry import read_poses
 from preprocess.sfm.camera_solution import CameraSolution
 from preprocess.sfm.capture_solving import apply_camera_solution, solve_capture_cameras
 
@@ -190,7 +190,7 @@ def psnr_by_cameras(capture: Path) -> dict[str, float]:
 
     _, recording = solve_film(capture)
     paths, true = recording.paths, truth(capture, recording)
-    exact = read_motion(capture / "truth" / "poses.npz")
+    exact = read_poses(capture / "truth" / "poses.npz")
     # Stricter than what anybody does, and not asked: exact poses of the true world, seen by solved
     # cameras that were moved there as a whole.
     a, b = (

@@ -15,7 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from preprocess.body.body_pose import Motion
 from preprocess.body.parametric_body import betas_for_motion, load_body_model
-from preprocess.poses.pose_file import read_motion, write_motion
+from preprocess.poses.pose_file import write_motion
+from preprocess.poses.pose_format_registry import read_poses
 
 Corruption = Callable[[Path], None]
 """Makes one mistake in a capture folder."""
@@ -49,7 +50,7 @@ def _link(source: str, target: str) -> None:
 
 def _change_poses(folder: Path, change: Callable[[Motion], Motion]) -> None:
     path = folder / "poses.npz"
-    motion = change(read_motion(path))
+    motion = change(read_poses(path))
     path.unlink()
     write_motion(path, motion)
 

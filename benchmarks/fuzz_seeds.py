@@ -124,9 +124,6 @@ def _poses(folder: Path, film: Path) -> None:
                                     "trans": [0, 0, 3]}] * ROWS).encode(),
         "person.json": json.dumps([{"id": 0, "Rh": [[0, 0, 1]], "Th": [[0, 0, 3]],
                                     "poses": [[0] * 72], "shapes": [[0] * 10]}]).encode(),
-        "live.jsonl": b"\n".join(
-            json.dumps({"frame": row, "global_orient": [0, 0, 0], "body_pose": [0] * 69,
-                        "transl": [0, 0, 3]}).encode() for row in range(ROWS)),
     }  # fmt: skip
     for name, data in files.items():
         (folder / name).write_bytes(data)

@@ -24,7 +24,8 @@ from benchmarks.sample_training import open_sample
 from capture.source_opening import open_source
 from instant_avatar.run.run_folder import RunFolder
 from preprocess.body.body_pose import Motion
-from preprocess.poses.pose_file import read_motion, write_motion
+from preprocess.poses.pose_file import write_motion
+from preprocess.poses.pose_format_registry import read_poses
 
 LOOPS = 5
 FIRST, LAST = 300, 3000
@@ -49,7 +50,7 @@ def write_looped_capture(capture: Path, out: Path) -> Path:
         (part / "masks" / f"{number:06d}.png").hardlink_to(masks[number % len(frames)])
     video.release()
     shutil.copy(capture / "cameras.npz", part)
-    motion = read_motion(capture / "poses.npz")
+    motion = read_poses(capture / "poses.npz")
     rows = np.tile(np.arange(len(motion)), LOOPS)
     repeated: dict[str, Any] = {
         item.name: getattr(motion, item.name)[rows]

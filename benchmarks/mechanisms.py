@@ -35,7 +35,7 @@ from export.build import export_avatar
 from export.player import Player, premultiply
 from instant_avatar.run.session_start import new_trainer
 from preprocess.body.body_pose import Motion
-from preprocess.poses.pose_file import read_motion
+from preprocess.poses.pose_format_registry import read_poses
 
 SCORED_FRAMES = 6
 """Held-out frames, and novel poses, that each row is scored on, spread evenly."""
@@ -309,7 +309,7 @@ def measured_scores(
             compared, rows = open_few(folder, size_px, frames), FEW_FRAME_MECHANISMS
             name = f"{len(compared.frames) + len(compared.held_out)} frames of {folder.name}"
         measured = ", ".join(Hardware.here().lines()[:2])
-        scores = list(score_mechanisms(compared, rows, steps, seed, dance and read_motion(dance)))
+        scores = list(score_mechanisms(compared, rows, steps, seed, dance and read_poses(dance)))
         found = CaptureScores(name, seed, steps, size_px, measured, scores)
         kept.write_text(json.dumps(found._asdict(), indent=1) + "\n")
     found = CaptureScores(**json.loads(kept.read_text()))

@@ -18,7 +18,7 @@ from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
 from preprocess.body.parametric_body import ShapedBody, load_body_model, read_shaped_body
 from preprocess.cameras.camera_file import read_cameras
-from preprocess.poses.pose_file import read_motion
+from preprocess.poses.pose_format_registry import read_poses
 
 TRACKED_JOINTS = 22
 """Joints that are compared, the root included: without the hands' inner joints."""
@@ -57,7 +57,7 @@ def rest_joint_distance_cm(
 
 def given_pose_error_deg(capture: Path) -> float:
     """Mean error of the poses that the user has, degrees, over joints and frames."""
-    given, truth = (read_motion(folder / "poses.npz") for folder in (capture, capture / "truth"))
+    given, truth = (read_poses(folder / "poses.npz") for folder in (capture, capture / "truth"))
     cameras = [_camera(folder / "cameras.npz") for folder in (capture, capture / "truth")]
     return float(
         np.mean([
@@ -70,7 +70,7 @@ def given_pose_error_deg(capture: Path) -> float:
 def learnt_pose_error_deg(run: Path, capture: Path) -> float:
     """Mean error of the corrected poses of the frames that were trained on, degrees."""
     trainer, _ = checkpoint.load(run / "checkpoint")
-    truth = read_motion(capture / "truth" / "poses.npz")
+    truth = read_poses(capture / "truth" / "poses.npz")
     true_camera = _camera(capture / "truth" / "cameras.npz")
     saved = SavedFrames.load(run / "checkpoint" / LAST_RUN_FILE)
     errors = []

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from benchmarks.hardware import ROOT
 from benchmarks.measurements import Measurement
-from preprocess.poses.pose_file import read_motion
+from preprocess.poses.pose_format_registry import read_poses
 
 POLL_INTERVAL_S = 0.01
 FPS = 30.0
@@ -52,7 +52,7 @@ def measure_realtime(capture: Path, run: Path) -> Iterator[Measurement]:
     run_realtime(capture, run.with_name("warm"), "--frames", "0:60", "--size", "64")
     seen = run_realtime(capture, run)
     report, stream = seen.report, seen.report["stream"]
-    last_s = (len(read_motion(capture / "poses.npz")) - 1) / FPS
+    last_s = (len(read_poses(capture / "poses.npz")) - 1) / FPS
     outside = seen.package_after_s - report["training"]["startup_seconds"] - last_s
     package = report["package"] or {"seconds": float("nan")}
     yield Measurement(

@@ -38,7 +38,7 @@ from benchmarks.training_quality import (
     measure_pose_refinement,
 )
 from instant_avatar.cli.command_line import run_command
-from preprocess.poses.pose_file import read_motion
+from preprocess.poses.pose_format_registry import read_poses
 
 SIZE_PX = 256
 TEN_MINUTES = 600.0
@@ -102,7 +102,7 @@ def operation_marks(capture: Path) -> Iterator[Measurement]:
     train_for_core_seconds(seen.trainer, WARMUP_TRAINING_SECONDS)
     yield from step_marks(seen)
     yield from encode_marks(seen)
-    novel = read_motion(capture / "truth" / "novel" / "poses.npz")
+    novel = read_poses(capture / "truth" / "novel" / "poses.npz")
     yield from warp_marks(seen, novel[len(novel) // 2].joint_rotations)
     yield from build_marks(capture)
     yield from skipping_marks(seen)

@@ -27,7 +27,7 @@ from benchmarks.sample_training import (
 from benchmarks.stopwatch import limit_threads
 from capture.inbox import Inbox
 from preprocess.capture_session import Capture
-from preprocess.poses.pose_file import read_motion
+from preprocess.poses.pose_format_registry import read_poses
 
 WALL_SECONDS = 60.0
 NOISE = {"pose_noise_deg": 2.0, "pose_noise_cm": 1.0}
@@ -65,7 +65,7 @@ def novel_pose_frames(capture: Path, rig: Rig) -> list[HeldOutFrame]:
 
 def with_true_poses(capture: Path, held: Sequence[HeldOutFrame], rig: Rig) -> list[HeldOutFrame]:
     """Held-out frames with their true poses."""
-    true = read_motion(capture / "truth" / "poses.npz")
+    true = read_poses(capture / "truth" / "poses.npz")
     posed = []
     for picture in held:
         pose = true[picture.observation.frame.index]

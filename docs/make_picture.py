@@ -14,7 +14,7 @@ from export.player import Player
 from instant_avatar.animation.clip_file import background_compositor
 from instant_avatar.animation.driving_motion import FollowingCamera
 from preprocess.cameras.camera_file import read_cameras
-from preprocess.poses.pose_file import read_motion
+from preprocess.poses.pose_format_registry import read_poses
 
 FRAMES, STEP, FPS = 40, 3, 10
 
@@ -37,9 +37,9 @@ def main() -> None:
     size = given.size
     capture = given.demo / "capture"
     player = Player.load(given.demo / "run" / "avatar.iavatar")
-    source, poses = open_source(capture), read_motion(capture / "poses.npz")
+    source, poses = open_source(capture), read_poses(capture / "poses.npz")
     camera = read_cameras(capture / "cameras.npz", source.size_px)[0].resize((size, size))
-    dance = read_motion(capture / "dance.npz")
+    dance = read_poses(capture / "dance.npz")
     following = FollowingCamera.of(player, dance, size)
     blend = background_compositor("#f4f1ea")
     rows = []

@@ -1,6 +1,5 @@
 """Pose files: InstantAvatar's .npz, which its successors read too, with a few keys of ours."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,6 @@ from jaxtyping import Bool, Float, Int, Shaped
 from capture.input_error import InputError
 from preprocess.body.body_pose import Motion, PoseSpace
 from preprocess.body.kinematics import stack_axis_angles
-from preprocess.file_content import read_npz
 from preprocess.tracking.keypoints import KeypointTrack
 
 POSE_KEY_LAYOUTS = (
@@ -32,8 +30,8 @@ MAX_PROPORTION = 100.0
 Arrays = dict[str, Shaped[np.ndarray, "..."]]
 
 
-def read_motion(path: Path, *, default_model: str = "body24") -> Motion:
-    """Read poses: axis-angles and metres, one row a pose.
+def motion_from_arrays(arrays: Arrays, path: Path, *, default_model: str = "body24") -> Motion:
+    """The poses in the arrays of a file: axis-angles and metres, one row a pose.
 
     Keys: global_orient (N, 3) and body_pose (N, 69), or thetas or poses (N, 72); transl or trans
     (N, 3); optional betas (B,), (1, B) or (N, B), frame (N), time (N), valid (N), K (3, 3) or
@@ -42,79 +40,53 @@ def read_motion(path: Path, *, default_model: str = "body24") -> Motion:
     the arrays of `KeypointTrack`. Rows with NaN are marked as not valid. Rotations may be 3x3
     matrices; a body_pose of 63 numbers has no hands.
 
-    A .jsonl file holds the same numbers of one frame in each line, optionally with `frame`; a last
-    line that is half written is left out.
-
-    Raises:
-        InputError: If there is no such file, or it holds no such poses.
+    An InputError names the file and the key that holds something else.
     """
-    if path.suffix.lower() not in (".npz", ".jsonl"):
-        raise InputError(
-            f"{path}: poses are read from .npz files (InstantAvatar's keys), or from .jsonl files "
-            "with the same keys, a frame a line."
-        )
-    arrays = read_npz(path) if path.suffix.lower() == ".npz" else _read_lines(path)
-    return motion_from_arrays(arrays, path, default_model=default_model)
+    try:
+        return _motion(arrays, default_model)
+    except ValueError as cause:
+        raise InputError(f"{path}: {cause}") from cause
 
 
-def motion_from_arrays(arrays: Arrays, path: Path, *, default_model: str = "body24") -> Motion:
-    """The poses in the arrays of a file (see `read_motion`)."""
+def _motion(arrays: Arrays, default_model: str) -> Motion:
     layout = next((keys for keys in POSE_KEY_LAYOUTS if set(keys) <= arrays.keys()), None)
     if layout is None:
         expected = "; or ".join(" and ".join(keys) for keys in POSE_KEY_LAYOUTS)
-        raise InputError(
-            f"{path} holds {', '.join(sorted(arrays)) or 'nothing'}; expected {expected}."
-        )
-    rows = [_rows(arrays, key, path) for key in layout]
+        raise ValueError(f"it holds {', '.join(sorted(arrays)) or 'nothing'}; expected {expected}.")
+    rows = [_rows(arrays, key, arrays[layout[-1]]) for key in layout]
     translations = rows.pop().reshape(len(rows[0]), -1)
     count = len(translations)
     try:
         poses = stack_axis_angles(rows).reshape(count, 72)
     except ValueError as cause:
-        raise InputError(
-            f"{path}: {' + '.join(layout[:-1])} have {', '.join(str(r.shape) for r in rows)} "
-            f"numbers ({cause}); expected axis-angles (N, 72), SMPL's root and 23 joints, or "
-            "rotation matrices."
+        raise ValueError(
+            f"{' + '.join(layout[:-1])} have {', '.join(str(r.shape) for r in rows)} numbers "
+            f"({cause}); expected axis-angles (N, 72), SMPL's root and 23 joints, or rotation "
+            "matrices."
         ) from cause
     if translations.shape != (count, 3):
-        raise InputError(
-            f"`{layout[-1]}` in {path} has {translations.shape}; expected (N, 3) metres."
-        )
-    times = _per_row(arrays, "time", count, path)
+        raise ValueError(f"`{layout[-1]}` has {translations.shape}; expected (N, 3) metres.")
+    times = _per_row(arrays, "time", count)
     return Motion(
         root_rotations=poses[:, :3],
         root_translations=translations,
         joint_rotations=poses[:, 3:].reshape(count, 23, 3),
-        valid=_valid(arrays, np.column_stack([poses, translations]), times, path),
-        betas=_betas(arrays, path),
+        valid=_valid(arrays, np.column_stack([poses, translations]), times),
+        betas=_betas(arrays),
         body_model=str(arrays["model"]) if "model" in arrays else default_model,
         model_is_stated="model" in arrays,
-        frames=_frame_numbers(arrays, count, path),
+        frames=_frame_numbers(arrays, count),
         times_s=times,
-        intrinsic=_intrinsic(arrays, path),
-        camera_from_world=_cameras(arrays, count, path),
-        space=_space(arrays, path),
-        proportions=_proportions(arrays, path),
-        keypoints=KeypointTrack.from_arrays(arrays, path),
+        intrinsic=_intrinsic(arrays),
+        camera_from_world=_cameras(arrays, count),
+        space=_space(arrays),
+        proportions=_proportions(arrays),
+        keypoints=KeypointTrack.from_arrays(arrays),
     )
 
 
-def _read_lines(path: Path) -> Arrays:
-    """One array for each key that every line has; texts are those of the first line."""
-    try:
-        text = path.read_text(encoding="utf-8")
-        whole = text[: text.rfind("\n") + 1]
-        lines = [dict(json.loads(line)) for line in whole.splitlines() if line.strip()]
-        keys = set.intersection(*(set(line) for line in lines)) if lines else set()
-        words = {"model", "space"} & keys
-        arrays = {key: np.array([line[key] for line in lines]) for key in keys - words}
-    except (OSError, ValueError, TypeError) as cause:
-        raise InputError(f"{path} is no file of one JSON object a line ({cause}).") from cause
-    return {**arrays, **{key: np.array(lines[0][key]) for key in words}}
-
-
 def write_motion(path: Path, motion: Motion) -> None:
-    """Write a motion in the keys that `read_motion` reads; reading gives `as_stored`."""
+    """Write a motion in the keys of `motion_from_arrays`; reading gives `as_stored`."""
     arrays: dict[str, Any] = _motion_arrays(motion)
     np.savez_compressed(path, **arrays)
 
@@ -143,32 +115,34 @@ def _motion_arrays(motion: Motion) -> Arrays:
     return {key: array for key, array in arrays.items() if array is not None}
 
 
-def _read_numbers(arrays: Arrays, key: str, path: Path) -> Float[np.ndarray, "..."]:
+def _read_numbers(arrays: Arrays, key: str) -> Float[np.ndarray, "..."]:
     if arrays[key].dtype.kind not in "biuf":
-        raise InputError(f"`{key}` in {path} holds no numbers.")
+        raise ValueError(f"`{key}` holds no numbers.")
     return arrays[key].astype(np.float64)
 
 
-def _rows(arrays: Arrays, key: str, path: Path) -> Float[np.ndarray, "poses *numbers"]:
-    rows = _read_numbers(arrays, key, path)
+def _rows(
+    arrays: Arrays, key: str, translations: Shaped[np.ndarray, "..."]
+) -> Float[np.ndarray, "poses *numbers"]:
+    rows = _read_numbers(arrays, key)
     if rows.ndim < 2 or not rows.size:
-        raise InputError(f"`{key}` in {path} has the shape {rows.shape}; expected one row a pose.")
-    first = arrays["transl"] if "transl" in arrays else arrays["trans"]
-    if len(rows) != len(np.atleast_1d(first)):
-        raise InputError(
-            f"{path} holds {len(rows)} rows of `{key}` but {len(np.atleast_1d(first))} "
-            "translations; expected one of each per pose."
+        raise ValueError(f"`{key}` has the shape {rows.shape}; expected one row a pose.")
+    count = len(np.atleast_1d(translations))
+    if len(rows) != count:
+        raise ValueError(
+            f"it holds {len(rows)} rows of `{key}` but {count} translations; expected one of each "
+            "per pose."
         )
     return rows
 
 
-def _per_row(arrays: Arrays, key: str, count: int, path: Path) -> Float[np.ndarray, "poses"] | None:
+def _per_row(arrays: Arrays, key: str, count: int) -> Float[np.ndarray, "poses"] | None:
     """An optional array of one number a pose."""
     if key not in arrays:
         return None
-    numbers = _read_numbers(arrays, key, path).reshape(-1)
+    numbers = _read_numbers(arrays, key).reshape(-1)
     if len(numbers) != count:
-        raise InputError(f"{path} holds {len(numbers)} numbers in `{key}` for {count} poses.")
+        raise ValueError(f"it holds {len(numbers)} numbers in `{key}` for {count} poses.")
     return numbers
 
 
@@ -176,84 +150,81 @@ def _valid(
     arrays: Arrays,
     numbers: Float[np.ndarray, "poses 75"],
     times: Float[np.ndarray, "poses"] | None,
-    path: Path,
 ) -> Bool[np.ndarray, "poses"]:
     """Rows that are finite, of a size that angles and places have, and not marked as lost."""
     valid = np.asarray((np.abs(np.nan_to_num(numbers, nan=np.inf)) < MAX_MAGNITUDE).all(axis=1))
-    marked = _per_row(arrays, "valid", len(valid), path)
+    marked = _per_row(arrays, "valid", len(valid))
     if marked is not None:
         valid &= marked > 0
     return valid if times is None else valid & np.isfinite(times)
 
 
-def _betas(arrays: Arrays, path: Path) -> Float[np.ndarray, "betas"]:
+def _betas(arrays: Arrays) -> Float[np.ndarray, "betas"]:
     """One shape for the whole motion: the mean, where each row has its own."""
     if "betas" not in arrays:
         return np.zeros(0)
-    betas = _read_numbers(arrays, "betas", path)
+    betas = _read_numbers(arrays, "betas")
     if betas.ndim > 2:
-        raise InputError(
-            f"`betas` in {path} have the shape {betas.shape}; expected (10,) or (1, 10)."
-        )
+        raise ValueError(f"`betas` have the shape {betas.shape}; expected (10,) or (1, 10).")
     rows = np.atleast_2d(betas)
     rows = rows[np.isfinite(rows).all(axis=1)]
     if not len(rows):
-        raise InputError(f"`betas` in {path} are NaN; a shape of finite numbers was expected.")
+        raise ValueError("`betas` are NaN; a shape of finite numbers was expected.")
     return rows.mean(axis=0)
 
 
-def _proportions(arrays: Arrays, path: Path) -> Float[np.ndarray, "coefficients"] | None:
+def _proportions(arrays: Arrays) -> Float[np.ndarray, "coefficients"] | None:
     if "proportions" not in arrays:
         return None
-    proportions = _read_numbers(arrays, "proportions", path)
+    proportions = _read_numbers(arrays, "proportions")
     if proportions.ndim != 1 or not (np.abs(proportions) < MAX_PROPORTION).all():
-        raise InputError(f"`proportions` in {path} are no coefficients; expected finite numbers.")
+        raise ValueError("`proportions` are no coefficients; expected finite numbers.")
     return proportions
 
 
-def _frame_numbers(arrays: Arrays, count: int, path: Path) -> Int[np.ndarray, "poses"] | None:
-    numbers = _per_row(arrays, "frame", count, path)
+def _frame_numbers(arrays: Arrays, count: int) -> Int[np.ndarray, "poses"] | None:
+    numbers = _per_row(arrays, "frame", count)
     if numbers is None:
         return None
     if not np.isfinite(numbers).all() or (numbers != np.round(numbers)).any():
-        raise InputError(f"`frame` in {path} holds numbers that are no frame numbers.")
+        raise ValueError("`frame` holds numbers that are no frame numbers.")
     frames = numbers.astype(np.int64)
     if len(np.unique(frames)) < count:
-        raise InputError(f"`frame` in {path} names a frame twice; expected one person's poses.")
+        raise ValueError("`frame` names a frame twice; expected one person's poses.")
     return frames
 
 
-def _intrinsic(arrays: Arrays, path: Path) -> Float[np.ndarray, "3 3"] | None:
+def _intrinsic(arrays: Arrays) -> Float[np.ndarray, "3 3"] | None:
     """The tracker's K; the median, where each row has its own."""
     if "K" not in arrays:
         return None
-    intrinsic = _read_numbers(arrays, "K", path)
+    intrinsic = _read_numbers(arrays, "K")
     if intrinsic.ndim == 3:
         intrinsic = np.nanmedian(intrinsic, axis=0)
     if intrinsic.shape != (3, 3) or not np.isfinite(intrinsic).all() or intrinsic[0, 0] <= 0.0:
-        raise InputError(f"`K` in {path} is no camera matrix; expected finite (3, 3) pixels.")
+        raise ValueError("`K` is no camera matrix; expected finite (3, 3) pixels.")
     return intrinsic
 
 
-def _space(arrays: Arrays, path: Path) -> PoseSpace:
+def _space(arrays: Arrays) -> PoseSpace:
     said = str(arrays["space"]) if "space" in arrays else "world"
     if said == "world" or said == "camera":
         return said
-    raise InputError(f"`space` in {path} is {said!r}; expected world or camera.")
+    raise ValueError(f"`space` is {said!r}; expected world or camera.")
 
 
-def _cameras(arrays: Arrays, count: int, path: Path) -> Float[np.ndarray, "poses 4 4"] | None:
+def _cameras(arrays: Arrays, count: int) -> Float[np.ndarray, "poses 4 4"] | None:
     """The camera of each row; one alone is that of all rows."""
     key = next((key for key in CAMERA_KEYS if key in arrays), None)
     if key is None:
         return None
-    cameras = _read_numbers(arrays, key, path)
+    cameras = _read_numbers(arrays, key)
     if cameras.shape not in ((4, 4), (count, 4, 4)) or not np.isfinite(cameras).all():
-        raise InputError(
-            f"`{key}` in {path} has the shape {cameras.shape}; expected finite camera-from-world "
+        raise ValueError(
+            f"`{key}` has the shape {cameras.shape}; expected finite camera-from-world "
             f"transforms (4, 4) or ({count}, 4, 4)."
         )
     rotations = cameras[..., :3, :3]
     if np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max() > 1e-3:
-        raise InputError(f"`{key}` in {path} is not rigid; expected no scale, OpenCV's axes.")
+        raise ValueError(f"`{key}` is not rigid; expected no scale, OpenCV's axes.")
     return np.broadcast_to(cameras, (count, 4, 4)).copy()

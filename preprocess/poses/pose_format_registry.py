@@ -15,7 +15,6 @@ from preprocess.file_content import read_untrusted_file
 from preprocess.poses import mocap_formats, video_trackers
 from preprocess.poses.instant_avatar import parse_instant_avatar, parse_per_frame
 from preprocess.poses.motion_builder import MAX_GAP_FRAMES, MotionByPerson, fill_gaps
-from preprocess.poses.pose_file import read_motion
 
 TRACKERS: dict[str, Callable[[Any, bool], MotionByPerson | None]] = {
     "PHALP (4D-Humans)": video_trackers.parse_phalp,
@@ -61,8 +60,6 @@ def read_poses(
     """
     path = resolve_pose_path(path)
     refuse_pipe(path)
-    if path.suffix.lower() == ".jsonl":
-        return read_motion(path, default_model=default_model)
     content = read_untrusted_file(path)
     tool, people = _recognize(content, path, default_model, prefer_world)
     motion = _select_person(people, person, path)

@@ -7,12 +7,9 @@ eyes, 7-8 ears, 9-10 mouth, 11-12 shoulders, 13-14 elbows, 15-16 wrists, 17-22 f
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, Shaped, UInt8
-
-from capture.input_error import InputError
 
 KEYPOINT_COUNT = 33
 """Number of key points of a person."""
@@ -144,13 +141,10 @@ class KeypointTrack:
         return arrays | {key: each for key, each in optional.items() if each is not None}
 
     @classmethod
-    def from_arrays(
-        cls, arrays: dict[str, Shaped[np.ndarray, "..."]], path: Path
-    ) -> "KeypointTrack | None":
+    def from_arrays(cls, arrays: dict[str, Shaped[np.ndarray, "..."]]) -> "KeypointTrack | None":
         """Restore what `as_arrays` returned; None if a file's arrays do not hold it.
 
-        Raises:
-            InputError: If they hold something else under its keys; `path` is for the message.
+        A ValueError names the key under which they hold something else.
         """
         if "keypoint_frames" not in arrays:
             return None
@@ -160,14 +154,14 @@ class KeypointTrack:
             if key in OPTIONAL_KEYS and key not in arrays:
                 continue
             if key not in arrays or arrays[key].dtype.kind not in "iuf":
-                raise InputError(f"{path} holds key points without numbers in `{key}`.")
+                raise ValueError(f"it holds key points without numbers in `{key}`.")
             wanted = tuple(count if length < 0 else length for length in shape)
             if arrays[key].shape != wanted or not np.isfinite(arrays[key]).all():
-                raise InputError(f"`{key}` in {path} must be finite numbers of the shape {wanted}.")
+                raise ValueError(f"`{key}` must be finite numbers of the shape {wanted}.")
             found[key] = arrays[key].astype(np.float64)
         frames = found["keypoint_frames"]
         if (np.diff(frames) <= 0.0).any():
-            raise InputError(f"`keypoint_frames` in {path} do not ascend.")
+            raise ValueError("`keypoint_frames` do not ascend.")
         width, height = found["keypoint_image_size"]
         problems = found.get("keypoint_problems")
         return cls(

@@ -57,7 +57,7 @@ def test_a_video_that_cannot_be_tracked_well_leaves_what_was_tracked(
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")
 @pytest.mark.parametrize(
     ("option", "name"),
-    [("poses", "p.npz"), ("poses", "p.jsonl"), ("cameras", "c.json"), ("masks", "m.mp4"),
+    [("poses", "p.npz"), ("cameras", "c.json"), ("masks", "m.mp4"),
      ("body", "b.npz")],
 )  # fmt: skip
 def test_a_pipe_is_refused_instead_of_waited_for(refused, capture, tmp_path, option, name):

@@ -15,7 +15,7 @@ from instant_avatar.capture_validation import passes_quick_check
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.open_capture import open_capture
-from preprocess.poses.pose_file import read_motion
+from preprocess.poses.pose_format_registry import read_poses
 
 SPOILS = {
     "frame_offset": capture_corruptions.delay_poses(4),
@@ -98,7 +98,7 @@ def test_the_mistake_is_named_and_mended(cause, spoilt, dancing, tmp_path, call_
     copied = [path for path in out.rglob("*") if path.is_file()]
     assert all(path.stat().st_nlink == 1 for path in copied)  # no second name of the user's file
     if cause in ("frame_offset", "frame_rate"):
-        mended, true = (read_motion(f / "poses.npz") for f in (out, dancing / "truth"))
+        mended, true = (read_poses(f / "poses.npz") for f in (out, dancing / "truth"))
         assert mended.frames is not None
         assert np.diff(mended.frames).max() == 1  # rows of half the rate are interpolated
         off = mended.root_translations - true.root_translations[mended.frames]
@@ -253,7 +253,7 @@ def test_unreadable_input_is_reported_in_the_json_too(tmp_path, call_check):
 @pytest.mark.filterwarnings("error")
 def test_lost_poses_and_jumps_are_odd(spoilt, call_check, changed):
     folder = spoilt()
-    motion = read_motion(folder / "poses.npz")
+    motion = read_poses(folder / "poses.npz")
     orient, moved = motion.root_rotations.copy(), motion.root_translations.copy()
     orient[3] = np.nan
     moved[20:22] += [0.9, 0.0, 0.0]

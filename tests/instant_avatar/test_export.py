@@ -7,7 +7,7 @@ import trimesh
 from export.package.package_file import read_package
 from export.player import Player, compare_golden_frames
 from instant_avatar import export
-from preprocess.poses.pose_file import read_motion
+from preprocess.poses.pose_format_registry import read_poses
 
 
 @pytest.fixture
@@ -72,7 +72,7 @@ def test_a_run_becomes_a_mesh_that_dances(run, film, call_export, tmp_path):
 
 def test_a_mesh_dances_what_any_file_of_poses_says(run, film, call_export, tmp_path):
     """AMASS's keys, which ia-play reads, say the same as our own."""
-    ours = read_motion(film / "truth" / "novel" / "poses.npz")
+    ours = read_poses(film / "truth" / "novel" / "poses.npz")
     turned = np.concatenate([ours.root_rotations[:, None], ours.joint_rotations], axis=1)
     np.savez(
         tmp_path / "amass.npz",

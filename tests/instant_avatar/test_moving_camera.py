@@ -14,7 +14,8 @@ from preprocess.capture_inputs import CaptureInputs
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
 from preprocess.poses.motion_builder import transform_motion
-from preprocess.poses.pose_file import read_motion, write_motion
+from preprocess.poses.pose_file import write_motion
+from preprocess.poses.pose_format_registry import read_poses
 
 
 @pytest.fixture
@@ -82,7 +83,7 @@ def test_an_avatar_is_learnt_and_scored_through_a_moving_camera(
 @pytest.mark.slow
 def test_a_moving_camera_is_checked_and_mended(walk, tmp_path):
     folder, _ = walk
-    motion = read_motion(folder / "poses.npz")
+    motion = read_poses(folder / "poses.npz")
     (folder / "poses.npz").unlink()
     write_motion(folder / "poses.npz", replace(motion, frames=np.arange(24) + 3, times_s=None))
     out, found = tmp_path / "mended", tmp_path / "found.json"
@@ -95,7 +96,7 @@ def test_a_moving_camera_is_checked_and_mended(walk, tmp_path):
 def test_a_player_looks_through_cameras_of_other_programs(run, film, walk, tmp_path):
     folder, _ = walk
     package = run / "avatar.iavatar"
-    motion = read_motion(folder / "poses.npz")
+    motion = read_poses(folder / "poses.npz")
     write_motion(tmp_path / "short.npz", motion.select_rows(np.arange(22)))
     moving = [str(package), "--poses", str(tmp_path / "short.npz"), "--out", str(tmp_path / "a")]
     assert play.main([*moving, "--camera", str(folder / "transforms.json")]) == 0

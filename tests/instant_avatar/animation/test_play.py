@@ -21,7 +21,7 @@ from export.player import Player
 from instant_avatar.animation.driving_motion import FollowingCamera, demo_motion
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import rotation_matrices
-from preprocess.poses.pose_file import read_motion
+from preprocess.poses.pose_format_registry import read_poses
 
 SIZE, ROOT = 96, Path(__file__).parents[3]
 
@@ -54,7 +54,7 @@ def test_a_folder_gets_frames_with_alpha_and_nothing_else(call_play, package, no
     assert sorted(f.name for f in out.iterdir() if f.name != LIST) == [
         f"{i:04d}.png" for i in range(12)
     ]
-    player, motion = Player.load(package), read_motion(novel)
+    player, motion = Player.load(package), read_poses(novel)
     camera = FollowingCamera.of(player, motion, SIZE)
     for row in (0, 11):
         with Image.open(out / f"{row:04d}.png") as picture:
@@ -84,7 +84,7 @@ def test_clips_show_what_the_player_draws(call_play, package, novel, tmp_path, s
     assert outcome.code == 0
     frames = frames_of(out)
     assert len(frames) == 12
-    player, motion = Player.load(package), read_motion(novel)
+    player, motion = Player.load(package), read_poses(novel)
     camera = FollowingCamera.of(player, motion, SIZE)
     rgba = player.render(motion[0], camera.camera_for(motion[0])).astype(np.float64)
     alpha = rgba[..., 3:] / 255.0
@@ -127,7 +127,7 @@ def test_the_standing_person_takes_four_fifths_of_the_picture(package):
 
 
 def test_the_picture_does_not_depend_on_where_the_tracker_s_world_lies(package, novel, rng):
-    player, motion = Player.load(package), read_motion(novel)
+    player, motion = Player.load(package), read_poses(novel)
     pose, pelvis = motion[0], player.manifest.rest_joints[0]
     turn = rotation_matrices(rng.normal(size=3))
     turned = turn @ rotation_matrices(pose.root_rotation)
@@ -140,7 +140,7 @@ def test_the_picture_does_not_depend_on_where_the_tracker_s_world_lies(package, 
     )
     pictures = []
     for one in (pose, moved):
-        single = read_motion(novel)
+        single = read_poses(novel)
         single.root_rotations[0] = one.root_rotation
         camera = FollowingCamera.of(player, single, SIZE)
         pictures.append(player.render(one, camera.camera_for(one)).astype(int))

@@ -11,7 +11,7 @@ from export.player import Player
 from instant_avatar.animation.driving_motion import FollowingCamera, canonical_pose_of, demo_motion
 from instant_avatar.animation.play_arguments import Viewpoint
 from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
-from preprocess.poses.pose_file import read_motion
+from preprocess.poses.pose_format_registry import read_poses
 
 SIZE = 96
 
@@ -65,7 +65,7 @@ def test_a_turntable_turns_about_a_motion_while_it_plays(frames, player, novel):
     still, turning = frames("--poses", novel), frames("--poses", novel, "--turntable", "4")
     assert len(still) == len(turning) == 12
     np.testing.assert_array_equal(turning[0], still[0])
-    motion = read_motion(novel)
+    motion = read_poses(novel)
     view = Viewpoint(orbit_deg=360.0 * (6 / 30) / 4)
     camera = FollowingCamera.of(player, motion, SIZE, view).camera_for(motion[6])
     assert np.abs(turning[6] - player.render(motion[6], camera)).mean() < 0.1
@@ -75,8 +75,8 @@ def test_one_pose_is_one_picture(call_play, package, player, novel, tmp_path):
     out = tmp_path / "still.png"
     wishes = ["--still", 5, "--orbit", "-40", "--elevation", "20", "--size", "80x60"]
     assert call_play(package, "--poses", novel, "--out", out, *wishes).code == 0
-    motion = read_motion(novel)
-    held = read_motion(novel)
+    motion = read_poses(novel)
+    held = read_poses(novel)
     held.valid[:] = np.arange(12) == 5
     view = Viewpoint(orbit_deg=-40.0, elevation_deg=20.0)
     camera = FollowingCamera.of(player, held, (80, 60), view).camera_for(motion[5])
@@ -192,6 +192,6 @@ def animation(motion, pelvis, folder):
 
 
 def test_motion_capture_of_120_poses_shows_every_second_one(frames, player, novel, tmp_path):
-    path, _ = amass(read_motion(novel), player.manifest.rest_joints[0], tmp_path)
+    path, _ = amass(read_poses(novel), player.manifest.rest_joints[0], tmp_path)
     fast, usual = frames("--poses", path, "--fps", "120"), frames("--poses", path)
     np.testing.assert_array_equal(usual, fast[::2])

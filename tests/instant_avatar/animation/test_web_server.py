@@ -14,7 +14,7 @@ from capture.input_error import InputError
 from export import player_page
 from export.player import PictureDifference, Player, premultiply
 from instant_avatar.animation.driving_motion import FollowingCamera
-from preprocess.poses.pose_file import read_motion
+from preprocess.poses.pose_format_registry import read_poses
 from tests.instant_avatar.browser import Browser, chromium, until
 
 SIZE = (900, 700)
@@ -126,7 +126,7 @@ def test_the_browser_draws_the_golden_frames_again(page):
 @with_chromium
 @pytest.mark.slow
 def test_the_browser_draws_what_the_player_draws(page, package, novel):
-    player, motion = Player.load(package), read_motion(novel)
+    player, motion = Player.load(package), read_poses(novel)
     row, size = 7, 96
     part = page.run(
         f"""(async () => {{

@@ -16,7 +16,7 @@ from preprocess.alignment.mask_alignment import body_height_m
 from preprocess.cameras.camera_file import read_cameras, write_cameras
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.open_capture import open_capture
-from preprocess.poses.pose_file import read_motion
+from preprocess.poses.pose_format_registry import read_poses
 from preprocess.sfm.camera_solution import CameraSolution
 from preprocess.sfm.capture_solving import (
     apply_camera_solution,
@@ -189,7 +189,7 @@ def test_a_run_learns_in_the_world_of_its_solved_cameras(
     assert report["cameras"]["gates"]["followed_px"]["value"] < 3.0
     assert report["cameras"]["cpu_seconds"] > 0.0
     track = read_cameras(out / "cameras.npz", (256, 144))
-    motion = read_motion(out / "poses.npz")
+    motion = read_poses(out / "poses.npz")
     assert len(track.cameras) == len(motion) == FRAMES
     again = open_capture(
         CaptureInputs(
@@ -211,7 +211,7 @@ def test_cameras_are_kept_when_the_avatar_is_refused(ingest_walk, tmp_path, monk
     assert outcome.code == 1
     assert "cameras.npz" in outcome.err
     assert len(read_cameras(out / "cameras.npz", (256, 144)).cameras) == FRAMES
-    assert len(read_motion(out / "poses.npz")) == FRAMES
+    assert len(read_poses(out / "poses.npz")) == FRAMES
     page = (out / "report.html").read_text()
     assert "cameras.npz and poses.npz hold" in page
     assert "ia-play" not in page

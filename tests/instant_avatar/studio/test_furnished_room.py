@@ -9,7 +9,7 @@ from instant_avatar.studio import staging
 from instant_avatar.studio.actor import Actor
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.cameras.camera_file import read_cameras
-from preprocess.poses.pose_file import read_motion
+from preprocess.poses.pose_format_registry import read_poses
 
 WALK = ShootConfig(frames=6, size=128, motion="walkaround")
 
@@ -68,7 +68,7 @@ def test_the_cameras_are_written_to_the_ground_truth_only(capture):
         assert str(poses["space"]) == "camera"
     track = read_cameras(capture / "truth" / "cameras.npz", (128, 72))
     assert len(track.cameras) == WALK.frames
-    given, truth = (read_motion(capture / name) for name in ("poses.npz", "truth/poses.npz"))
+    given, truth = (read_poses(capture / name) for name in ("poses.npz", "truth/poses.npz"))
     np.testing.assert_allclose(given.intrinsic, track[0].intrinsic)
     shaped = Actor.of(1).shaped
     for row, camera in enumerate(track.cameras):
@@ -86,9 +86,9 @@ def test_a_painted_backdrop_is_refused_where_the_camera_moves(tmp_path):
 
 
 def test_a_pose_file_says_in_which_space_it_is(capture, tmp_path):
-    assert read_motion(capture / "poses.npz").space == "camera"
+    assert read_poses(capture / "poses.npz").space == "camera"
     with np.load(capture / "poses.npz") as arrays:
         changed = {**arrays, "space": np.array("moon")}
     np.savez(tmp_path / "poses.npz", **changed)
     with pytest.raises(InputError, match=r"expected world or camera"):
-        read_motion(tmp_path / "poses.npz")
+        read_poses(tmp_path / "poses.npz")

@@ -12,7 +12,7 @@ from preprocess.cameras.camera_file import read_cameras
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
-from preprocess.poses.pose_file import read_motion
+from preprocess.poses.pose_format_registry import read_poses
 
 FRAMES = 24
 PHONE = ShootConfig(frames=FRAMES, size=72, subject=3, like_a_phone=True)
@@ -40,7 +40,7 @@ def mean_joint_error_deg(one, other):
 
 
 def test_poses_are_off_by_some_degrees_and_the_focal_length_by_a_tenth(capture):
-    given, truth = (read_motion(folder / "poses.npz") for folder in (capture, capture / "truth"))
+    given, truth = (read_poses(folder / "poses.npz") for folder in (capture, capture / "truth"))
     errors = [mean_joint_error_deg(given[i], truth[i]) for i in range(FRAMES)]
     assert 2.5 < np.median(errors) < 7.0
     focal = [

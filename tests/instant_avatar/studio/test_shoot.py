@@ -14,7 +14,8 @@ from instant_avatar.studio.outfit import SKIN
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 from instant_avatar.studio.staging import static_camera
 from preprocess.body.body_pose import Motion
-from preprocess.poses.pose_file import read_motion, write_motion
+from preprocess.poses.pose_file import write_motion
+from preprocess.poses.pose_format_registry import read_poses
 from tests.avatar_fixtures import render_on_white
 
 SMALL = ShootConfig(frames=5, size=64, turns=1.0)
@@ -84,7 +85,7 @@ def test_a_track_in_a_cameras_axes_is_filmed_upright_on_the_spot(actor, tmp_path
     write_motion(tmp_path / "track.npz", track)
     config = ShootConfig(frames=2, size=32, track=tmp_path / "track.npz")
     film_capture(tmp_path / "sample", config)
-    assert len(read_motion(tmp_path / "sample" / "poses.npz")) == 2
+    assert len(read_poses(tmp_path / "sample" / "poses.npz")) == 2
     with pytest.raises(InputError, match="--track replaces the turn"):
         ShootConfig(track=tmp_path / "track.npz", motion="dance").validate()
 
@@ -125,23 +126,23 @@ def test_the_folder_is_a_native_capture(capture):
         assert cameras["intrinsic"].shape == (3, 3)
         assert cameras["extrinsic"].shape == (4, 4)
         assert (cameras["height"], cameras["width"]) == (64, 64)
-    poses = read_motion(capture / "poses.npz")
+    poses = read_poses(capture / "poses.npz")
     assert (len(poses), poses.body_model, poses.valid.all()) == (SMALL.frames, "body24", True)
     assert poses.times_s is not None
     np.testing.assert_allclose(np.diff(poses.times_s), 1 / 30)
-    assert len(read_motion(capture / "dance.npz")) == 150
+    assert len(read_poses(capture / "dance.npz")) == 150
     novel = capture / "truth" / "novel"
-    assert len(read_motion(novel / "poses.npz")) == 12
+    assert len(read_poses(novel / "poses.npz")) == 12
     assert len(list((novel / "images").iterdir())) == len(list((novel / "masks").iterdir())) == 12
 
 
 def test_given_poses_are_the_truth_without_noise_and_not_with_it(capture, tmp_path):
-    given, truth = (read_motion(capture / p) for p in ("poses.npz", "truth/poses.npz"))
+    given, truth = (read_poses(capture / p) for p in ("poses.npz", "truth/poses.npz"))
     np.testing.assert_array_equal(given.joint_rotations, truth.joint_rotations)
     noisy = ShootConfig(frames=2, size=32, pose_noise_deg=2.0, mask_noise_px=1.0)
     film_capture(tmp_path / "noisy", noisy)
-    given = read_motion(tmp_path / "noisy" / "poses.npz")
-    truth = read_motion(tmp_path / "noisy" / "truth" / "poses.npz")
+    given = read_poses(tmp_path / "noisy" / "poses.npz")
+    truth = read_poses(tmp_path / "noisy" / "truth" / "poses.npz")
     assert np.abs(given.joint_rotations - truth.joint_rotations).max() > 0.01
     np.testing.assert_array_equal(given.root_translations, truth.root_translations)
 
@@ -150,7 +151,7 @@ def test_the_video_is_exact_and_masks_fit_it(capture):
     """Drawing the truth again gives the very frames: the codec and the files cost nothing."""
     actor = Actor.of(1)
     camera = static_camera(actor, 64)
-    truth = read_motion(capture / "truth" / "poses.npz")
+    truth = read_poses(capture / "truth" / "poses.npz")
     frames = list(frames_of(capture / "video.mp4"))
     assert len(frames) == SMALL.frames
     for row, frame in enumerate(frames):

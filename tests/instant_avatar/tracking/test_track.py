@@ -17,7 +17,7 @@ from preprocess.body.proportion_space import shape_for_motion
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
-from preprocess.poses.pose_file import read_motion
+from preprocess.poses.pose_format_registry import read_poses
 from preprocess.tracking.blazepose import BlazePoseTracker
 
 
@@ -39,8 +39,8 @@ def joints_mm(motion):
 
 
 def test_poses_are_near_the_truth(tracked, filmed):
-    found = joints_mm(read_motion(tracked / "out" / "poses.npz"))
-    true = joints_mm(read_motion(filmed / "poses.npz"))
+    found = joints_mm(read_poses(tracked / "out" / "poses.npz"))
+    true = joints_mm(read_poses(filmed / "poses.npz"))
     true = true @ np.load(filmed / "cameras.npz")["extrinsic"][:3, :3].T  # to the camera's axes
     scale = (found * true).sum() / (found * found).sum()
     assert np.linalg.norm(scale * found - true, axis=2).mean() < 60.0
@@ -172,7 +172,7 @@ def test_what_was_found_before_ctrl_c_is_kept(video, tmp_path):
         )
     assert found.interrupted
     assert found.grade.frames == 9
-    assert len(read_motion(tmp_path / "out" / "poses.npz")) == 9
+    assert len(read_poses(tmp_path / "out" / "poses.npz")) == 9
     assert len(list((tmp_path / "out" / "masks").glob("*.png"))) == 9
     assert open_capture(found.imported.inputs).source.frame_count == 9
 
@@ -184,5 +184,5 @@ def test_frames_that_had_better_not_be_learnt_from_have_no_valid_pose(video, tmp
     )
     words = ["--out", str(tmp_path / "poses.npz"), "--frames", ":8", "--no-film"]
     assert track.main([str(video), *words]) in (0, 1)
-    found = read_motion(tmp_path / "poses.npz")
+    found = read_poses(tmp_path / "poses.npz")
     assert found.frames[~found.valid].tolist() == [3, 4]

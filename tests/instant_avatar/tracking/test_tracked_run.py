@@ -17,7 +17,7 @@ from instant_avatar.run.run_folder import RunFolder
 from preprocess import tracked_stream
 from preprocess.fitting import tracked_frames
 from preprocess.masks.mask_refinement import MaskRefiner
-from preprocess.poses.pose_file import read_motion
+from preprocess.poses.pose_format_registry import read_poses
 from preprocess.tracking.blazepose import BlazePoseTracker
 from tests.instant_avatar.conftest import Outcome
 
@@ -63,7 +63,7 @@ def test_a_video_alone_is_tracked_and_learnt(ingest_video, monkeypatch):
     assert report["tracking"]["good_enough"]
     assert report["command"]["poses"] is None
     assert report["frames"]["dropped"] == []
-    assert read_motion(out / "tracking" / "poses.npz").proportions is not None
+    assert read_poses(out / "tracking" / "poses.npz").proportions is not None
     assert "Good enough for an avatar" in (out / "report.html").read_text()
     # a resumed run reads the poses that it has
     monkeypatch.setattr(run_tracking, "track_person", None)
@@ -114,7 +114,7 @@ def test_a_run_whose_tracking_was_interrupted_can_be_resumed(ingest_video, monke
     assert done.code == 130
     again, out = ingest_video("--resume")
     assert again.code == 0, again.err
-    frames = read_motion(out / "tracking" / "poses.npz").keypoints.frames
+    frames = read_poses(out / "tracking" / "poses.npz").keypoints.frames
     assert frames.tolist() == list(range(20))
 
 

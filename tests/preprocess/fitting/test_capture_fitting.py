@@ -20,7 +20,7 @@ from preprocess.fitting.capture_fitting import (
     share_beyond_noise,
 )
 from preprocess.open_capture import open_capture
-from preprocess.poses.pose_file import read_motion
+from preprocess.poses.pose_format_registry import read_poses
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +146,7 @@ def coarse(tmp_path_factory):
         folder,
         ShootConfig(frames=24, size=112, fps=8.0, like_a_phone=True, tracker_error=2.5),
     )
-    return open_capture(CaptureInputs(video=folder)), read_motion(folder / "truth" / "poses.npz")
+    return open_capture(CaptureInputs(video=folder)), read_poses(folder / "truth" / "poses.npz")
 
 
 def error_deg(motion, truth) -> float:

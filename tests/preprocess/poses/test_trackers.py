@@ -94,17 +94,6 @@ def superset(w: World) -> Path:
     return w.write("poses.npz", npz(**again, model=np.array("smpl"), betas=w.betas[0]))
 
 
-def lines(w: World) -> Path:
-    """What a tracker writes while it runs."""
-    rows = (
-        {"frame": row, "global_orient": w.thetas[row, :3].tolist(), "model": "smpl",
-         "body_pose": w.thetas[row, 3:].tolist(), "transl": w.places[row].tolist()}
-        for row in range(40)
-    )  # fmt: skip
-    text = "\n".join(json.dumps(row) for row in rows) + '\n{"frame": 40, "global_or'
-    return w.write("poses.jsonl", text.encode())
-
-
 def matrices_without_hands(w: World) -> Path:
     held = {"global_orient": w.matrices[:, :1], "body_pose": w.matrices[:, 1:22]}
     return w.write("poses.pkl", pickle.dumps({**held, "transl": w.places, "model": "smpl"}))
@@ -335,7 +324,7 @@ def aist(w: World) -> Path:
 
 
 TRACKERS = [
-    instant_avatar, animation, thetas, superset, lines, matrices_without_hands, human_data, phalp,
+    instant_avatar, animation, thetas, superset, matrices_without_hands, human_data, phalp,
     wham, vibe, gvhmr, tram_track, tram, prompthmr, prompthmr_numbers, romp, romp_folder, bev,
     easymocap, easymocap_annots, easymocap_short, zju, amass, amass_smplx, aist,
 ]  # fmt: skip
