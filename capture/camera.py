@@ -82,30 +82,6 @@ class Camera:
         width, height = (max(1, round(side * scale)) for side in self.size_px)
         return self.resize((width, height))
 
-    def rotate_quarter_turns(self, quarter_turns: int) -> "Camera":
-        """The camera of the same images, rotated counter-clockwise by this many quarter turns.
-
-        Its axes turn with the image; its position and its view stay. Distortion can only
-        follow where it is radial, or by half a turn of its tangential part's signs.
-        """
-        camera = self
-        for _ in range(quarter_turns % 4):
-            (fx, fy), (cx, cy), (width, height) = camera.focal_px, camera.center_px, camera.size_px
-            turn = np.eye(4)
-            turn[:2, :2] = [[0.0, 1.0], [-1.0, 0.0]]  # x' = y, y' = -x
-            distortion = list(camera.distortion)
-            if len(distortion) >= 4:  # tangential p1 goes with y, p2 with x (OpenCV)
-                distortion[2], distortion[3] = -distortion[3], distortion[2]
-            camera = replace(
-                camera,
-                focal_px=(fy, fx),
-                center_px=(cy, width - cx),
-                size_px=(height, width),
-                camera_from_world=turn @ camera.camera_from_world,
-                distortion=tuple(distortion),
-            )
-        return camera
-
     def pixel_centers(self) -> Float[np.ndarray, "height width 2"]:
         """The centre (x, y) of every pixel."""
         width, height = self.size_px

@@ -1,55 +1,21 @@
 """A folder of images as frames, in natural order; reading and writing of one image."""
 
-import io
-import os
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image
+from PIL import Image, ImageOps
 
 from capture.input_error import InputError
 from capture.source import ASSUMED_FPS, Frame, FrameSelection, Recording
 
-LOG_LEVEL_SILENT = 0
-"""OpenCV's log level that prints nothing: our messages explain what is wrong with a file."""
-
-
-@cache
-def silence_opencv() -> None:
-    """Silence OpenCV and its FFmpeg; to be called before a file is opened."""
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read when FFmpeg is first used
-    set_level = getattr(cv2, "setLogLevel", None)  # OpenCV 4 has it here, OpenCV 5 there
-    (set_level or cv2.utils.logging.setLogLevel)(LOG_LEVEL_SILENT)
-
-
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"})
 """File endings of images that are read."""
-
-EXIF_ORIENTATION = 0x0112
-"""EXIF's tag of the orientation."""
-
-EXIF_QUARTER_TURNS = {3: 2, 6: 3, 8: 1}
-"""Counter-clockwise quarter turns that make a stored image upright, by EXIF's orientation."""
-
-EXIF_TRANSPOSE = {
-    2: Image.Transpose.FLIP_LEFT_RIGHT,
-    3: Image.Transpose.ROTATE_180,
-    4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE,
-    6: Image.Transpose.ROTATE_270,
-    7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_90,
-}
-"""Pillow's operation that makes stored pixels upright, by EXIF's orientation."""
-
-TIFF_MAGIC = (b"II*\x00", b"MM\x00*")
-"""First bytes of TIFF files: their tags are EXIF's, and OpenCV turns their pixels in any mode."""
 
 ALPHA_SAMPLES = 5
 """Number of images, evenly spread, whose alpha channel is examined."""
@@ -89,30 +55,24 @@ def refuse_pipe(path: Path) -> None:
 def read_image(
     path: Path,
 ) -> tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"] | None]:
-    """One upright image as RGB, and its alpha channel if it has one.
+    """One image as RGB, upright by its EXIF tag, and its alpha channel if it has one.
 
-    Raises:
-        InputError: If it cannot be decoded, or is not complete.
+    An InputError if it cannot be decoded, or is not complete.
     """
-    data = path.read_bytes()
-    if not _is_complete(data):
-        raise InputError(f"{path} is cut off; the file is not complete.")
-    encoded = np.frombuffer(data, np.uint8)
-    picture = _decode(encoded, cv2.IMREAD_UNCHANGED)
-    if picture is None:
-        raise InputError(f"{path} is no picture that can be decoded; it is empty or damaged.")
-    alpha = None
-    if picture.ndim == 3 and picture.shape[2] == 4:
-        alpha = picture[..., 3]
-        alpha = alpha if alpha.dtype == np.uint8 else (alpha >> 8).astype(np.uint8)
-        alpha = np.ascontiguousarray(_rotate_alpha(alpha, data))
-    picture = _decode(encoded, cv2.IMREAD_COLOR)  # 8 bits, turned upright by its EXIF tag
-    if picture is None:
-        raise InputError(f"{path} is a picture of a kind that cannot be read; expected 8-bit RGB.")
-    rgb = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
-    if alpha is not None and alpha.shape != rgb.shape[:2]:
-        raise InputError(f"{path} has an EXIF rotation and an alpha channel; rotate its pixels.")
-    return rgb, alpha
+    try:
+        with Image.open(path) as stored:
+            stored.load()
+            image = ImageOps.exif_transpose(stored)
+            if image.mode.startswith("I;16"):  # Pillow would clip it to 255
+                image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
+            has_alpha = image.has_transparency_data
+            pixels = np.asarray(image.convert("RGBA" if has_alpha else "RGB"))
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as cause:
+        raise InputError(
+            f"{path} is no picture that can be decoded: it is empty, cut off or damaged ({cause})."
+        ) from cause
+    alpha = np.ascontiguousarray(pixels[..., 3]) if has_alpha else None
+    return np.ascontiguousarray(pixels[..., :3]), alpha
 
 
 def write_png(path: Path, picture: UInt8[np.ndarray, "..."]) -> None:
@@ -142,53 +102,11 @@ def any_has_cutout_alpha(images: Sequence[Path]) -> bool:
     for path in (able[place] for place in places):
         try:
             alpha = read_image(path)[1]
-        except (InputError, OSError):  # damaged or half written; another one says it
+        except InputError:  # damaged or half written; another one says it
             continue
         if has_cutout_alpha(alpha):
             return True
     return False
-
-
-def exif_orientation(data: bytes) -> int:
-    """EXIF's orientation of an encoded image, 1 to 8; 1 (upright) where there is none."""
-    tagged = data.startswith(TIFF_MAGIC) or any(
-        mark in data for mark in (b"Exif", b"eXIf", b"EXIF")
-    )
-    if not tagged:  # looking closer would decode a PNG
-        return 1
-    try:
-        with Image.open(io.BytesIO(data)) as picture:
-            found = picture.getexif().get(EXIF_ORIENTATION, 1)
-    except Exception:  # damaged tags; of many types, and OpenCV leaves the picture as it is, too
-        return 1
-    return found if found in EXIF_TRANSPOSE else 1
-
-
-def _rotate_alpha(
-    alpha: UInt8[np.ndarray, "_ _"], data: bytes
-) -> UInt8[np.ndarray, "height width"]:
-    """An alpha channel as it was stored, made upright as OpenCV makes the colors."""
-    found = exif_orientation(data)
-    if found == 1 or data.startswith(TIFF_MAGIC):
-        return alpha
-    return np.asarray(Image.fromarray(alpha).transpose(EXIF_TRANSPOSE[found]))
-
-
-def _decode(encoded: UInt8[np.ndarray, "bytes"], mode: int) -> np.ndarray | None:
-    silence_opencv()
-    try:
-        return cv2.imdecode(encoded, mode) if len(encoded) else None
-    except cv2.error:  # sizes that OpenCV refuses
-        return None
-
-
-def _is_complete(data: bytes) -> bool:
-    """Return whether a PNG or JPEG has its end: some decoders fill a missing rest in silence."""
-    if data.startswith(b"\x89PNG"):
-        return b"IEND" in data[-1024:]
-    if data.startswith(b"\xff\xd8"):
-        return b"\xff\xd9" in data[-65536:]
-    return True
 
 
 def _reduce(frame: Frame, longer_px: int) -> Frame:
@@ -212,7 +130,7 @@ class ImageFolder(Recording):
                 f"; at least one was expected from number {selection.start} on."
             )
         self.duration_s: float | None = selection.span(self.frames_in_file) / ASSUMED_FPS
-        self.size_px, self.quarter_turns = self._look()
+        self.size_px = self._look()
         self.has_alpha = any_has_cutout_alpha(
             [p for i, p in enumerate(self._images) if selection.contains(i)]
         )
@@ -225,7 +143,7 @@ class ImageFolder(Recording):
                 continue
             try:
                 rgb, alpha = read_image(path)
-            except (InputError, OSError) as cause:  # damaged, or the disk was unplugged
+            except InputError as cause:  # damaged, or the disk was unplugged
                 self._warn(f"{cause} It was left out.")
                 continue
             if rgb.shape[1::-1] != self.size_px:
@@ -255,13 +173,10 @@ class ImageFolder(Recording):
         """The number of images in the folder."""
         return len(self._images)
 
-    def _look(self) -> tuple[tuple[int, int], int]:
-        """Size of the first image that can be read, and its counter-clockwise quarter turns."""
+    def _look(self) -> tuple[int, int]:
+        """Size of the first image that can be read."""
         for path in self._images:
-            try:
+            with suppress(InputError):
                 rgb, _ = read_image(path)
-            except InputError:
-                continue
-            turns = EXIF_QUARTER_TURNS.get(exif_orientation(path.read_bytes()), 0)
-            return (rgb.shape[1], rgb.shape[0]), turns
+                return rgb.shape[1], rgb.shape[0]
         raise InputError(f"None of the {len(self._images)} pictures in {self.path} can be decoded.")

@@ -11,6 +11,8 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator
+from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple, final
 
@@ -19,12 +21,9 @@ import numpy as np
 from jaxtyping import UInt8
 
 from capture.image_folder import (
-    EXIF_QUARTER_TURNS,
     any_has_cutout_alpha,
-    exif_orientation,
     list_images,
     read_image,
-    silence_opencv,
 )
 from capture.input_error import InputError
 from capture.source import ASSUMED_FPS, Frame, FrameSelection, PacingClock
@@ -37,6 +36,18 @@ MAX_QUEUED_FRAMES = 16
 
 MAX_READ_FAILURES = 16
 """Consecutive failures that mean the end: the camera was unplugged, or the stream is over."""
+
+
+LOG_LEVEL_SILENT = 0
+"""OpenCV's log level that prints nothing: our messages explain what is wrong with a file."""
+
+
+@cache
+def silence_opencv() -> None:
+    """Silence OpenCV and its FFmpeg; to be called before a file is opened."""
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read when FFmpeg is first used
+    set_level = getattr(cv2, "setLogLevel", None)  # OpenCV 4 has it here, OpenCV 5 there
+    (set_level or cv2.utils.logging.setLogLevel)(LOG_LEVEL_SILENT)
 
 
 def camera_address(path: Path) -> str | None:
@@ -55,7 +66,7 @@ class CameraDevice:
     """
 
     has_alpha = is_hdr = False
-    quarter_turns = rotate = 0
+    rotate = 0
     live = paced = True
     frames_in_file = 0
     frame_count: int | None = None
@@ -259,8 +270,7 @@ class WatchedImageFolder:
         self.selection = selection
         self.warnings: list[str] = []
         self._pace, self._idle_s, self._watch_s = pace, idle_s, watch_s
-        first, rgb = self._first()
-        self.quarter_turns = EXIF_QUARTER_TURNS.get(exif_orientation(first.read_bytes()), 0)
+        rgb = self._first()
         self.started_at, self._first_at = time.time(), pace.now()
         self.size_px = (rgb.shape[1], rgb.shape[0])
         self.has_alpha = any_has_cutout_alpha(list_images(path))
@@ -293,15 +303,13 @@ class WatchedImageFolder:
         """End the watch, also in the middle of a wait."""
         self._pace.stop()
 
-    def _first(self) -> tuple[Path, UInt8[np.ndarray, "height width 3"]]:
+    def _first(self) -> UInt8[np.ndarray, "height width 3"]:
         """The first image that can be read."""
         deadline = self._pace.now() + self._idle_s
         while True:
             for path in list_images(self.path):
-                try:
-                    return path, read_image(path)[0]
-                except (InputError, OSError):
-                    continue
+                with suppress(InputError):
+                    return read_image(path)[0]
             if self._pace.now() >= deadline:
                 raise InputError(
                     f"No image came into {self.path} within {self._idle_s:g} s (--idle-seconds)"
@@ -341,7 +349,7 @@ class WatchedImageFolder:
         while not self._pace.stopped:
             try:
                 image = read_image(path)
-            except (InputError, OSError) as cause:
+            except InputError as cause:
                 before, state = state, _state_of(path)
                 since = since if state == before else self._pace.now()
                 if state is None or self._pace.now() - since >= DAMAGED_AFTER_S:

@@ -109,8 +109,7 @@ class FrameSource(Protocol):
         duration_s: Duration of the selected frames, as the container claims; None if unknown.
         has_alpha: Whether the frames' own alpha channel cuts the person out of one of the sampled
             images.
-        quarter_turns: Counter-clockwise quarter turns that make stored images upright.
-        rotate: Degrees by which the user had frames turned clockwise, after `quarter_turns`.
+        rotate: Degrees by which the user had upright frames turned clockwise.
         is_hdr: Whether frames are tone mapped from HDR.
         live: Whether frames that are not taken in time are lost.
         paced: Whether frames come at times of their own, however fast they are taken.
@@ -125,7 +124,6 @@ class FrameSource(Protocol):
     frame_count: int | None
     duration_s: float | None
     has_alpha: bool
-    quarter_turns: int
     rotate: int
     is_hdr: bool
     live: bool
@@ -189,8 +187,8 @@ class WrappedSource:
         self.frame_count = source.frame_count
         self.duration_s = source.duration_s
         self.has_alpha = source.has_alpha
-        self.quarter_turns, self.rotate = source.quarter_turns, source.rotate
-        self.is_hdr, self.live, self.paced = source.is_hdr, source.live, source.paced
+        self.rotate, self.is_hdr = source.rotate, source.is_hdr
+        self.live, self.paced = source.live, source.paced
         self.started_at = source.started_at
         self.warnings = source.warnings
 

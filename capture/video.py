@@ -64,7 +64,6 @@ class VideoFile(Recording):
     A file that ends early or has gaps is read as far as it goes, with a warning.
 
     Attributes:
-        quarter_turns: Counter-clockwise quarter turns that make its stored images upright.
         has_unread_alpha: Whether it has an alpha channel that is not opaque; it is not read (that
             of image files is).
     """
@@ -94,11 +93,10 @@ class VideoFile(Recording):
             ) from cause
         if first is None:
             raise InputError(f"No frame of {path} could be decoded; the video is empty or damaged.")
-        self.quarter_turns = _quarter_turns(first.frame)
         self.has_unread_alpha = _has_transparency(first.frame)
         self.is_hdr = int(first.frame.color_trc) in HDR_TRANSFERS
         width, height = int(first.frame.width), int(first.frame.height)
-        self.size_px = (height, width) if self.quarter_turns % 2 else (width, height)
+        self.size_px = (height, width) if _quarter_turns(first.frame) % 2 else (width, height)
         self.frames_in_file = claimed_frames if claimed_frames > 0 else self.count_frames()
         self.frame_count: int | None = selection.count(self.frames_in_file)
         span = selection.span(self.frames_in_file)

@@ -25,8 +25,12 @@ from preprocess.body.parametric_body import (
     load_body_model,
     read_shaped_body,
 )
-from preprocess.cameras.camera_file import CameraTrack, assume_static_camera
-from preprocess.cameras.camera_orientation import assume_camera, read_upright_cameras
+from preprocess.cameras.camera_file import (
+    CameraTrack,
+    assume_camera,
+    assume_static_camera,
+    read_cameras,
+)
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.capture_paths import (
     CapturePaths,
@@ -217,7 +221,7 @@ def _align(
     cameras = (
         assume_static_camera(motion, source.size_px)
         if named is None
-        else read_upright_cameras(named, source)
+        else read_cameras(named, source.size_px, source)
     )
     evidence, is_given = CaptureEvidence(source, given, cameras), named is not None
     motion, shaped = place_motion(motion, imported.body, evidence, cameras_given=is_given)

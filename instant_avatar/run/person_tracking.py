@@ -18,7 +18,7 @@ from preprocess.alignment.silhouette_objective import sample_masks
 from preprocess.body.body_pose import Motion
 from preprocess.body.body_surface import SkinPoints
 from preprocess.body.parametric_body import load_body_model
-from preprocess.cameras.camera_orientation import assume_camera
+from preprocess.cameras.camera_file import assume_camera
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.capture_paths import CapturePaths, find_own_masks, find_stream_cameras
 from preprocess.capture_session import Capture

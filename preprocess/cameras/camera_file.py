@@ -14,6 +14,7 @@ from preprocess.body.body_pose import Motion, RelativeFocalLength
 from preprocess.cameras.camera_registry import read_named_cameras
 from preprocess.cameras.multi_view_cameras import find_multi_view_cameras, read_multi_view_camera
 from preprocess.cameras.named_camera import checked_camera, checked_rigid, explain_camera_errors
+from preprocess.capture_paths import find_stream_cameras
 from preprocess.file_content import read_npz
 from preprocess.frame_association import cameras_by_frame, interpolate_missing_cameras
 
@@ -169,9 +170,9 @@ def _fit_to_frames(
         if size_px is not None and not same_aspect_ratio(stored, size_px):
             raise InputError(
                 f"The cameras in {path} belong to images of {stored[0]}x{stored[1]} px, the video "
-                f"has {size_px[0]}x{size_px[1]}; expected the same shape. If the video was rotated "
-                "or cropped, change the cameras with it; if it was stretched, undo that (ffmpeg "
-                f"-vf scale={stored[0]}:{stored[1]})."
+                f"has {size_px[0]}x{size_px[1]}; expected the same shape, upright. If the "
+                "video was rotated (also by its rotation flag) or cropped, change the cameras with "
+                f"it; if it was stretched, undo that (ffmpeg -vf scale={stored[0]}:{stored[1]})."
             )
         if size_px is not None and stored != size_px:
             note = (
@@ -208,6 +209,20 @@ def assume_static_camera(motion: Motion, size_px: tuple[int, int]) -> CameraTrac
             "again."
         )
     return CameraTrack(cameras=(camera,), source=ASSUMED_CAMERA_SOURCE, note=note)
+
+
+def assume_camera(video: Path, named: str | None, source: FrameSource) -> Camera:
+    """A camera at the origin: the first one of a file, or a phone's where there is none.
+
+    `named` is the value of --cameras; without it cameras are looked for beside the video (see
+    `find_stream_cameras`).
+    """
+    path = find_stream_cameras(video, named)
+    if path is None:
+        phone = RelativeFocalLength(ratio=DEFAULT_FOCAL_RATIO).intrinsic_matrix(source.size_px)
+        return Camera.from_intrinsic(phone, source.size_px)
+    cameras = read_cameras(path, source.size_px, None if source.live else source)
+    return replace(cameras[0], camera_from_world=np.eye(4))
 
 
 def tracker_intrinsic_matrix(

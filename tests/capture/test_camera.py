@@ -93,33 +93,3 @@ def test_barrel_distortion_pulls_points_inwards():
         distortion=(-0.1, 0.0, 0.0, 0.0),
     )
     np.testing.assert_allclose(camera.project(point), [50.0 + 90.0, 50.0])
-
-
-@pytest.mark.parametrize("turns", [0, 1, 2, 3, 5])
-@pytest.mark.parametrize("distortion", [(), (0.1, -0.05, 0.01, -0.02, 0.03)])
-def test_a_turned_camera_sees_each_point_where_the_turned_picture_shows_it(turns, distortion, rng):
-    turn = np.eye(4)
-    turn[:3, 3] = 0.1, -0.2, 3.0
-    camera = Camera(
-        focal_px=(300.0, 320.0),
-        center_px=(50.0, 30.0),
-        size_px=(96, 64),
-        camera_from_world=turn,
-        distortion=distortion,
-    )
-    points = rng.uniform(-0.3, 0.3, (50, 3))
-    pixels = camera.project(points)
-    picture = np.zeros((64, 96), dtype=int)
-    inside = (pixels >= 0).all(axis=1) & (pixels < [96, 64]).all(axis=1)
-    points, pixels = points[inside], pixels[inside]
-    assert len(points) > 20
-    seen = camera.rotate_quarter_turns(turns)
-    turned = np.rot90(picture, turns)
-    assert seen.size_px == turned.shape[::-1]
-    for point, (x, y) in zip(points, pixels, strict=True):
-        marked = picture.copy()
-        marked[int(y), int(x)] = 1
-        row, column = np.argwhere(np.rot90(marked, turns))[0]
-        at = seen.project(point)
-        assert (int(at[1]), int(at[0])) == (row, column)
-    np.testing.assert_allclose(seen.center_world, camera.center_world, atol=1e-12)

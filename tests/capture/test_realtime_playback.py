@@ -35,7 +35,7 @@ class Recorded:
 
     path, size_px, selection = Path("uneven.mp4"), (2, 2), FrameSelection()
     has_alpha = live = paced = False
-    quarter_turns = rotate = 0
+    rotate = 0
     is_hdr = False
     started_at = 0.0
     frames_in_file = frame_count = len(UNEVEN_S)

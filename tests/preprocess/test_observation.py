@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.image_folder import silence_opencv
 from capture.input_error import InputError
+from capture.live_sources import silence_opencv
 from capture.source_opening import open_source
 from preprocess.body.body_pose import Motion
 from preprocess.cameras.camera_file import CameraTrack, assume_static_camera

@@ -12,8 +12,7 @@ from capture.source import Frame
 from preprocess import tracked_stream
 from preprocess.body.body_surface import splat_silhouette
 from preprocess.body.parametric_body import load_body_model
-from preprocess.cameras.camera_file import CameraTrack, write_cameras
-from preprocess.cameras.camera_orientation import assume_camera
+from preprocess.cameras.camera_file import CameraTrack, assume_camera, write_cameras
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.capture_paths import CapturePaths
 from preprocess.capture_session import Capture
@@ -37,7 +36,7 @@ SIZE = (180, 320)
 class Pictures:
     """A source of empty frames; its clock is the test's."""
 
-    live, paced, has_alpha, is_hdr, quarter_turns, rotate = False, True, False, False, 0, 0
+    live, paced, has_alpha, is_hdr, rotate = False, True, False, False, 0
     started_at = waited_s = 0.0
     dropped, path, size_px = 0, Path("film.mp4"), SIZE
     selection, frames_in_file, frame_count, duration_s = None, COUNT, COUNT, COUNT / 30.0

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from capture.image_folder import silence_opencv
 from capture.input_error import InputError
+from capture.live_sources import silence_opencv
 from preprocess.masks.mask_files import open_masks
 
 SIZE = (30, 40)
