@@ -12,7 +12,7 @@ from jaxtyping import UInt8
 from PIL import Image, ImageOps
 
 from capture.input_error import InputError
-from capture.source import ASSUMED_FPS, Frame, FrameSelection, Recording
+from capture.source import ASSUMED_FPS, Frame, FrameSelection, FrameSource
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"})
 """File endings of images that are read."""
@@ -115,7 +115,7 @@ def _reduce(frame: Frame, longer_px: int) -> Frame:
     return replace(frame, rgb=cv2.resize(frame.rgb, size_px, interpolation=cv2.INTER_AREA))
 
 
-class ImageFolder(Recording):
+class ImageFolder(FrameSource):
     """A folder of images; image i was taken at i / 30 s."""
 
     def __init__(self, path: Path, selection: FrameSelection) -> None:
@@ -123,13 +123,13 @@ class ImageFolder(Recording):
         super().__init__(path, selection)
         self._images = list_images(path)
         self.frames_in_file = len(self._images)
-        self.frame_count: int | None = selection.count(self.frames_in_file)
+        self.frame_count = selection.count(self.frames_in_file)
         if not self.frame_count:
             raise InputError(
                 f"{path} holds {self.frames_in_file} pictures ({', '.join(sorted(IMAGE_SUFFIXES))})"
                 f"; at least one was expected from number {selection.start} on."
             )
-        self.duration_s: float | None = selection.span(self.frames_in_file) / ASSUMED_FPS
+        self.duration_s = selection.span(self.frames_in_file) / ASSUMED_FPS
         self.size_px = self._look()
         self.has_alpha = any_has_cutout_alpha(
             [p for i, p in enumerate(self._images) if selection.contains(i)]

@@ -26,7 +26,7 @@ from capture.image_folder import (
     read_image,
 )
 from capture.input_error import InputError
-from capture.source import ASSUMED_FPS, Frame, FrameSelection, PacingClock
+from capture.source import ASSUMED_FPS, Frame, FrameSelection, FrameSource, PacingClock
 
 CAMERA_PREFIX = "camera:"
 """Start of an argument that names a camera instead of a file."""
@@ -59,18 +59,10 @@ def camera_address(path: Path) -> str | None:
 
 
 @final
-class CameraDevice:
-    """A camera by its number, a device, the address of a stream, or a file that plays like one.
+class CameraDevice(FrameSource):
+    """A camera by its number, a device, the address of a stream, or a file that plays like one."""
 
-    `dropped` counts images that were dropped for later ones; `started_at` is when the first came.
-    """
-
-    has_alpha = is_hdr = False
-    rotate = 0
     live = paced = True
-    frames_in_file = 0
-    frame_count: int | None = None
-    duration_s: float | None = None
 
     def __init__(self, address: str, selection: FrameSelection, pace: PacingClock) -> None:
         """Open it and wait for its first image.
@@ -83,11 +75,8 @@ class CameraDevice:
             InputError: If there is no such camera.
             OSError: If it exists and is in use (EBUSY), or may not be opened (EACCES).
         """
-        self.path = Path(CAMERA_PREFIX + address)
-        self.selection = selection
-        self.warnings: list[str] = []
-        self.dropped = 0
-        self._pace, self._waited_s = pace, 0.0
+        super().__init__(Path(CAMERA_PREFIX + address), selection)
+        self._pace, self._waited_s, self._dropped = pace, 0.0, 0
         self._is_file = Path(address).is_file()
         self._capture = _open_device(address)
         ok, picture = self._capture.read()
@@ -107,6 +96,11 @@ class CameraDevice:
         """Seconds of waiting for images, and for what belongs to them, so far."""
         return self._waited_s + self._pace.waited_s
 
+    @property
+    def dropped(self) -> int:
+        """Number of images that were dropped for later ones."""
+        return self._dropped
+
     def frames(self) -> Iterator[Frame]:
         """The images as they come; to be read once."""
         if self._reader is None:
@@ -117,10 +111,6 @@ class CameraDevice:
                 return
             if self.selection.contains(frame.index):
                 yield frame
-
-    def count_frames(self) -> int:
-        """Return 0: the length of a live source is unknown."""
-        return 0
 
     def close(self) -> None:
         """Release the camera."""
@@ -147,7 +137,7 @@ class CameraDevice:
         try:
             count = 1 + self._read_all()
             if not (self._ended or self._is_file):
-                self.warnings.append(
+                self._warn(
                     f"{self.path} gave no more pictures after {count}; was it unplugged? What was "
                     "learnt until then is kept."
                 )
@@ -177,7 +167,7 @@ class CameraDevice:
         with self._changed:
             if len(self._waiting) == MAX_QUEUED_FRAMES:
                 self._waiting.popleft()
-                self.dropped += 1
+                self._dropped += 1
             self._waiting.append(frame)
             self._changed.notify_all()
 
@@ -230,7 +220,7 @@ class _FileState(NamedTuple):
 
 
 @final
-class WatchedImageFolder:
+class WatchedImageFolder(FrameSource):
     """A source that grows: images that another program writes.
 
     Files wait until they are taken, so none is lost. They come in the order in which they are first
@@ -238,10 +228,7 @@ class WatchedImageFolder:
     `rsync -a` keep, tell at most how much time lies between two of them.
     """
 
-    live, paced, is_hdr = False, True, False
-    dropped = frames_in_file = rotate = 0
-    frame_count: int | None = None
-    duration_s: float | None = None
+    paced = True
 
     def __init__(
         self,
@@ -266,9 +253,7 @@ class WatchedImageFolder:
         """
         if not path.is_dir():
             raise InputError(f"{path} is no folder; --live watches a folder of images that grows.")
-        self.path = path
-        self.selection = selection
-        self.warnings: list[str] = []
+        super().__init__(path, selection)
         self._pace, self._idle_s, self._watch_s = pace, idle_s, watch_s
         rgb = self._first()
         self.started_at, self._first_at = time.time(), pace.now()
@@ -369,10 +354,6 @@ class WatchedImageFolder:
     def _is_done(self) -> bool:
         places = [self.path, self.path.parent] if self.path.name == "images" else [self.path]
         return any((place / DONE_FILE_NAME).exists() for place in places)
-
-    def _warn(self, message: str) -> None:
-        if message not in self.warnings and len(self.warnings) < 100:
-            self.warnings.append(message)
 
 
 def _state_of(path: Path) -> _FileState | None:

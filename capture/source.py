@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, final, runtime_checkable
+from typing import final
 
 import numpy as np
 from jaxtyping import UInt8
@@ -14,6 +14,8 @@ from capture.input_error import InputError
 
 ASSUMED_FPS = 30.0
 """Frames or poses per second where no file says: folders of images, poses without times."""
+MAX_WARNINGS = 100
+"""Most problems of one source that are told."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -96,8 +98,7 @@ class FrameSelection:
         return (count - 1) * self.step + 1 if count else 0
 
 
-@runtime_checkable
-class FrameSource(Protocol):
+class FrameSource:
     """A recorded or live stream of upright RGB frames of one size.
 
     Attributes:
@@ -117,79 +118,57 @@ class FrameSource(Protocol):
         warnings: Problems so far; grows while `frames()` is read.
     """
 
-    path: Path
     size_px: tuple[int, int]
-    selection: FrameSelection
-    frames_in_file: int
-    frame_count: int | None
-    duration_s: float | None
-    has_alpha: bool
-    rotate: int
-    is_hdr: bool
-    live: bool
-    paced: bool
-    started_at: float
-    warnings: list[str]
-
-    @property
-    def waited_s(self) -> float:
-        """Seconds that `frames()` has waited for frames, in all."""
-        ...
-
-    @property
-    def dropped(self) -> int:
-        """Number of frames that were lost because they were not taken in time."""
-        ...
-
-    def frames(self) -> Iterator[Frame]:
-        """The selected frames, lazily and in order; every call starts from the first."""
-        ...
-
-    def count_frames(self) -> int:
-        """The true number of all frames, found by decoding; slow."""
-        ...
-
-    def close(self) -> None:
-        """End `frames()`, also one that waits on another thread, and release a device."""
-        ...
-
-
-class Recording:
-    """The common part of a video file and a folder of images: nothing waits or is lost."""
-
-    live = paced = is_hdr = False
-    started_at = waited_s = 0.0
-    dropped = rotate = 0
+    frames_in_file: int = 0
+    frame_count: int | None = None
+    duration_s: float | None = None
+    has_alpha: bool = False
+    is_hdr: bool = False
+    live: bool = False
+    paced: bool = False
+    rotate: int = 0
+    started_at: float = 0.0
 
     def __init__(self, path: Path, selection: FrameSelection) -> None:
         """Keep the arguments; nothing is read yet."""
         self.path, self.selection = path, selection
         self.warnings: list[str] = []
 
+    @property
+    def waited_s(self) -> float:
+        """Seconds that `frames()` has waited for frames, in all."""
+        return 0.0
+
+    @property
+    def dropped(self) -> int:
+        """Number of frames that were lost because they were not taken in time."""
+        return 0
+
+    def frames(self) -> Iterator[Frame]:
+        """The selected frames, lazily and in order; every call starts from the first."""
+        raise NotImplementedError
+
+    def count_frames(self) -> int:
+        """The true number of all frames, found by decoding, which is slow; 0 if it is unknown."""
+        return 0
+
     def close(self) -> None:
-        """Do nothing: only `frames()` holds files open, and closes them itself."""
+        """End `frames()`, also one that waits on another thread, and release a device."""
 
     def _warn(self, message: str) -> None:
-        if message not in self.warnings:
+        if message not in self.warnings and len(self.warnings) < MAX_WARNINGS:
             self.warnings.append(message)
 
 
-class WrappedSource:
+class WrappedSource(FrameSource):
     """A source of which something is changed; all else is the source's own."""
 
     def __init__(self, source: FrameSource) -> None:
         """Wrap a source; nothing is read yet."""
+        super().__init__(source.path, source.selection)
         self._source = source
-        self.path = source.path
-        self.size_px = source.size_px
-        self.selection = source.selection
-        self.frames_in_file = source.frames_in_file
-        self.frame_count = source.frame_count
-        self.duration_s = source.duration_s
-        self.has_alpha = source.has_alpha
-        self.rotate, self.is_hdr = source.rotate, source.is_hdr
-        self.live, self.paced = source.live, source.paced
-        self.started_at = source.started_at
+        for name in FrameSource.__annotations__:
+            setattr(self, name, getattr(source, name))
         self.warnings = source.warnings
 
     @property

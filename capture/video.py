@@ -12,7 +12,7 @@ from jaxtyping import UInt8
 from capture.hdr_tone_mapping import HDR_TRANSFERS, tone_map_hdr
 from capture.image_folder import has_cutout_alpha, refuse_pipe
 from capture.input_error import InputError, quote_command
-from capture.source import Frame, FrameSelection, Recording
+from capture.source import Frame, FrameSelection, FrameSource
 
 VIDEO_SUFFIXES = frozenset(
     {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".ts", ".wmv"}
@@ -58,7 +58,7 @@ class DecodedFrame(NamedTuple):
         return np.ascontiguousarray(np.rot90(rgb, _quarter_turns(self.frame)))
 
 
-class VideoFile(Recording):
+class VideoFile(FrameSource):
     """A recorded video; its rotation tag is applied and HDR is tone mapped.
 
     A file that ends early or has gaps is read as far as it goes, with a warning.
@@ -67,8 +67,6 @@ class VideoFile(Recording):
         has_unread_alpha: Whether it has an alpha channel that is not opaque; it is not read (that
             of image files is).
     """
-
-    has_alpha = False
 
     def __init__(self, path: Path, selection: FrameSelection) -> None:
         """Open the file and decode one frame."""
@@ -98,9 +96,9 @@ class VideoFile(Recording):
         width, height = int(first.frame.width), int(first.frame.height)
         self.size_px = (height, width) if _quarter_turns(first.frame) % 2 else (width, height)
         self.frames_in_file = claimed_frames if claimed_frames > 0 else self.count_frames()
-        self.frame_count: int | None = selection.count(self.frames_in_file)
+        self.frame_count = selection.count(self.frames_in_file)
         span = selection.span(self.frames_in_file)
-        self.duration_s: float | None = span / self._fps if self._fps > 0.0 else None
+        self.duration_s = span / self._fps if self._fps > 0.0 else None
         if not self.frame_count:
             raise InputError(
                 f"{path} has {self.frames_in_file} frames; none of them is among the frames asked "

@@ -7,8 +7,11 @@ import dataclasses
 import json
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 from avatar.evaluation.all_round_verdict import AllRoundVerdict
 from avatar.evaluation.coverage import Coverage, coverage_advice
@@ -19,7 +22,6 @@ from avatar.evaluation.image_metrics import (
     overall_verdict,
 )
 from avatar.events import HeldOutScore
-from capture.process_metrics import ReservoirSample
 from preprocess.observation import DroppedFrame
 from preprocess.tracking.video_tracking import NOT_FOUND
 
@@ -152,10 +154,10 @@ class Percentiles:
     p95: float
 
     @classmethod
-    def of(cls, numbers: ReservoirSample, *, scale: float = 1.0) -> "Percentiles":
-        """Return the percentiles of a reservoir sample, times `scale`."""
-        p50, p95 = (scale * numbers.percentile(percent) for percent in (50.0, 95.0))
-        return cls(p50=p50, p95=p95)
+    def of(cls, numbers: Sequence[float], *, scale: float = 1.0) -> "Percentiles":
+        """Return the percentiles of some numbers, times `scale`; 0 of none."""
+        p50, p95 = scale * np.percentile(numbers or [0.0], (50.0, 95.0))
+        return cls(p50=float(p50), p95=float(p95))
 
 
 @dataclass(frozen=True, kw_only=True)

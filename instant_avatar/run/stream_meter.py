@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator
 from typing import TypeVar, final
 
 from avatar.training.frame_stream import RedundantFrame
-from capture.process_metrics import ReservoirSample
 from capture.source import Frame, FrameSource
 from instant_avatar.report.report_schema import Percentiles, StreamStats
 from preprocess.observation import DroppedFrame, Observation
@@ -46,8 +45,8 @@ class StreamMeter:
         self.first_frame_at: float | None = None
         self.last_frame_s = 0.0
         self.size_px: tuple[int, int] | None = None
-        self.preparation_s, self.lateness_s = ReservoirSample(), ReservoirSample()
-        self.latency_s, self.inbox_depth = ReservoirSample(), ReservoirSample()
+        self.preparation_s, self.lateness_s = list[float](), list[float]()
+        self.latency_s, self.inbox_depth = list[float](), list[float]()
         self.current_latency_s = 0.0
         self.inbox_dropped = 0
         self._first_time_s = self._clip_started_at = 0.0
@@ -68,7 +67,7 @@ class StreamMeter:
         for frame in frames:
             now = time.perf_counter()
             available_at = now if frame.due_s is None else frame.due_s
-            self.lateness_s.add(now - available_at)
+            self.lateness_s.append(now - available_at)
             if self.first_frame_at is None:
                 self.first_frame_at, self._first_time_s = available_at, frame.time_s
                 self._clip_started_at = available_at
@@ -104,7 +103,7 @@ class StreamMeter:
             if isinstance(item, RedundantFrame):
                 self.near_duplicates += 1
             else:
-                self.preparation_s.add(time.perf_counter() - started - waited)
+                self.preparation_s.append(time.perf_counter() - started - waited)
             yield item
 
     def mark_arrived(self, index: int, *, held_out: bool) -> None:
@@ -114,11 +113,12 @@ class StreamMeter:
             number, available_at = self._available_at.popleft()
             if number == index:
                 self.current_latency_s = time.perf_counter() - available_at
-                self.latency_s.add(self.current_latency_s)
+                self.latency_s.append(self.current_latency_s)
 
     def lateness_warnings(self) -> Iterator[str]:
         """Yield warnings about frames that could not be prepared as fast as they came."""
-        dropped, late = self._source.dropped + self.inbox_dropped, self.lateness_s
+        dropped = self._source.dropped + self.inbox_dropped
+        late = Percentiles.of(self.lateness_s)
         if dropped:
             yield (
                 f"{dropped} frames were dropped because tracking or preprocessing is slower than "
@@ -126,11 +126,11 @@ class StreamMeter:
                 "--size."
             )
         playback = self._source.paced and not self._source.live
-        if playback and not dropped and late.percentile(95.0) > LATENESS_WARNING_S:
+        if playback and not dropped and late.p95 > LATENESS_WARNING_S:
             yield (
-                f"Playback lagged by up to {late.largest:.1f} s (median "
-                f"{late.percentile(50.0):.1f} s): preprocessing is slower than the frame rate. No "
-                "frame was dropped. Reduce --size, or use every other frame (--frames ::2)."
+                f"Playback lagged by up to {max(self.lateness_s):.1f} s (median {late.p50:.1f} s): "
+                "preprocessing is slower than the frame rate. No frame was dropped. Reduce --size, "
+                "or use every other frame (--frames ::2)."
             )
 
     def stats(self, *, ready_at: float | None) -> StreamStats:

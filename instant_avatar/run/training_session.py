@@ -306,7 +306,7 @@ class TrainingSession:
             case FrameArrived(index=index, held_out=held_out):
                 self.meter.mark_arrived(index, held_out=held_out)
             case Stepped():
-                self.meter.inbox_depth.add(float(inbox.pending))
+                self.meter.inbox_depth.append(float(inbox.pending))
                 if self._checkpoints.is_due():
                     self._begin_checkpoint(trains_on=True)
                 for step in self._checkpoints.take_saved():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from capture.source import Frame, FrameSelection, PacingClock, RealtimePlayback
+from capture.source import Frame, FrameSelection, FrameSource, PacingClock, RealtimePlayback
 from capture.source_opening import open_source
 
 UNEVEN_S = [5.0, 5.04, 5.1, 5.1, 5.7, 5.733]
@@ -30,18 +30,15 @@ class Time:
         self.now_s += seconds
 
 
-class Recorded:
+class Recorded(FrameSource):
     """A source of tiny frames at given times."""
 
-    path, size_px, selection = Path("uneven.mp4"), (2, 2), FrameSelection()
-    has_alpha = live = paced = False
-    rotate = 0
-    is_hdr = False
-    started_at = 0.0
+    size_px = (2, 2)
     frames_in_file = frame_count = len(UNEVEN_S)
-    duration_s, waited_s, dropped = 0.77, 0.0, 0
+    duration_s = 0.77
 
     def __init__(self, times=UNEVEN_S):
+        super().__init__(Path("uneven.mp4"), FrameSelection())
         self.times, self.warnings, self.closed = times, ["a gap"], False
 
     def frames(self):

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from capture.input_error import InputError
-from capture.source import Frame
+from capture.source import Frame, FrameSelection, FrameSource
 from preprocess import tracked_stream
 from preprocess.body.body_surface import splat_silhouette
 from preprocess.body.parametric_body import load_body_model
@@ -33,28 +33,20 @@ COUNT = 24
 SIZE = (180, 320)
 
 
-class Pictures:
+class Pictures(FrameSource):
     """A source of empty frames; its clock is the test's."""
 
-    live, paced, has_alpha, is_hdr, rotate = False, True, False, False, 0
-    started_at = waited_s = 0.0
-    dropped, path, size_px = 0, Path("film.mp4"), SIZE
-    selection, frames_in_file, frame_count, duration_s = None, COUNT, COUNT, COUNT / 30.0
+    paced, size_px = True, SIZE
+    frames_in_file, frame_count, duration_s = COUNT, COUNT, COUNT / 30.0
 
     def __init__(self, due_s=None) -> None:
-        self.warnings: list[str] = []
+        super().__init__(Path("film.mp4"), FrameSelection())
         self._due_s = due_s
 
     def frames(self):
         for index in range(COUNT):
             rgb = np.full((SIZE[1], SIZE[0], 3), 80, np.uint8)
             yield Frame(index=index, time_s=index / 30.0, rgb=rgb, due_s=self._due_s)
-
-    def count_frames(self):
-        return COUNT
-
-    def close(self):
-        pass
 
 
 @pytest.fixture(scope="module")
