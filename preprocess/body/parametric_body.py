@@ -147,9 +147,6 @@ def load_body_model(path: Path | None = None) -> BodyModel:
     Keys: v_template (V, 3), shapedirs (V, 3, B), weights (V, 24), kintree_table (2, 24), f (F, 3),
     and either J_regressor (24, V), which makes it SMPL's, or J (24, 3) and J_shapedirs (24, 3, B);
     posedirs (V, 3, 207) if there are any. A .pkl is read without executing it.
-
-    Raises:
-        InputError: If there is no such file, or it holds no such body, or code.
     """
     path = path or Path(str(files("preprocess") / "data" / "body24.npz"))
     if not path.is_file():
@@ -163,90 +160,91 @@ def load_body_model(path: Path | None = None) -> BodyModel:
         arrays = read_pickled_arrays(path, BODY_KEYS)
     else:
         raise InputError(f"{path} ends in {path.suffix!r}; a body file ends in .npz or .pkl.")
-    return _parse_body(arrays, path)
+    try:
+        return _parse_body(arrays)
+    except ValueError as cause:
+        raise InputError(f"{path} is no usable body file: {cause}") from cause
 
 
-def _parse_body(arrays: Arrays, path: Path) -> BodyModel:
+def _parse_body(arrays: Arrays) -> BodyModel:
     missing = [key for key in REQUIRED_BODY_KEYS if key not in arrays]
     if missing or not ("J_regressor" in arrays or {"J", "J_shapedirs"} <= arrays.keys()):
-        raise InputError(
-            f"{path} is no body file: it lacks {', '.join(missing) or 'J_regressor'}. "
+        raise ValueError(
+            f"it lacks {', '.join(missing) or 'J_regressor'}. "
             f"Expected {', '.join(REQUIRED_BODY_KEYS)} and J_regressor (or J with J_shapedirs)."
         )
-    template = _read_array(arrays, "v_template", (-1, 3), path)
-    directions = _read_array(arrays, "shapedirs", (len(template), 3, -1), path)
-    weights = _read_array(arrays, "weights", (len(template), -1), path)
+    template = _read_array(arrays, "v_template", (-1, 3))
+    directions = _read_array(arrays, "shapedirs", (len(template), 3, -1))
+    weights = _read_array(arrays, "weights", (len(template), -1))
     if weights.shape[1] != len(PARENTS):
-        raise InputError(
-            f"{path} has {weights.shape[1]} joints; a body of SMPL's {len(PARENTS)} joints was "
+        raise ValueError(
+            f"it has {weights.shape[1]} joints; a body of SMPL's {len(PARENTS)} joints was "
             "expected (not SMPL+H or SMPL-X)."
         )
     if "J_regressor" in arrays:
-        regressor = _read_array(arrays, "J_regressor", (24, len(template)), path)
+        regressor = _read_array(arrays, "J_regressor", (24, len(template)))
         joints = regressor @ template
         joint_directions = np.einsum("jv,vab->jab", regressor, directions)
     else:
-        joints = _read_array(arrays, "J", (24, 3), path)
-        joint_directions = _read_array(arrays, "J_shapedirs", (24, 3, directions.shape[2]), path)
+        joints = _read_array(arrays, "J", (24, 3))
+        joint_directions = _read_array(arrays, "J_shapedirs", (24, 3, directions.shape[2]))
     return BodyModel(
         family="smpl" if "J_regressor" in arrays else "body24",
         template=template,
-        faces=_faces(arrays, len(template), path),
-        weights=_normalize_weights(weights, path),
+        faces=_faces(arrays, len(template)),
+        weights=_normalize_weights(weights),
         joints=joints,
-        parents=_parents(arrays, path),
+        parents=_parents(arrays),
         shape_directions=directions,
         joint_directions=joint_directions,
-        pose_directions=_read_array(arrays, "posedirs", (len(template), 3, 207), path)
+        pose_directions=_read_array(arrays, "posedirs", (len(template), 3, 207))
         if "posedirs" in arrays
         else None,
     )
 
 
-def _read_array(
-    arrays: Arrays, key: str, shape: tuple[int, ...], path: Path
-) -> Float64[np.ndarray, "..."]:
+def _read_array(arrays: Arrays, key: str, shape: tuple[int, ...]) -> Float64[np.ndarray, "..."]:
     """One array as float64, of the shape given (-1: any length)."""
     array = arrays[key]
     if array.dtype.kind not in "biuf":
-        raise InputError(f"`{key}` in {path} holds no numbers.")
+        raise ValueError(f"`{key}` holds no numbers.")
     fits = array.ndim == len(shape) and all(
         wanted in (-1, length) for wanted, length in zip(shape, array.shape, strict=False)
     )
     if not fits:
         expected = " x ".join("any" if n < 0 else str(n) for n in shape)
-        raise InputError(f"`{key}` in {path} has the shape {array.shape}; expected {expected}.")
+        raise ValueError(f"`{key}` has the shape {array.shape}; expected {expected}.")
     if not np.isfinite(array).all():
-        raise InputError(f"`{key}` in {path} holds NaN or infinite numbers; the file is damaged.")
+        raise ValueError(f"`{key}` holds NaN or infinite numbers; the file is damaged.")
     return np.ascontiguousarray(array, dtype=np.float64)
 
 
-def _parents(arrays: Arrays, path: Path) -> Int[np.ndarray, "24"]:
+def _parents(arrays: Arrays) -> Int[np.ndarray, "24"]:
     """Parents as integers; the root's, 2³² - 1 in unsigned files, becomes -1."""
-    parents = _read_array(arrays, "kintree_table", (2, 24), path)[0].astype(np.int64)
+    parents = _read_array(arrays, "kintree_table", (2, 24))[0].astype(np.int64)
     parents = np.where(parents == 2**32 - 1, -1, parents)
     if tuple(parents) != PARENTS:
-        raise InputError(
-            f"The joints of {path} form another tree than SMPL's: their parents are "
+        raise ValueError(
+            f"the joints form another tree than SMPL's: their parents are "
             f"{parents.tolist()}, expected {list(PARENTS)}."
         )
     return parents
 
 
-def _faces(arrays: Arrays, vertices: int, path: Path) -> Int[np.ndarray, "faces 3"]:
-    faces = _read_array(arrays, "f", (-1, 3), path).astype(np.int64)
+def _faces(arrays: Arrays, vertices: int) -> Int[np.ndarray, "faces 3"]:
+    faces = _read_array(arrays, "f", (-1, 3)).astype(np.int64)
     if faces.size and not 0 <= faces.min() <= faces.max() < vertices:
-        raise InputError(f"`f` in {path} names vertices that the body does not have.")
+        raise ValueError("`f` names vertices that the body does not have.")
     return faces
 
 
 def _normalize_weights(
-    weights: Float[np.ndarray, "vertices 24"], path: Path
+    weights: Float[np.ndarray, "vertices 24"],
 ) -> Float[np.ndarray, "vertices 24"]:
     """Weights whose rows sum to 1 exactly."""
     sums = weights.sum(axis=1, keepdims=True)
     if weights.min() < 0.0 or np.abs(sums - 1.0).max() > 0.02:
-        raise InputError(f"`weights` in {path} are no skinning weights: rows must sum to 1.")
+        raise ValueError("`weights` are no skinning weights: rows must sum to 1.")
     return weights / sums
 
 
