@@ -158,11 +158,7 @@ class AtomicFile:
     """
 
     def __init__(self, path: Path, *, replace: bool | None = None) -> None:
-        """Make the empty file, and folders above it; `replace` is that of `is_replaceable`.
-
-        Raises:
-            InputError: If `path` is a folder, a device or a pipe, or a file that must stay.
-        """
+        """Make the empty file, and folders above it; `replace` is that of `is_replaceable`."""
         self._path, self._replace = path, replace
         if path.is_dir():
             raise InputError(f"{path} is a folder; the name of a file was expected.")
@@ -175,11 +171,7 @@ class AtomicFile:
         self.temporary_path.touch(exist_ok=False)
 
     def commit(self) -> None:
-        """Flush the file to the disk and give it its name.
-
-        Raises:
-            InputError: If a file that must stay has come there meanwhile.
-        """
+        """Flush the file to the disk and give it its name."""
         with self.temporary_path.open("r+b") as file:
             os.fsync(file.fileno())
         self._check_replaceable()

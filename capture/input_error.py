@@ -13,7 +13,11 @@ DISTRIBUTION = "instant-avatar-stream"
 
 
 class InputError(ValueError):
-    """Input that cannot be used; the message says what is, what was expected and what to do."""
+    """Input that cannot be used; the message says what is, what was expected and what to do.
+
+    Whatever reads what a user gave raises it; docstrings say so only where a caller goes on after
+    it.
+    """
 
 
 def quote_command(*words: object) -> str:

@@ -56,11 +56,7 @@ class FrameSelection:
 
     @classmethod
     def of(cls, frames: slice | None) -> "FrameSelection":
-        """The selection of a slice; all frames if it is None.
-
-        Raises:
-            InputError: If it counts from the end, goes backwards or leaves nothing.
-        """
+        """The selection of a slice; all frames if it is None."""
         if frames is None:
             return cls()
         start = 0 if frames.start is None else frames.start

@@ -26,9 +26,6 @@ def open_source(path: Path, *, frames: slice | None = None, rotate: int = 0) -> 
 
     Selected `frames` keep their numbers; all if None. They are turned clockwise by `rotate`
     degrees.
-
-    Raises:
-        InputError: If there is nothing there that can be read.
     """
     source = _open_recording(path, FrameSelection.of(frames))
     return RotatedSource(source, rotate) if rotate else source

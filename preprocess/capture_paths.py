@@ -61,9 +61,6 @@ def find_capture_paths(
         poses: Pose file; needed unless `video` is a folder that holds one of `POSE_FILE_NAMES`.
         cameras: Camera file; "static" for a static camera without a description; "solve" for a
             moving one, for which no file is looked for either.
-
-    Raises:
-        InputError: If something that was named, or the poses, does not exist.
     """
     if str(cameras) == "solve":  # nothing lies anywhere: until then each frame has its own camera
         cameras = "static"

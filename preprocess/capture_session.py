@@ -129,9 +129,6 @@ class Capture:
         """Size of one pixel on the body: the dial of the field's resolution.
 
         `as_filmed` means a pixel of the video, not of the reduced images.
-
-        Raises:
-            InputError: If the person is behind the camera.
         """
         claim = self.geometry()
         valid = self.motion.valid

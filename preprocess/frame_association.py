@@ -30,9 +30,6 @@ def associate_by_order(rows: int, source: FrameSource, things: str) -> Callable[
     The container's claim counts, so that a truncated video still fits its poses; where it does not
     fit, the frames are counted by decoding them. `things` names the rows in the message ("poses in
     poses.npz").
-
-    Raises:
-        InputError: If there are more or fewer rows than frames.
     """
     for total in (source.frames_in_file, None):
         count = source.count_frames() if total is None else total
@@ -71,9 +68,6 @@ def associate_by_time(
     Args:
         times_s: Of the poses, in any order; NaN where unknown.
         source: The frames; the frame rate in its container bounds how near a row must be.
-
-    Raises:
-        InputError: If hardly any frame has a pose at its time.
     """
     row_of = _nearest_row(times_s, _frame_interval_s(source))
     _check_time_matches(times_s, source, row_of)
@@ -191,11 +185,7 @@ MIN_NUMBERED_COVERAGE = 0.9
 def cameras_by_frame(
     found: Sequence[NamedCamera], source: FrameSource, path: Path
 ) -> dict[int, Camera]:
-    """The cameras by their frames' numbers; `found` is in the order of their images' names.
-
-    Raises:
-        InputError: If it cannot be decided which frames they belong to.
-    """
+    """The cameras by their frames' numbers; `found` is in the order of their images' names."""
     found = _select_image_folder(found, source, path)
     names = [None if each.name is None else PurePosixPath(each.name).name for each in found]
     if source.path.is_dir():

@@ -112,12 +112,7 @@ def join_frame(
 
 
 def associate_poses(motion: Motion, source: FrameSource) -> Callable[[Frame], int | None]:
-    """Map a frame to its row in the motion, or to None; cheap unless their numbers differ.
-
-    Raises:
-        InputError: If most poses are unusable, none belongs to a selected frame, or rows and
-            frames are of different number and nothing tells which belong together.
-    """
+    """Map a frame to its row in the motion, or to None; cheap unless their numbers differ."""
     usable = int(motion.valid.sum())
     if 2 * usable < len(motion):
         raise InputError(

@@ -151,9 +151,6 @@ class LiveTracking:
             camera: Its focal length is not exact.
             fixed_body: Whether `shaped` is the person.
             stated_focal: Whether the focal length comes from a file and is no guess.
-
-        Raises:
-            InputError: If the stream ends before the person was found.
         """
         while len(self._seen) < START_FRAMES and self.stream.take_next():
             pass

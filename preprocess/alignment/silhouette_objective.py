@@ -175,9 +175,6 @@ def sample_masks(
     """Read a few given masks; images are decoded only where their alpha channel is the mask.
 
     `person_px` is the height of the person in the reduced masks.
-
-    Raises:
-        InputError: If no mask shows a person, or masks or cameras do not belong to the frames.
     """
     start, step = source.selection.start, source.selection.step
     usable = [start + step * n for n in range(source.frame_count or 1)]

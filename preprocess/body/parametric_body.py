@@ -263,11 +263,7 @@ def write_shaped_body(path: Path, person: ShapedBody) -> None:
 
 
 def read_shaped_body(path: Path, body: BodyModel) -> ShapedBody:
-    """Read the person that `write_shaped_body` wrote, on the same body.
-
-    Raises:
-        InputError: If `body` is another one than then, or the file cannot be read.
-    """
+    """Read the person that `write_shaped_body` wrote, on the same body."""
     arrays = read_npz(path)
     if not set(SHAPED_BODY_KEYS) <= arrays.keys() or arrays["joints"].shape != (24, 3):
         raise InputError(

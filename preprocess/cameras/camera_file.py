@@ -75,10 +75,6 @@ def read_cameras(
         size_px: Width and height of the frames; None for those of the file's own images.
         source: The frames, whose names or number tell which camera is whose. Without it cameras
             of other programs are taken in order.
-
-    Raises:
-        InputError: If there is no such file, or it holds no such cameras, or their images had
-            another aspect ratio.
     """
     path = resolve_camera_path(path)
     refuse_pipe(path)

@@ -27,9 +27,6 @@ def read_named_cameras(path: Path, size_px: tuple[int, int] | None = None) -> li
     """Read the cameras of a file or a folder.
 
     `size_px` is the images' width and height, for files that do not state them.
-
-    Raises:
-        InputError: If nothing there holds cameras.
     """
     if not path.exists():
         raise InputError(f"{path} does not exist; expected {READABLE_FORMATS}.")

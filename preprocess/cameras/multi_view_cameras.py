@@ -73,9 +73,6 @@ def read_multi_view_camera(
         video: The video or folder; None if there are only poses, and one camera is expected.
         size_px: Width and height of its frames, for files that state none; None for twice the
             principal point.
-
-    Raises:
-        InputError: If there is no such camera, or it is none.
     """
     with explain_camera_errors(rig, "cameras of EasyMocap or ZJU-MoCap"):
         cameras = _read_zju(rig) if rig.name == ZJU else _read_easymocap(rig)

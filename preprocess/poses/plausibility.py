@@ -38,11 +38,7 @@ MAX_FLIP_SHARE = 0.1
 
 
 def require_plausible(motion: Motion, path: Path | str) -> Motion:
-    """Return the motion with impossible rows marked as not valid.
-
-    Raises:
-        InputError: If the numbers cannot be poses of a body in radians and metres.
-    """
+    """Return the motion with impossible rows marked as not valid."""
     reason = implausibility_reason(motion)
     if reason is not None:
         raise InputError(f"{path}: {reason}")

@@ -54,9 +54,6 @@ def read_poses(
         default_model: Body family of files that do not say theirs.
         person: Whose poses, by the file's own number or name.
         prefer_world: Reads poses in the world rather than in a camera, to drive an avatar.
-
-    Raises:
-        InputError: If there is no such file, it holds no known poses, or no person of that name.
     """
     path = resolve_pose_path(path)
     refuse_pipe(path)

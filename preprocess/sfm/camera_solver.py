@@ -93,9 +93,6 @@ def solve_cameras(
 
     `person_mask` finds the person, who moves and is ignored; progress is the fraction of the work
     that is done.
-
-    Raises:
-        InputError: If pycolmap is missing, or no solution passes all gates.
     """
     colmap_mapping.require_pycolmap()
     wall_s, cpu_s = time.perf_counter(), time.process_time()

@@ -119,11 +119,7 @@ def dilate_person(person: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, 
 
 
 def write_keyframes(keys: Iterator[SfmKeyframe], images: Path, masks: Path) -> list[SfmKeyframe]:
-    """Write images and masks (0 where pixels are ignored), named by the frames' numbers.
-
-    Raises:
-        InputError: If there are too few.
-    """
+    """Write images and masks (0 where pixels are ignored), named by the frames' numbers."""
     images.mkdir(parents=True)
     masks.mkdir(parents=True)
     kept = []

@@ -94,9 +94,6 @@ def place_in_metric_world(
         motion: Each row in the camera of its frame, metres.
         tracker_camera: Camera that the poses were made for, at its world's origin; None if unknown:
             then they are taken to be right for the solved focal length.
-
-    Raises:
-        InputError: If nothing tells the scale of the world.
     """
     lens = solved.lens(source.size_px)
     if tracker_camera is not None:

@@ -172,9 +172,6 @@ def track_video(
             not found; None writes none.
         advance: Called with the number of frames done.
         stop: Ends tracking early once it is set; what was found until then is returned.
-
-    Raises:
-        InputError: If the person is found in too few frames.
     """
     frames, problems = list[int](), list[int]()
     found: list[PersonKeypoints] = []
