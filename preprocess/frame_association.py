@@ -186,8 +186,12 @@ def cameras_by_frame(
     found: Sequence[NamedCamera], source: FrameSource, path: Path
 ) -> dict[int, Camera]:
     """The cameras by their frames' numbers; `found` is in the order of their images' names."""
-    found = _select_image_folder(found, source, path)
     names = [None if each.name is None else PurePosixPath(each.name).name for each in found]
+    if None not in names and len(set(names)) < len(names):
+        raise InputError(
+            f"{path} holds several cameras for pictures of one name, in several folders. Give "
+            f"those of {source.path} alone."
+        )
     if source.path.is_dir():
         index = {file.stem: number for number, file in enumerate(list_images(source.path))}
         matched = {
@@ -205,24 +209,6 @@ def cameras_by_frame(
         "their names do not tell which belong together. Give as VIDEO the folder of pictures that "
         "the cameras were made from, or a camera for every frame."
     )
-
-
-def _select_image_folder(
-    found: Sequence[NamedCamera], source: FrameSource, path: Path
-) -> Sequence[NamedCamera]:
-    """The cameras of the video's own images, where several folders hold images of one name."""
-    places = [PurePosixPath(each.name or str(row)) for row, each in enumerate(found)]
-    if len({place.name for place in places}) == len(found):
-        return found
-    own = {source.path.resolve().name, source.path.stem}
-    chosen = [e for place, e in zip(places, found, strict=True) if own & set(place.parent.parts)]
-    if not chosen or len({PurePosixPath(each.name or "").name for each in chosen}) < len(chosen):
-        folders = ", ".join(sorted({str(place.parent) for place in places})[:12])
-        raise InputError(
-            f"{path} holds several cameras for pictures of one name, in the folders {folders}; "
-            f"{source.path} is none of them. Give as VIDEO one of these folders of pictures."
-        )
-    return chosen
 
 
 def interpolate_missing_cameras(

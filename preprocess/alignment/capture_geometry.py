@@ -205,7 +205,6 @@ def relative_change(before: CaptureGeometry, after: CaptureGeometry) -> float:
 def sanity_warnings(geometry: CaptureGeometry, frames: list[int]) -> Iterator[str]:
     """Describe implausible poses and cameras of the selected frames: gaps, jumps, ranges, views."""
     yield from _missing_pose_warnings(geometry, frames)
-    yield from _timestamp_warnings(geometry, frames)
     yield from _range_warnings(geometry)
     yield from _jump_warnings(geometry)
     seen = view_coverage(geometry)
@@ -237,25 +236,6 @@ def _missing_pose_warnings(geometry: CaptureGeometry, frames: list[int]) -> Iter
     bare = [frame for frame in frames if geometry.row_for_frame(frame) is None]
     if len(bare) > int((~geometry.motion.valid).sum()):
         yield f"{len(bare)} of {len(frames)} frames have no pose{_list_frames(bare)}."
-
-
-def _timestamp_warnings(geometry: CaptureGeometry, frames: list[int]) -> Iterator[str]:
-    times = geometry.motion.times_s
-    known = np.isfinite(geometry.row_frames)
-    if times is None or geometry.motion.frames is not None or not known.any():
-        return
-    inside = (geometry.row_frames[known] >= frames[0] - 0.5) & (
-        geometry.row_frames[known] <= frames[-1] + 0.5
-    )
-    last = int(np.argmax(np.where(known, np.abs(times), 0.0)))
-    if inside.mean() >= 0.5 or geometry.row_frames[last] == 0.0:
-        return
-    seconds = times[last] / geometry.row_frames[last]
-    yield (
-        f"The poses' times run from {times[known].min():.6g} to {times[known].max():.6g} s, the "
-        f"frames' from {seconds * frames[0]:.3g} to {seconds * frames[-1]:.3g} s; `time` is in "
-        "seconds since the video's first frame. Milliseconds, or another clock?"
-    )
 
 
 def _range_warnings(geometry: CaptureGeometry) -> Iterator[str]:
