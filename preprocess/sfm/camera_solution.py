@@ -89,10 +89,6 @@ class SparseModel:
         )
 
 
-NARROW = 0.2
-"""Relative distance from a bound within which a gate is missed narrowly."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class QualityGate:
     """One figure and its bound; `name` is its key in the report.
@@ -107,11 +103,10 @@ class QualityGate:
     failure_reason: str
 
     def describe_failure(self) -> str:
-        """Say why it has not passed, by which figure, and whether that was a narrow miss."""
+        """Say why it has not passed, and by which figure."""
         if not np.isfinite(self.value):
             return self.failure_reason
-        narrow = ": a narrow miss" if abs(self.value - self.bound) < NARROW * self.bound else ""
-        return f"{self.failure_reason} ({self.value:.2g}, the bound is {self.bound:.2g}{narrow})"
+        return f"{self.failure_reason} ({self.value:.2g}, the bound is {self.bound:.2g})"
 
 
 MISSING, INTERPOLATED, PLACED, KEY = range(4)

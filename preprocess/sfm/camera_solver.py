@@ -7,7 +7,6 @@ its gates, and if points followed from key frame to key frame land where the nex
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -41,8 +40,9 @@ from preprocess.sfm.colmap_mapping import (
     write_keyframes,
 )
 from preprocess.sfm.point_tracking import (
+    MAX_STATIC_MOTION,
     ResectionResult,
-    detect_static_camera,
+    measure_background_motion,
     resect_intermediate_frames,
 )
 from preprocess.sfm.turning_camera import solve_turning_camera
@@ -61,11 +61,6 @@ MIN_SOLVED_FRAMES = 0.5
 
 MAX_IGNORED_DISTORTION_PX = 0.3
 """Distortion of the corners below which a lens counts as free of distortion, pixels."""
-
-STAGE_SHARES = {
-    "key frames": 0.07, "features": 0.5, "matches": 0.15, "mapping": 0.22, "frames between": 0.06,
-}  # fmt: skip
-"""Usual fraction of the whole time that each stage takes, for the progress bar; in their order."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,24 +110,26 @@ def _solve(
 ) -> CameraSolution:
     """Run all stages; key frames and COLMAP's database lie in a folder meanwhile."""
 
-    def stage(name: str) -> Callable[[float], None]:
-        return partial(_report_stage, report_progress, name)
+    def part(start: float, end: float) -> Callable[[float], None]:
+        """Report the progress of one stage, which takes about this part of the whole time."""
+        return lambda share: report_progress(start + share * (end - start))
 
-    chosen = select_keyframes(source, person_mask, stage("key frames"), settings.max_keyframes)
+    chosen = select_keyframes(source, person_mask, part(0.0, 0.07), settings.max_keyframes)
     keys = write_keyframes(chosen, folder / "images", folder / "masks")
-    rest = detect_static_camera(keys)
-    if rest.is_static:
-        return CameraSolution.static(source, rest.background_motion, len(keys))
+    background_motion = measure_background_motion(keys)
+    if background_motion <= MAX_STATIC_MOTION:
+        return CameraSolution.static(source, background_motion, len(keys))
     ratio, longer_px = settings.focal_ratio, max(keys[0].gray.shape)
     workspace = ColmapWorkspace(
         images=folder / "images", masks=folder / "masks", database=folder / "matches.db",
+        names=tuple(key.name for key in keys), size_px=keys[0].gray.shape[::-1],
         focal_px=None if ratio is None else ratio * longer_px, threads=settings.threads,
     )  # fmt: skip
     model = solve_turning_camera(keys, workspace.focal_px)
     gates = [] if model is None else evaluate_gates(model, len(keys))
     if model is None or not all(gate.passed for gate in gates):
-        model, gates = _solve_path(workspace, folder / "models", keys, settings.seed, stage)
-    between = resect_intermediate_frames(source, model, keys, stage("frames between"))
+        model, gates = _solve_path(workspace, folder / "models", keys, settings.seed, part)
+    between = resect_intermediate_frames(source, model, keys, part(0.94, 1.0))
     gates.append(_tracking_gate(between, len(model.frames)))
     if not gates[-1].passed:
         raise _unsolved_error([gates[-1]])
@@ -145,7 +142,7 @@ def _solve(
             "movements, or give only the part that goes well (--frames START:STOP)."
         )
     return CameraSolution(
-        is_static=False, background_motion=rest.background_motion, gates=tuple(gates), model=model,
+        is_static=False, background_motion=background_motion, gates=tuple(gates), model=model,
         camera_from_solved=cameras, frame_status=status, keyframe_count=len(keys),
     )  # fmt: skip
 
@@ -155,22 +152,16 @@ def _solve_path(
     folder: Path,
     keys: list[SfmKeyframe],
     seed: int,
-    stage: Callable[[str], Callable[[float], None]],
+    part: Callable[[float, float], Callable[[float], None]],
 ) -> tuple[SparseModel, list[QualityGate]]:
     """Solve the key frames of a camera that is carried around; return the gates passed, too."""
-    colmap_mapping.extract_features(workspace, stage("features"))
-    colmap_mapping.match_features(workspace, stage("matches"))
+    colmap_mapping.extract_features(workspace, part(0.07, 0.57))
+    colmap_mapping.match_features(workspace, part(0.57, 0.72))
     parallax = _parallax(workspace, len(keys))
     if not parallax.passed:
         raise _unsolved_error([parallax])
-    model, gates = _map(workspace, folder, keys, seed, stage("mapping"))
+    model, gates = _map(workspace, folder, keys, seed, part(0.72, 0.94))
     return model, [parallax, *gates]
-
-
-def _report_stage(report_progress: Callable[[float], None], name: str, share: float) -> None:
-    names = list(STAGE_SHARES)
-    before = sum(STAGE_SHARES[each] for each in names[: names.index(name)])
-    report_progress(before + share * STAGE_SHARES[name])
 
 
 def _parallax(workspace: ColmapWorkspace, keys: int) -> QualityGate:

@@ -56,6 +56,11 @@ class SfmKeyframe:
     gray: UInt8[np.ndarray, "height width"]
     person_mask: Bool[np.ndarray, "height width"]
 
+    @property
+    def name(self) -> str:
+        """Name of the image's file."""
+        return f"{self.index:06d}.png"
+
 
 def feature_image_size(size_px: tuple[int, int]) -> tuple[int, int]:
     """The size of images that are worked on: that of the frames, at most `FEATURE_IMAGE_PX`."""
@@ -124,9 +129,8 @@ def write_keyframes(keys: Iterator[SfmKeyframe], images: Path, masks: Path) -> l
     masks.mkdir(parents=True)
     kept = []
     for key in keys:
-        name = f"{key.index:06d}.png"
-        write_png(images / name, key.gray)
-        write_png(masks / f"{name}.png", np.where(key.person_mask, 0, 255).astype(np.uint8))
+        write_png(images / key.name, key.gray)
+        write_png(masks / f"{key.name}.png", np.where(key.person_mask, 0, 255).astype(np.uint8))
         kept.append(key)
     if len(kept) < MIN_KEYFRAMES:
         raise InputError(
@@ -171,6 +175,7 @@ class ColmapWorkspace:
     Attributes:
         images: Folder of images named by their frame's number.
         masks: Folder of an 8-bit image for each, 0 where pixels are ignored.
+        names, size_px: Names, width and height of the images.
         focal_px: The known focal length, else None.
         threads: Of extraction and matching.
     """
@@ -178,6 +183,8 @@ class ColmapWorkspace:
     images: Path
     masks: Path
     database: Path
+    names: tuple[str, ...]
+    size_px: tuple[int, int]
     focal_px: float | None
     threads: int
 
@@ -195,7 +202,7 @@ def require_pycolmap() -> None:
 def extract_features(workspace: ColmapWorkspace, report_progress: ProgressFn) -> None:
     """Find SIFT features (Lowe 2004) outside the masked parts."""
     colmap = _colmap()
-    width, height = _size(workspace)
+    width, height = workspace.size_px
     reader, options = colmap.ImageReaderOptions(), colmap.FeatureExtractionOptions()
     reader.mask_path = str(workspace.masks)
     reader.camera_model = "SIMPLE_RADIAL"
@@ -206,7 +213,7 @@ def extract_features(workspace: ColmapWorkspace, report_progress: ProgressFn) ->
     options.num_threads, options.use_gpu = workspace.threads, False
     options.max_image_size = max(width, height)
     options.sift.max_num_features = MAX_FEATURES
-    names, step = _names(workspace), IMAGES_PER_THREAD * workspace.threads
+    names, step = list(workspace.names), IMAGES_PER_THREAD * workspace.threads
     with colmap.Database.open(workspace.database):  # makes it
         pass
     colmap.import_images(
@@ -227,9 +234,8 @@ def match_features(workspace: ColmapWorkspace, report_progress: ProgressFn) -> N
     colmap = _colmap()
     options = colmap.FeatureMatchingOptions()
     options.num_threads, options.use_gpu = 1, False
-    count = len(_names(workspace))
     report_progress(0.0)
-    if count <= MAX_EXHAUSTIVE_IMAGES:
+    if len(workspace.names) <= MAX_EXHAUSTIVE_IMAGES:
         colmap.match_exhaustive(
             workspace.database, matching_options=options, device=colmap.Device.cpu
         )
@@ -265,7 +271,7 @@ def map_incrementally(
     options.num_threads, options.random_seed = 1, seed
     options.min_model_size, options.max_num_models = 3, MAX_MODELS
     options.init_num_trials, options.extract_colors = MAX_INITIAL_PAIRS, False
-    total, done = len(_names(workspace)), 0
+    total, done = len(workspace.names), 0
 
     def next_image() -> None:
         nonlocal done
@@ -285,17 +291,6 @@ def _colmap() -> Any:
     pycolmap.logging.minloglevel = 3  # its log would go to stderr
     pycolmap.set_random_seed(0)
     return pycolmap
-
-
-def _names(workspace: ColmapWorkspace) -> list[str]:
-    return sorted(path.name for path in workspace.images.iterdir())
-
-
-def _size(workspace: ColmapWorkspace) -> tuple[int, int]:
-    from PIL import Image
-
-    with Image.open(workspace.images / _names(workspace)[0]) as picture:
-        return picture.size
 
 
 def _largest_model(models: dict[int, Any], stated_px: float | None) -> SparseModel | None:

@@ -90,7 +90,7 @@ MAX_CORNERS = 400
 MIN_TRACKED_FRACTION = 0.3
 """Fraction of the points that must be tracked for a static camera."""
 
-MAX_STATIC_SHIFT = 0.005
+MAX_STATIC_MOTION = 0.005
 """Largest shift of a static background; a fraction of the image's longer side (5 px of 960)."""
 
 MIN_TRACKED_POINTS = 12
@@ -100,25 +100,16 @@ COMPARED_KEYFRAMES = 12
 """Number of key frames that are compared with the first."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class StaticCameraTest:
-    """Result of the test for a static camera.
+def measure_background_motion(keys: list[SfmKeyframe]) -> float:
+    """Largest shift of the background between the first key frame and some others.
 
-    `background_motion` is the largest shift of the background between the first key frame and
-    another (median over its points), as a fraction of the image's longer side; NaN if it was lost.
+    The median over points of the first one's background, as a fraction of the image's longer side;
+    NaN if it was lost. The search ends where the camera cannot be static any more.
     """
-
-    is_static: bool
-    background_motion: float
-
-
-def detect_static_camera(keys: list[SfmKeyframe]) -> StaticCameraTest:
-    """Track points of the first key frame's background into others."""
-    first = keys[0]
+    first, moved = keys[0], 0.0
     pixels = detect_corners(first.gray, ~first.person_mask, MAX_CORNERS)
-    longer, moved = max(first.gray.shape), 0.0
     if len(pixels) < MIN_TRACKED_POINTS:
-        return StaticCameraTest(is_static=False, background_motion=float("nan"))
+        return float("nan")
     rows = np.unique(np.linspace(1, len(keys) - 1, COMPARED_KEYFRAMES).round().astype(int))
     for key in (keys[int(row)] for row in rows):
         there, found = track_points(first.gray, key.gray, pixels)
@@ -126,12 +117,12 @@ def detect_static_camera(keys: list[SfmKeyframe]) -> StaticCameraTest:
         open_view = ~key.person_mask[y, x]
         found &= open_view
         if found.sum() < max(MIN_TRACKED_POINTS, MIN_TRACKED_FRACTION * open_view.sum()):
-            return StaticCameraTest(is_static=False, background_motion=float("nan"))
-        shift = float(np.median(np.linalg.norm(there - pixels, axis=1)[found])) / longer
-        moved = max(moved, shift)
-        if moved > MAX_STATIC_SHIFT:
-            return StaticCameraTest(is_static=False, background_motion=moved)
-    return StaticCameraTest(is_static=True, background_motion=moved)
+            return float("nan")
+        shift = float(np.median(np.linalg.norm(there - pixels, axis=1)[found]))
+        moved = max(moved, shift / max(first.gray.shape))
+        if moved > MAX_STATIC_MOTION:
+            break
+    return moved
 
 
 MIN_PNP_POINTS = 20
@@ -148,9 +139,6 @@ MIN_INLIER_FRACTION = 0.5
 
 RESECTION_ITERATIONS = 10
 """Rounds of reweighted least squares for the turn of a camera; far points weigh less."""
-
-MAX_BUFFERED_FRAMES = 256
-"""Most frames between two key frames that are kept in memory; the middle of more is skipped."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -322,8 +310,6 @@ def _frames_between_keyframes(
             before, stretch = after, []
         if (before is None or frame.index != before.frame) and "corrupt" not in frame.flags:
             stretch.append((frame.index, to_grayscale(frame, size_px)))
-            if len(stretch) > MAX_BUFFERED_FRAMES:
-                del stretch[MAX_BUFFERED_FRAMES // 2]
     yield before, None, stretch
     for after in waiting:  # the video ended before they came
         yield before, after, []

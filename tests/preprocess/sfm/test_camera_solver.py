@@ -11,7 +11,7 @@ from benchmarks.camera_accuracy import fit_similarity
 from capture.input_error import InputError
 from capture.source_opening import open_source
 from preprocess.sfm import camera_solver, colmap_mapping
-from preprocess.sfm.camera_solution import INTERPOLATED, KEY, PLACED, QualityGate
+from preprocess.sfm.camera_solution import INTERPOLATED, KEY, PLACED
 from preprocess.sfm.camera_solver import SolverSettings, solve_cameras
 from preprocess.sfm.colmap_mapping import select_keyframes
 from preprocess.sfm.point_tracking import resect_intermediate_frames
@@ -184,11 +184,3 @@ def test_a_missing_pycolmap_is_reported(monkeypatch, tmp_path):
     monkeypatch.setattr(colmap_mapping.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"pycolmap.*\[learn\]"):
         colmap_mapping.require_pycolmap()
-
-
-def test_a_gate_that_is_missed_by_a_hair_is_named_as_one():
-    gate = QualityGate(
-        name="reprojection_px", value=0.67, bound=0.6, passed=False, failure_reason="points jump"
-    )
-    assert gate.describe_failure() == "points jump (0.67, the bound is 0.6: a narrow miss)"
-    assert "narrow" not in replace(gate, value=1.2).describe_failure()
