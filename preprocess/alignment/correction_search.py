@@ -20,7 +20,11 @@ from preprocess.alignment.corrections import (
     undo_video_offset,
 )
 from preprocess.alignment.keypoint_objective import KeypointObjective
-from preprocess.alignment.silhouette_objective import SilhouetteObjective, mean_with_missing
+from preprocess.alignment.silhouette_objective import (
+    SilhouetteObjective,
+    mean_score,
+    mean_with_missing,
+)
 
 MIN_STANDARD_ERRORS = 3.0
 """Standard errors, over the frames, by which a gain must exceed 0."""
@@ -40,6 +44,8 @@ MIN_FITTED_GAIN = 0.04
 """Gain in score that a fitted correction must bring: clothes make every body a little larger."""
 MIN_FITTED_CHANGE = 0.06
 """Relative change of its number that a fitted correction must make."""
+MIN_EXPLAINED_SCORE = 0.5
+"""Score after all corrections below which they explain nothing, and none is named."""
 MIN_WINDOW_CHANGE = 0.02
 """Fraction of the image that a video must be cropped or padded by."""
 
@@ -107,6 +113,7 @@ class CorrectionSearch:
 
     def run(self, geometry: CaptureGeometry) -> CorrectionResult:
         """Apply the best correction again and again while that helps significantly."""
+        stored = geometry
         scores = self.objective.frame_scores(geometry)
         chosen: list[Correction] = []
         first: tuple[CorrectionCandidate, ...] = ()
@@ -121,6 +128,8 @@ class CorrectionSearch:
             winner = min(tied, key=lambda each: CAUSES.index(each.correction.cause))
             chosen.append(winner.correction)
             geometry, scores = winner.correction.apply(geometry), winner.frame_scores
+        if mean_score(scores) < MIN_EXPLAINED_SCORE:
+            chosen, geometry = [], stored
         return CorrectionResult(corrections=tuple(chosen), candidates=first, corrected=geometry)
 
     def _best_candidates(self, geometry: CaptureGeometry) -> list[CorrectionCandidate]:
