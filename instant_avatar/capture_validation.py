@@ -162,7 +162,7 @@ def check_capture(imported: ImportedCapture) -> CaptureValidation:
     """Align a capture, with its video rotated if that explains an error, and validate it."""
     try:
         capture = align_capture(imported, skip_checks=True)
-        return check_aligned_capture(capture, imported.polarity_error or None)
+        return check_aligned_capture(capture)
     except InputError as error:
         with suppress(InputError):
             rotated = align_capture(imported.transposed(), skip_checks=True)

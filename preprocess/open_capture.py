@@ -78,7 +78,6 @@ class ImportedCapture:
         motion: The poses, in the space and for the body of their file.
         stored_masks: The masks, if a file holds them.
         segmenter: Name of the segmenter that estimates them; None if they are given.
-        polarity_error: Why it is unclear which side of them is the person; empty if it is clear.
         provenance: Where the poses come from, if not from a file of the user.
     """
 
@@ -89,7 +88,6 @@ class ImportedCapture:
     motion: Motion
     stored_masks: Masks | None
     segmenter: str | None
-    polarity_error: str = ""
     provenance: tuple[Provenance, ...] = ()
 
     def given_masks(self) -> GivenMasks | None:
@@ -137,19 +135,13 @@ def import_capture(
 ) -> ImportedCapture:
     """Join poses with the masks of files or alpha channels."""
     segmenter = _choose_segmenter(inputs, paths.masks, source)
-    masks, error = None, ""
-    if segmenter is None and (path := inputs.masks or paths.masks) is not None:
-        try:
-            masks = open_masks(path, invert=inputs.invert_masks)
-        except InputError as unclear:
-            if inputs.invert_masks is not None:
-                raise
-            masks = open_masks(path, invert=False)
-            error = str(unclear)
+    masks, path = None, inputs.masks or paths.masks
+    if segmenter is None and path is not None:
+        masks = open_masks(path, invert=inputs.invert_masks)
     paths = replace(paths, masks=None if masks is None else masks.path)
     return ImportedCapture(
         inputs=inputs, paths=paths, source=source, body=body, motion=motion,
-        stored_masks=masks, segmenter=segmenter, polarity_error=error,
+        stored_masks=masks, segmenter=segmenter,
     )  # fmt: skip
 
 
@@ -182,8 +174,6 @@ def align_capture(
     if not skip_checks:
         warnings = tuple(plausibility_warnings(motion))
         motion = require_plausible(motion, imported.paths.poses)
-        if imported.polarity_error:
-            raise InputError(imported.polarity_error)
     given = imported.given_masks()
     fit, cameras = _align(imported, motion, given, avatar_body)
     masks = given or _estimated_masks(imported.segmenter, fit.shaped)

@@ -108,11 +108,10 @@ def test_an_empty_mask_among_others_does_not_decide(write):
     assert open_masks(write([255 - nothing, 255 - person()], "turned")).inverted
 
 
-def test_masks_of_unclear_polarity_are_refused(write):
-    framed = np.full((40, 30), 255, np.uint8)
-    framed[2:-2, 2:-2] = 0
-    with pytest.raises(InputError, match="--mask-invert"):
-        open_masks(write([framed]))
+def test_a_person_who_fills_the_picture_is_no_background(write):
+    near = np.zeros((40, 30), np.uint8)
+    near[6:, 4:26] = 255
+    assert not open_masks(write([near])).inverted
 
 
 def test_gray_object_numbers_are_masks_and_dark_noise_is_not(write, rng):
