@@ -1,7 +1,9 @@
 """A queue between two threads: one produces items at its own speed, the other takes them."""
 
+import math
 import queue
 import threading
+import time
 from collections.abc import Iterable
 from typing import Generic, TypeVar, final
 
@@ -68,10 +70,11 @@ class Inbox(Generic[Item]):
             raise error
         return taken
 
-    def close(self) -> None:
-        """Tell the producer to stop and wait until it has."""
+    def close(self, *, timeout_s: float = math.inf) -> None:
+        """Tell the producer to stop and wait until it has, but no longer than this."""
         self._stop.set()
-        while self._thread.is_alive():
+        latest = time.perf_counter() + timeout_s
+        while self._thread.is_alive() and time.perf_counter() < latest:
             self._drain()
             self._thread.join(timeout=0.02)
 

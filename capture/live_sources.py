@@ -7,9 +7,7 @@ a folder is taken when it is complete, and waits until then.
 import errno
 import os
 import re
-import threading
 import time
-from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import cache
@@ -25,6 +23,7 @@ from capture.image_folder import (
     list_images,
     read_image,
 )
+from capture.inbox import Inbox
 from capture.input_error import InputError
 from capture.source import ASSUMED_FPS, Frame, FrameSelection, FrameSource, PacingClock
 
@@ -76,7 +75,8 @@ class CameraDevice(FrameSource):
             OSError: If it exists and is in use (EBUSY), or may not be opened (EACCES).
         """
         super().__init__(Path(CAMERA_PREFIX + address), selection)
-        self._pace, self._waited_s, self._dropped = pace, 0.0, 0
+        self._pace, self._waited_s = pace, 0.0
+        self._inbox: Inbox[Frame] | None = None
         self._is_file = Path(address).is_file()
         self._capture = _open_device(address)
         ok, picture = self._capture.read()
@@ -86,10 +86,7 @@ class CameraDevice(FrameSource):
         self.size_px = (int(picture.shape[1]), int(picture.shape[0]))
         self.started_at = time.time()
         self._first_at = time.perf_counter()
-        self._waiting: deque[Frame] = deque([self._frame(0, self._first_at, picture)])
-        self._changed = threading.Condition()
-        self._ended = False
-        self._reader: threading.Thread | None = None
+        self._first = self._frame(0, self._first_at, picture)
 
     @property
     def waited_s(self) -> float:
@@ -99,57 +96,34 @@ class CameraDevice(FrameSource):
     @property
     def dropped(self) -> int:
         """Number of images that were dropped for later ones."""
-        return self._dropped
+        return 0 if self._inbox is None else self._inbox.dropped
 
     def frames(self) -> Iterator[Frame]:
         """The images as they come; to be read once."""
-        if self._reader is None:
-            self._reader = threading.Thread(target=self._read, daemon=True)
-            self._reader.start()
-        while (frame := self._next()) is not None:
-            if self.selection.is_past_end(frame.index):
-                return
-            if self.selection.contains(frame.index):
-                yield frame
+        self._inbox = inbox = Inbox(self._read(), capacity=MAX_QUEUED_FRAMES, live=True)
+        while not (inbox.finished or self._pace.stopped):
+            began = time.perf_counter()
+            taken = inbox.take(timeout_s=0.1, max_items=1)
+            self._waited_s += time.perf_counter() - began
+            for frame in taken:
+                if self.selection.is_past_end(frame.index):
+                    return
+                if self.selection.contains(frame.index):
+                    yield frame
 
     def close(self) -> None:
         """Release the camera."""
         self._pace.stop()
-        with self._changed:
-            self._ended = True
-            self._changed.notify_all()
-        if self._reader is not None:
-            self._reader.join(timeout=2.0)  # a stuck driver must not hold what was learnt
-        if self._reader is None or not self._reader.is_alive():
+        if self._inbox is not None:
+            self._inbox.close(timeout_s=2.0)  # a stuck driver must not hold what was learnt
+        if self._inbox is None or self._inbox.finished:
             self._capture.release()
 
-    def _next(self) -> Frame | None:
-        """The oldest image that waits; None at the end."""
-        with self._changed:
-            began = time.perf_counter()
-            while not (self._waiting or self._ended):
-                self._changed.wait(0.1)
-            self._waited_s += time.perf_counter() - began
-            return self._waiting.popleft() if self._waiting and not self._pace.stopped else None
-
-    def _read(self) -> None:
-        """Take images as fast as they come; runs on its own thread."""
-        try:
-            count = 1 + self._read_all()
-            if not (self._ended or self._is_file):
-                self._warn(
-                    f"{self.path} gave no more pictures after {count}; was it unplugged? What was "
-                    "learnt until then is kept."
-                )
-        finally:
-            with self._changed:
-                self._ended = True
-                self._changed.notify_all()
-
-    def _read_all(self) -> int:
-        """Read until the end; return the number of the last image."""
+    def _read(self) -> Iterator[Frame]:
+        """Take images as fast as they come; runs on the inbox's thread."""
+        yield self._first
         index, failures = 0, 0
-        while failures < MAX_READ_FAILURES and not self._ended:
+        while failures < MAX_READ_FAILURES and not self._pace.stopped:
             if not self._capture.grab():
                 failures += 1
                 continue
@@ -160,16 +134,12 @@ class CameraDevice(FrameSource):
             now = time.perf_counter()
             ok, picture = self._capture.retrieve()
             if ok and picture.shape[1::-1] == self.size_px:
-                self._put(self._frame(index, now, picture))
-        return index
-
-    def _put(self, frame: Frame) -> None:
-        with self._changed:
-            if len(self._waiting) == MAX_QUEUED_FRAMES:
-                self._waiting.popleft()
-                self._dropped += 1
-            self._waiting.append(frame)
-            self._changed.notify_all()
+                yield self._frame(index, now, picture)
+        if not (self._pace.stopped or self._is_file):
+            self._warn(
+                f"{self.path} gave no more pictures after {index + 1}; was it unplugged? What was "
+                "learnt until then is kept."
+            )
 
     def _frame(self, index: int, due_s: float, bgr: UInt8[np.ndarray, "height width 3"]) -> Frame:
         rgb = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)

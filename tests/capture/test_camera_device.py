@@ -78,7 +78,7 @@ def test_a_late_reader_gets_the_newest_frames_and_a_drop_count(monkeypatch):
     source = CameraDevice("0", FrameSelection(), PacingClock())
     frames = source.frames()
     first = next(frames)
-    source._reader.join(timeout=10.0)
+    source._inbox._thread.join(timeout=10.0)
     rest = list(frames)
     assert grey(first) == first.index % 256
     oldest = max(
