@@ -11,7 +11,8 @@ import json
 import sys
 import zipfile
 import zlib
-from collections.abc import Callable, Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,45 +27,15 @@ MAX_BYTES = 1 << 30
 """Largest file, packed or unpacked (SMPL with 300 betas: a quarter of it)."""
 
 
-def read_npz(
-    path: Path, keys: tuple[str, ...] | None = None
-) -> dict[str, Shaped[np.ndarray, "..."]]:
-    """Read the arrays of an archive (only those of `keys` that it has, if given)."""
-    if not path.is_file():
-        raise InputError(f"{path} does not exist (or is no file); an .npz archive was expected.")
+@contextmanager
+def explain_damage(path: Path, kind: str) -> Iterator[None]:
+    """Turn any error of a damaged or foreign file in a block into one InputError that names it.
+
+    `kind` is the format that the file was taken for.
+    """
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            _check_unpacked_size(archive.zip)
-            chosen = [key for key in (keys or archive.files) if key in archive.files]
-            arrays = {key: archive[key] for key in chosen}
-    except Exception as cause:  # numpy reads headers as Python: damaged ones fail in any way
-        raise InputError(
-            f"{path} is no readable .npz of plain arrays ({cause}). "
-            "Is the file complete, and written without pickled objects?"
-        ) from cause
-    return {key: array for key, array in arrays.items() if isinstance(array, np.ndarray)}
-
-
-def read_pickled_arrays(path: Path, keys: Collection[str]) -> dict[str, Shaped[np.ndarray, "..."]]:
-    """Read those of the entries `keys` of a pickled dictionary that it has, as arrays."""
-    content = _explain_failures(path, lambda: load_safe_pickle(_read_bytes(path)), "pickle")
-    if not isinstance(content, dict):
-        raise InputError(f"{path} holds a {type(content).__name__}; a dictionary was expected.")
-    arrays = {}
-    for key in keys:
-        if key in content:
-            try:
-                arrays[key] = array_of(content[key])
-            except Exception as cause:  # stand-ins hold whatever the file says
-                raise InputError(f"`{key}` in {path} is no readable array ({cause}).") from cause
-    return arrays
-
-
-def _explain_failures(path: Path, read: Callable[[], Any], kind: str) -> Any:
-    """Return the result of `read`, or raise an InputError that says what is wrong with the file."""
-    try:
-        return read()
-    except (InputError, PermissionError, ModuleNotFoundError):  # commands explain these
+        yield
+    except (InputError, PermissionError, ModuleNotFoundError):  # these explain themselves
         raise
     except UnsafePickleError as error:
         raise InputError(
@@ -72,10 +43,45 @@ def _explain_failures(path: Path, read: Callable[[], Any], kind: str) -> Any:
             "A body or pose file holds arrays only: get it from its authors again, or convert it "
             "to .npz."
         ) from None
-    except Exception as cause:  # a broken pickle may fail in any way: see the pickle documentation
-        # a KeyError's text is the byte or name that was not expected, and explains nothing
-        why = "it holds something else" if isinstance(cause, KeyError) else cause
-        raise InputError(f"{path} is no readable {kind} ({why}). Is the file complete?") from cause
+    except Exception as cause:  # damaged files fail in any way: numpy reads headers as Python
+        missing = isinstance(cause, KeyError)
+        text = str(cause).rstrip(".") or type(cause).__name__
+        reason = f"{text} is missing" if missing else text
+        raise InputError(
+            f"{path} cannot be read as {kind}: {reason}. Is the file complete? Readable formats "
+            "are listed in docs/formats.md."
+        ) from cause
+
+
+def read_npz(
+    path: Path, keys: tuple[str, ...] | None = None
+) -> dict[str, Shaped[np.ndarray, "..."]]:
+    """Read the arrays of an archive (only those of `keys` that it has, if given)."""
+    if not path.is_file():
+        raise InputError(f"{path} does not exist (or is no file); an .npz archive was expected.")
+    with (
+        explain_damage(path, "an .npz of plain arrays, without pickled objects"),
+        path.open("rb") as file,
+        np.load(file, allow_pickle=False) as archive,
+    ):
+        _check_unpacked_size(archive.zip)
+        chosen = [key for key in (keys or archive.files) if key in archive.files]
+        arrays = {key: archive[key] for key in chosen}
+    return {key: array for key, array in arrays.items() if isinstance(array, np.ndarray)}
+
+
+def read_pickled_arrays(path: Path, keys: Collection[str]) -> dict[str, Shaped[np.ndarray, "..."]]:
+    """Read those of the entries `keys` of a pickled dictionary that it has, as arrays."""
+    with explain_damage(path, "a pickled dictionary"):
+        content = load_safe_pickle(_read_bytes(path))
+        if not isinstance(content, dict):
+            raise TypeError(f"it holds a {type(content).__name__}")
+    arrays = {}
+    for key in keys:
+        if key in content:
+            with explain_damage(path, f"an array under `{key}`"):
+                arrays[key] = array_of(content[key])
+    return arrays
 
 
 def _read_bytes(path: Path) -> bytes:
@@ -109,7 +115,8 @@ def read_untrusted_file(path: Path) -> Any:
         }
     if not path.is_file():
         raise InputError(f"{path} does not exist (or is no file).")
-    return _explain_failures(path, lambda: _decode(_read_bytes(path), path), "file")
+    with explain_damage(path, "any file of poses"):
+        return _decode(_read_bytes(path), path)
 
 
 def _decode(data: bytes, path: Path) -> Any:

@@ -15,7 +15,7 @@ from jaxtyping import Float, Float64, Int, Shaped
 from capture.input_error import InputError
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.kinematics import PARENTS, body_from_rest, rotation_matrices, world_from_body
-from preprocess.file_content import read_npz, read_pickled_arrays
+from preprocess.file_content import explain_damage, read_npz, read_pickled_arrays
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -160,10 +160,8 @@ def load_body_model(path: Path | None = None) -> BodyModel:
         arrays = read_pickled_arrays(path, BODY_KEYS)
     else:
         raise InputError(f"{path} ends in {path.suffix!r}; a body file ends in .npz or .pkl.")
-    try:
+    with explain_damage(path, "a body file"):
         return _parse_body(arrays)
-    except ValueError as cause:
-        raise InputError(f"{path} is no usable body file: {cause}") from cause
 
 
 def _parse_body(arrays: Arrays) -> BodyModel:

@@ -13,9 +13,9 @@ from capture.source import FrameSource
 from preprocess.body.body_pose import Motion, RelativeFocalLength
 from preprocess.cameras.camera_registry import read_named_cameras
 from preprocess.cameras.multi_view_cameras import find_multi_view_cameras, read_multi_view_camera
-from preprocess.cameras.named_camera import checked_camera, checked_rigid, explain_camera_errors
+from preprocess.cameras.named_camera import checked_camera, checked_rigid
 from preprocess.capture_paths import find_stream_cameras
-from preprocess.file_content import read_npz
+from preprocess.file_content import explain_damage, read_npz
 from preprocess.frame_association import cameras_by_frame, interpolate_missing_cameras
 
 DEFAULT_FOCAL_RATIO = 0.85
@@ -85,7 +85,7 @@ def read_cameras(
 
 def _read_npz_cameras(path: Path, size_px: tuple[int, int] | None) -> CameraTrack:
     arrays = read_npz(path)
-    with explain_camera_errors(path, "an .npz of intrinsic, extrinsic, height and width"):
+    with explain_damage(path, "an .npz of intrinsic, extrinsic, height and width"):
         if arrays["intrinsic"].shape[-2:] != (3, 3):
             raise ValueError(f"`intrinsic` has the shape {arrays['intrinsic'].shape}, not (3, 3)")
         intrinsics = arrays["intrinsic"].astype(np.float64).reshape(-1, 3, 3)

@@ -17,9 +17,9 @@ from capture.image_folder import natural_sort_key
 from preprocess.cameras.named_camera import (
     NamedCamera,
     checked_camera,
-    explain_camera_errors,
     image_name,
 )
+from preprocess.file_content import explain_damage
 
 MODEL_SUBFOLDERS = (".", "sparse/0", "0", "sparse", "colmap/sparse/0", "dense/sparse")
 """Places of models in a folder, as COLMAP, nerfstudio and others leave them."""
@@ -58,7 +58,7 @@ def read_colmap_model(folder: Path) -> list[NamedCamera]:
 
     An InputError if it cannot be read, is empty, or has a camera that OpenCV does not have.
     """
-    with explain_camera_errors(folder, "a COLMAP model"):
+    with explain_damage(folder, "a COLMAP model"):
         if (folder / "cameras.bin").is_file():
             lenses, images = _read_binary(folder)
         else:

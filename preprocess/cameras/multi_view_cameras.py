@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from capture.camera import Camera
 from capture.input_error import InputError
-from preprocess.cameras.named_camera import checked_camera, explain_camera_errors
-from preprocess.file_content import read_untrusted_file
+from preprocess.cameras.named_camera import checked_camera
+from preprocess.file_content import explain_damage, read_untrusted_file
 
 INTRINSICS = "intri.yml"
 """EasyMocap's file of camera matrices and distortions."""
@@ -74,7 +74,7 @@ def read_multi_view_camera(
         size_px: Width and height of its frames, for files that state none; None for twice the
             principal point.
     """
-    with explain_camera_errors(rig, "cameras of EasyMocap or ZJU-MoCap"):
+    with explain_damage(rig, "cameras of EasyMocap or ZJU-MoCap"):
         cameras = _read_zju(rig) if rig.name == ZJU else _read_easymocap(rig)
         if not cameras:
             raise ValueError("it holds no K_01, Rot_01 and T_01")

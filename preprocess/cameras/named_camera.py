@@ -3,17 +3,13 @@
 The frame of the image is found later (`preprocess.frame_association`).
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
-from zipfile import BadZipFile
+from pathlib import PurePosixPath
 
 import numpy as np
 from jaxtyping import Float
 
 from capture.camera import Camera
-from capture.input_error import InputError
 from preprocess.body.kinematics import rigid_transform
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -21,12 +17,6 @@ OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 MAX_IMAGE_SIDE_PX = 16_384
 """Longest side of an image."""
-
-FILE_ERRORS = (
-    ArithmeticError, AttributeError, BadZipFile, LookupError, OSError, RuntimeError, TypeError,
-    ValueError,
-)  # fmt: skip
-"""Exceptions of reading a damaged or foreign file."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -39,25 +29,6 @@ class NamedCamera:
 
     name: str | None
     camera: Camera
-
-
-@contextmanager
-def explain_camera_errors(path: Path, kind: str) -> Iterator[None]:
-    """Turn any error of a damaged or foreign file in a block into one InputError that names it.
-
-    `kind` is the format that the file was taken for.
-    """
-    try:
-        yield
-    except InputError:
-        raise
-    except FILE_ERRORS as cause:
-        missing = isinstance(cause, KeyError)
-        reason = f"{cause} is missing" if missing else str(cause) or type(cause).__name__
-        raise InputError(
-            f"{path} cannot be read as {kind}: {reason}. Is it complete? Readable formats are "
-            "listed in docs/formats.md."
-        ) from cause
 
 
 def image_name(stored: str) -> str:

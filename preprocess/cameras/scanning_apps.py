@@ -21,10 +21,10 @@ from preprocess.cameras.named_camera import (
     camera_from_opengl,
     checked_camera,
     checked_rigid,
-    explain_camera_errors,
     image_name,
     invert_rigid,
 )
+from preprocess.file_content import explain_damage
 
 SUPPORTED_CAMERA_MODELS = (
     "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FULL", "perspective",
@@ -48,7 +48,7 @@ def read_json_cameras(path: Path, size_px: tuple[int, int] | None) -> list[Named
 
     `size_px` is the images' width and height, if the file does not state them.
     """
-    with explain_camera_errors(path, "JSON of nerfstudio (`frames`) or Record3D (`poses`)"):
+    with explain_damage(path, "JSON of nerfstudio (`frames`) or Record3D (`poses`)"):
         content = json.loads(path.read_text(encoding="utf-8"))
         if "frames" in content:
             return _read_transforms(content, size_px)
@@ -57,7 +57,7 @@ def read_json_cameras(path: Path, size_px: tuple[int, int] | None) -> list[Named
 
 def read_r3d(path: Path) -> list[NamedCamera]:
     """The cameras of a whole .r3d recording."""
-    with explain_camera_errors(path, "a Record3D recording"), zipfile.ZipFile(path) as archive:
+    with explain_damage(path, "a Record3D recording"), zipfile.ZipFile(path) as archive:
         return _read_record3d(json.loads(archive.read("metadata")))
 
 
@@ -150,7 +150,7 @@ def read_polycam(folder: Path) -> list[NamedCamera]:
     """A file for each image: t_00 … t_23 (world-from-camera), fx, fy, cx, cy, width, height."""
     named = []
     for path in sorted(folder.glob("*.json"), key=natural_sort_key):
-        with explain_camera_errors(path, "a camera of Polycam"):
+        with explain_damage(path, "a camera of Polycam"):
             numbers = json.loads(path.read_text(encoding="utf-8"))
             world = checked_rigid(np.reshape([numbers[key] for key in POLYCAM_KEYS], (3, 4)))
             focal, center, size_px = (

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from capture.input_error import InputError
 from preprocess.body.body_pose import Motion, PoseSpace
 from preprocess.body.kinematics import stack_axis_angles
+from preprocess.file_content import explain_damage
 from preprocess.tracking.keypoints import KeypointTrack
 
 POSE_KEY_LAYOUTS = (
@@ -42,10 +42,8 @@ def motion_from_arrays(arrays: Arrays, path: Path, *, default_model: str = "body
 
     An InputError names the file and the key that holds something else.
     """
-    try:
+    with explain_damage(path, "poses"):
         return _motion(arrays, default_model)
-    except ValueError as cause:
-        raise InputError(f"{path}: {cause}") from cause
 
 
 def _motion(arrays: Arrays, default_model: str) -> Motion:

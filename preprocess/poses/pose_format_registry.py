@@ -11,7 +11,7 @@ from capture.image_folder import refuse_pipe
 from capture.input_error import InputError
 from preprocess.body.body_pose import Motion
 from preprocess.capture_paths import resolve_pose_path
-from preprocess.file_content import read_untrusted_file
+from preprocess.file_content import explain_damage, read_untrusted_file
 from preprocess.poses import mocap_formats, video_trackers
 from preprocess.poses.instant_avatar import parse_instant_avatar, parse_per_frame
 from preprocess.poses.motion_builder import MAX_GAP_FRAMES, MotionByPerson, fill_gaps
@@ -29,11 +29,6 @@ TRACKERS: dict[str, Callable[[Any, bool], MotionByPerson | None]] = {
     "AMASS or AIST++": mocap_formats.parse_amass,
 }
 """Trackers by name, in the order in which they try to read a file."""
-
-MALFORMED_FILE_ERRORS = (
-    ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, MemoryError,
-)  # fmt: skip
-"""Exceptions of adapters for a file that is nearly theirs: they read it as if it were whole."""
 
 
 def read_poses(
@@ -78,28 +73,15 @@ def _recognize(
 ) -> tuple[str | None, MotionByPerson]:
     """The tracker of the file (None: in our own keys), and the people in it."""
     for tool, tracks in TRACKERS.items():
-        try:
+        with explain_damage(path, f"a file of {tool}"):
             people = tracks(content, driving)
-        except InputError:
-            raise
-        except MALFORMED_FILE_ERRORS as cause:
-            raise InputError(
-                f"{path} looks like a file of {tool}, but what it holds cannot be used: "
-                f"{type(cause).__name__} {cause}. Is it complete?"
-            ) from cause
         if people:
             return tool, people
     people = parse_instant_avatar(content, path, default_model)
     if people is not None:
         return None, people
-    try:
+    with explain_damage(path, "a pose a frame"):
         people = parse_per_frame(content, path, default_model)
-    except InputError:
-        raise
-    except MALFORMED_FILE_ERRORS as cause:
-        raise InputError(
-            f"{path} holds a pose a frame that do not fit together ({cause})."
-        ) from cause
     if people is None:
         raise InputError(
             f"{path} holds no poses that are known: {_describe_content(content)}. Expected "
