@@ -10,7 +10,7 @@ from av.error import FFmpegError
 from jaxtyping import UInt8
 
 from capture.hdr_tone_mapping import HDR_TRANSFERS, tone_map_hdr
-from capture.image_folder import has_cutout_alpha, refuse_pipe
+from capture.image_folder import refuse_pipe
 from capture.input_error import InputError, quote_command
 from capture.source import Frame, FrameSelection, FrameSource
 
@@ -62,10 +62,6 @@ class VideoFile(FrameSource):
     """A recorded video; its rotation tag is applied and HDR is tone mapped.
 
     A file that ends early or has gaps is read as far as it goes, with a warning.
-
-    Attributes:
-        has_unread_alpha: Whether it has an alpha channel that is not opaque; it is not read (that
-            of image files is).
     """
 
     def __init__(self, path: Path, selection: FrameSelection) -> None:
@@ -91,7 +87,6 @@ class VideoFile(FrameSource):
             ) from cause
         if first is None:
             raise InputError(f"No frame of {path} could be decoded; the video is empty or damaged.")
-        self.has_unread_alpha = _has_transparency(first.frame)
         self.is_hdr = int(first.frame.color_trc) in HDR_TRANSFERS
         width, height = int(first.frame.width), int(first.frame.height)
         self.size_px = (height, width) if _quarter_turns(first.frame) % 2 else (width, height)
@@ -237,9 +232,3 @@ def _decode(container: Any, stream: Any) -> Iterator[DecodedFrame]:
 def _quarter_turns(frame: Any) -> int:
     """Return the counter-clockwise quarter turns that make a frame upright."""
     return int(frame.rotation) // 90 % 4
-
-
-def _has_transparency(frame: Any) -> bool:
-    if not any(component.is_alpha for component in frame.format.components):
-        return False
-    return has_cutout_alpha(frame.to_ndarray(format="rgba")[..., 3])

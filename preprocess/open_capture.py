@@ -10,7 +10,6 @@ from pathlib import Path
 from capture.input_error import InputError
 from capture.source import FrameSource, PacingClock, RealtimePlayback, TransposedSource
 from capture.source_opening import open_live_source, open_source
-from capture.video import VideoFile
 from preprocess.alignment.capture_alignment import (
     BodyAlignment,
     estimate_focal_length,
@@ -169,7 +168,7 @@ def align_capture(
     Raises:
         InputError: If they do not fit together.
     """
-    inputs, source, motion = imported.inputs, imported.source, imported.motion
+    source, motion = imported.source, imported.motion
     warnings: tuple[str, ...] = ()
     if not skip_checks:
         warnings = tuple(plausibility_warnings(motion))
@@ -194,7 +193,7 @@ def align_capture(
                 uncertainty=0.0 if motion.proportions is None else 1.0,
             ),
             Provenance("cameras", cameras.source, (cameras.note,)),
-            _mask_provenance(masks, inputs, imported.segmenter, source),
+            _mask_provenance(masks, imported.segmenter),
             _body_provenance(fit),
         ),
     )
@@ -234,20 +233,12 @@ def _body_provenance(fit: BodyAlignment) -> Provenance:
     return Provenance("body", family, (note,), figures=figures)
 
 
-def _mask_provenance(
-    masks: MaskSource, inputs: CaptureInputs, segmenter: str | None, source: FrameSource
-) -> Provenance:
+def _mask_provenance(masks: MaskSource, segmenter: str | None) -> Provenance:
     notes = []
     if segmenter is not None:
         notes.append(
             f"Masks are estimated from the images and the poses (segmenter:{segmenter}); a "
             "segmenter's own masks (--masks) are sharper around hair and hands."
-        )
-    has_unread_alpha = isinstance(source, VideoFile) and source.has_unread_alpha
-    if segmenter is not None and inputs.masks is None and has_unread_alpha:
-        notes.append(
-            f"{source.path} has an alpha channel, which is not read from videos. If it cuts "
-            "the person out, write its frames as PNG images (ffmpeg), and learn from their folder."
         )
     if isinstance(masks, AlphaChannelMasks):
         notes.append("The images' own alpha channel is used as their masks.")
@@ -309,7 +300,7 @@ def open_tracked_stream(
     made = Provenance("masks", masks.origin, uncertainty=1.0)
     if segmenter is None or inputs.masks is not None:
         masks = given or _estimated_masks(segmenter, person)
-        made = _mask_provenance(masks, inputs, segmenter, source)
+        made = _mask_provenance(masks, segmenter)
     unread = tuple(_unread_live_parts(inputs))
     capture = Capture(
         paths=CapturePaths(video=inputs.video, poses=poses, masks=own, cameras=None),

@@ -4,14 +4,11 @@ import os
 from fractions import Fraction
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
 
 from capture.input_error import InputError
-from capture.source import FrameSelection
 from capture.source_opening import GLANCES, describe_recording, glance, open_source, reopen
-from capture.video import VideoFile
 
 
 def greys(frames) -> list[int]:
@@ -216,16 +213,3 @@ def test_pixels_that_are_not_square_are_named_with_a_cure(write_video):
     (told,) = open_source(write_video(frames=2, pixel_aspect=Fraction(4, 3))).warnings
     assert "not square" in told
     assert "scale=iw*sar:ih,setsar=1" in told
-
-
-@pytest.mark.parametrize("opaque", [False, True])
-def test_a_videos_alpha_channel_is_known_to_be_left_out_unless_it_is_opaque(tmp_path, opaque):
-    rgba = np.full((32, 32, 4), 255, np.uint8)
-    rgba[8:24, :, 3] = 255 if opaque else 0
-    with av.open(str(tmp_path / "cut.mov"), "w") as container:
-        stream = container.add_stream("qtrle", rate=10)
-        stream.width = stream.height = 32
-        stream.pix_fmt = "argb"
-        frame = av.VideoFrame.from_ndarray(rgba, format="rgba").reformat(format="argb")
-        container.mux([*stream.encode(frame), *stream.encode(None)])
-    assert VideoFile(tmp_path / "cut.mov", FrameSelection()).has_unread_alpha != opaque

@@ -106,15 +106,3 @@ def test_one_opaque_picture_at_the_start_does_not_decide(folder):
     recording = open_capture(wanted(there, "none"))
     assert parts_shown(recording) == [None, (True, False), None, (True, False)]
     assert recording.mask_report()["masks"] == ALPHA
-
-
-@pytest.mark.parametrize("masked", [False, True])
-def test_an_unread_alpha_channel_is_reported_where_masks_are_estimated(
-    capture, monkeypatch, masked
-):
-    monkeypatch.setattr("capture.video._has_transparency", lambda frame: True)
-    if not masked:
-        shutil.rmtree(capture / "masks")
-    said = [n for n in open_capture(CaptureInputs(video=capture)).notes if "alpha" in n]
-    assert bool(said) != masked
-    assert all(str(capture / "video.mp4") in note for note in said)
