@@ -231,6 +231,14 @@ def test_two_mistakes_are_both_named_and_an_unusable_capture_ends_with_2(spoilt,
     assert "--fix" in said
 
 
+@pytest.mark.slow
+def test_what_no_correction_explains_is_not_named(spoilt, call_check):
+    """Poses in a world whose cameras are lost: turns would make the least bad of it."""
+    code, said, found = call_check(spoilt(capture_corruptions.reset_extrinsics))
+    assert (code, found["verdict"], found["corrections"]) == (2, "unusable", [])
+    assert "No known mistake explains this" in said
+
+
 def test_mending_needs_a_mistake_and_a_free_place(dancing, tmp_path, call_check):
     code, said, _ = call_check(dancing, "--fix", tmp_path / "mended")
     assert code == 2
