@@ -137,7 +137,6 @@ class ImageFolder(FrameSource):
 
     def frames(self) -> Iterator[Frame]:
         """The selected images in order; every call starts from the first."""
-        previous = None
         for index, path in enumerate(self._images):
             if not self.selection.contains(index):
                 continue
@@ -152,10 +151,7 @@ class ImageFolder(FrameSource):
                     f"{self.size_px[0]}x{self.size_px[1]}. It was left out."
                 )
                 continue
-            repeated = previous is not None and np.array_equal(rgb, previous)
-            flags = frozenset({"repeated"} if repeated else ())
-            yield Frame(index=index, time_s=index / ASSUMED_FPS, rgb=rgb, flags=flags, alpha=alpha)
-            previous = rgb
+            yield Frame(index=index, time_s=index / ASSUMED_FPS, rgb=rgb, alpha=alpha)
 
     def glance(
         self, times_s: Sequence[float], apart_s: float, longer_px: int

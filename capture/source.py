@@ -25,7 +25,7 @@ class Frame:
     Attributes:
         index: Position in the source, counted from 0 (frames that were skipped keep their number).
         time_s: Container timestamp in seconds; never computed from an assumed rate.
-        flags: What is wrong with it: "corrupt", "repeated", or both.
+        flags: What is wrong with it: "corrupt", or nothing.
         alpha: The source's own alpha channel (RGBA images), else None.
         due_s: Time on `time.perf_counter`'s clock at which it was played or filmed. None for a
             recording that is read as fast as it is taken.

@@ -103,7 +103,6 @@ class VideoFile(FrameSource):
 
     def frames(self) -> Iterator[Frame]:
         """Yield the selected frames in order; every call starts from the first."""
-        previous = None
         for index, decoded in self.numbered():
             if not self.selection.contains(index):
                 continue
@@ -111,18 +110,10 @@ class VideoFile(FrameSource):
             if rgb is None or rgb.shape[1::-1] != self.size_px:
                 self._warn(f"Frame {index} of {self.path.name} could not be decoded; left out.")
                 continue
-            flags = {
-                "repeated": previous is not None and np.array_equal(rgb, previous),
-                # a frame after a gap was predicted from one that is lost
-                "corrupt": decoded.after_gap or decoded.frame.is_corrupt,
-            }
-            yield Frame(
-                index=index,
-                time_s=decoded.time_s,
-                rgb=rgb,
-                flags=frozenset(flag for flag, is_set in flags.items() if is_set),
-            )
-            previous = rgb
+            # a frame after a gap was predicted from one that is lost
+            corrupt = decoded.after_gap or decoded.frame.is_corrupt
+            flags = frozenset({"corrupt"} if corrupt else ())
+            yield Frame(index=index, time_s=decoded.time_s, rgb=rgb, flags=flags)
 
     def glance(
         self, times_s: Sequence[float], apart_s: float, longer_px: int

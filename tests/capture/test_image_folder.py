@@ -86,13 +86,6 @@ def test_a_picture_that_cannot_be_read_or_has_another_size_is_left_out(write_ima
     assert capfd.readouterr().err == ""
 
 
-def test_a_repeated_picture_is_flagged(tmp_path):
-    for index, grey in enumerate((10, 10, 30)):
-        cv2.imwrite(str(tmp_path / f"{index}.png"), np.full((6, 8, 3), grey, np.uint8))
-    flags = [frame.flags for frame in open_source(tmp_path).frames()]
-    assert flags == [frozenset(), {"repeated"}, frozenset()]
-
-
 def test_a_folder_without_pictures_is_refused(tmp_path):
     with pytest.raises(InputError, match=tmp_path.name):
         open_source(tmp_path)

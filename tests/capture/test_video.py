@@ -167,13 +167,6 @@ def test_a_missing_file_is_refused(tmp_path):
         open_source(tmp_path / "video.mp4")
 
 
-def test_a_repeated_picture_is_flagged(write_video):
-    noise = np.random.default_rng(0).integers(0, 255, (48, 64, 3), dtype=np.uint8)
-    path = write_video("still.mkv", pictures=[noise, noise, 255 - noise], codec="ffv1")
-    frames = list(open_source(path).frames())
-    assert ["repeated" in frame.flags for frame in frames] == [False, True, False]
-
-
 def test_damaged_bytes_in_the_middle_lose_no_place(write_video, rng):
     noise = [rng.integers(0, 255, (48, 64, 3), dtype=np.uint8) for _ in range(30)]
     path = write_video(pictures=noise)
