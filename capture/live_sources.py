@@ -248,7 +248,7 @@ class WatchedImageFolder(FrameSource):
                 time_s, written_s = max(time_s + step_s, seen_s), state.written_s
             if self.selection.contains(index) and image is not None:
                 rgb, alpha = image
-                yield Frame(index=index, time_s=time_s, rgb=rgb, alpha=alpha, name=path.stem)
+                yield Frame(index=index, time_s=time_s, rgb=rgb, alpha=alpha)
 
     def count_frames(self) -> int:
         """The number of images by now."""

@@ -29,7 +29,6 @@ class Frame:
         alpha: The source's own alpha channel (RGBA images), else None.
         due_s: Time on `time.perf_counter`'s clock at which it was played or filmed. None for a
             recording that is read as fast as it is taken.
-        name: Of the image's file without its ending, where each image has a file.
     """
 
     index: int
@@ -38,7 +37,6 @@ class Frame:
     flags: frozenset[str] = frozenset()
     alpha: UInt8[np.ndarray, "height width"] | None = None
     due_s: float | None = None
-    name: str | None = None
 
     @property
     def size_px(self) -> tuple[int, int]:
