@@ -166,5 +166,4 @@ def _interpolate_motion(geometry: CaptureGeometry, frames: int) -> Motion:
         frames=numbers,
         times_s=None,
         camera_from_world=None,
-        interpolated=None,
     )

@@ -85,7 +85,6 @@ class Motion:
             to SMPL's convention once the body is known.
         space: "world", or "camera": each row in the camera of its frame.
         camera_from_world: The camera of each row, if the file holds them.
-        interpolated: Rows that the tracker had lost, filled in between their neighbors.
         proportions: Coefficients of `ProportionSpace` around the mean of the embedded body, if the
             poses were fitted together with them; then they are the person's shape, not the betas.
         keypoints: Key points in the video's frames that the poses were made of, if there are any.
@@ -106,7 +105,6 @@ class Motion:
     anchor: RootAnchor = "pelvis"
     space: PoseSpace = "world"
     camera_from_world: Float[np.ndarray, "poses 4 4"] | None = None
-    interpolated: Bool[np.ndarray, "poses"] | None = None
     proportions: Float[np.ndarray, "coefficients"] | None = None
     keypoints: KeypointTrack | None = None
     note: str | None = None
@@ -132,7 +130,7 @@ class Motion:
             rows: Which ones, in their new order.
             frames: The frame that each row belongs to; None if unknown.
         """
-        cameras, bridged = self.camera_from_world, self.interpolated
+        cameras = self.camera_from_world
         return replace(
             self,
             root_rotations=self.root_rotations[rows],
@@ -142,6 +140,5 @@ class Motion:
             frames=frames,
             times_s=None,
             camera_from_world=None if cameras is None else cameras[rows],
-            interpolated=None if bridged is None else bridged[rows],
             keypoints=None,
         )

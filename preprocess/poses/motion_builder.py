@@ -157,7 +157,6 @@ def fill_gaps(motion: Motion, max_gap: int = MAX_GAP_FRAMES) -> Motion:
         valid=merged(motion.valid, np.ones(len(new), dtype=bool)),
         frames=merged(numbers, new) if motion.frames is not None else None,
         times_s=times_s,
-        interpolated=merged(np.zeros(len(numbers), dtype=bool), np.ones(len(new), dtype=bool)),
     )
 
 

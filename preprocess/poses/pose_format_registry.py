@@ -41,7 +41,7 @@ def read_poses(
     """Poses from a file, or a folder of files, of any tracker that is known (docs/formats.md).
 
     Of several people the one with most poses is chosen, and the note names the others. Short gaps
-    of the tracker are interpolated and marked. The poses keep the file's anchor and space;
+    of the tracker are interpolated. The poses keep the file's anchor and space;
     `preprocess.poses.motion_builder` converts them for a body and its cameras.
 
     Args:
@@ -57,15 +57,15 @@ def read_poses(
     motion = _select_person(people, person, path)
     if tool is None:
         return motion
-    motion = fill_gaps(motion)
-    note = motion.note
-    if motion.interpolated is not None:
+    whole, note = fill_gaps(motion), motion.note
+    filled = int(whole.valid.sum() - motion.valid.sum())
+    if filled:
         said = (
-            f"{int(motion.interpolated.sum())} poses that {tool} had lost were filled in between "
-            f"their neighbours (gaps of up to {MAX_GAP_FRAMES} frames)."
+            f"{filled} poses that {tool} had lost were filled in between their neighbours (gaps of "
+            f"up to {MAX_GAP_FRAMES} frames)."
         )
         note = said if note is None else f"{note} {said}"
-    return replace(motion, note=note)
+    return replace(whole, note=note)
 
 
 def _recognize(

@@ -181,7 +181,7 @@ def test_people_whom_slahmr_lost_are_lost_and_cameras_stay_with_their_rows(world
     arrays["track_mask"][0, 10:13] = False
     path = world.write("gaps.npz", npz(**arrays))
     motion = read_poses(path, person="0")
-    assert np.flatnonzero(motion.interpolated).tolist() == [10, 11, 12]
+    assert "3 poses that SLAHMR or 3DPW had lost" in motion.note
     cameras, _, _ = seen_from(world)
     np.testing.assert_allclose(motion.camera_from_world, cameras)
 

@@ -107,13 +107,12 @@ def test_some_rows_are_a_whole_motion_again(tmp_path, motion):
     """Also their cameras: a file with one of six would not be read."""
     cameras = np.tile(np.eye(4), (6, 1, 1))
     cameras[:, 0, 3] = np.arange(6)
-    whole = replace(motion, camera_from_world=cameras, interpolated=np.arange(6) == 4)
+    whole = replace(motion, camera_from_world=cameras)
     some = whole.select_rows(np.array([4, 2]), np.array([10, 11]))
     write_motion(tmp_path / "some.npz", some)
     again = read_poses(tmp_path / "some.npz")
     assert_same(again, some)
     assert again.camera_from_world[:, 0, 3].tolist() == [4.0, 2.0]
-    assert some.interpolated.tolist() == [True, False]
 
 
 def test_the_three_spellings_are_one(write, motion):

@@ -446,18 +446,17 @@ def without(rows: np.ndarray, motion: Motion) -> Motion:
     )
 
 
-def test_a_short_gap_is_bridged_and_marked_and_a_long_one_stays(world, shaped, joints_of):
+def test_a_short_gap_is_bridged_and_a_long_one_stays(world, shaped, joints_of):
     lost = World(world.folder, without(np.r_[5:9, 15:30], world.truth), world.rest, None)
     rows = {"pose": lost.thetas, "trans": lost.places, "betas": lost.betas}
     rows["frame_ids"] = lost.truth.frames
     motion = read_poses(lost.write("w.pkl", pickle.dumps({0: rows})))
     assert motion.frames.tolist() == [*range(15), *range(30, 40)]
     assert motion.valid.all()
-    assert motion.frames[motion.interpolated].tolist() == [5, 6, 7, 8]
     assert "4 poses that WHAM had lost" in motion.note
     away = joints_of(motion) - joints_of(without(np.r_[15:30], world.truth))
     assert np.linalg.norm(away, axis=-1)[5:9].max() < 0.1  # the way between is not the truth
-    assert np.linalg.norm(away, axis=-1)[~motion.interpolated].max() < 1e-6
+    assert np.delete(np.linalg.norm(away, axis=-1), range(5, 9), axis=0).max() < 1e-6
 
 
 def test_a_bridge_goes_the_shortest_way_at_even_speed(truth):
