@@ -166,6 +166,7 @@ def test_a_wrong_world_is_refused_by_points_that_are_followed(walk, monkeypatch)
         monkeypatch.setattr(colmap_mapping, name, lambda *given: None)
     monkeypatch.setattr(colmap_mapping, "parallax_fraction", lambda database: (KEYS, 1.0))
     monkeypatch.setattr(colmap_mapping, "map_incrementally", lambda *given: wrong)
+    monkeypatch.setattr(camera_solver, "solve_turning_camera", lambda *given: None)
     monkeypatch.setattr(camera_solver, "evaluate_gates", lambda model, keys: [])
     with pytest.raises(InputError, match="beside where they should"):
         solve_cameras(source, no_person, SolverSettings(max_keyframes=KEYS), lambda share: None)
