@@ -66,7 +66,7 @@ def read_image(
             if image.mode.startswith("I;16"):  # Pillow would clip it to 255
                 image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
             has_alpha = image.has_transparency_data
-            pixels = np.asarray(image.convert("RGBA" if has_alpha else "RGB"))
+            pixels = np.array(image.convert("RGBA" if has_alpha else "RGB"))  # writable
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as cause:
         raise InputError(
             f"{path} is no picture that can be decoded: it is empty, cut off or damaged ({cause})."
