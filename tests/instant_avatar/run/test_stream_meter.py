@@ -15,7 +15,7 @@ from preprocess.observation import DroppedFrame
 class Recorded(FrameSource):
     """A source of which only the counts matter."""
 
-    size_px = (2, 2)
+    size_px, waited_s = (2, 2), 0.0
 
     def __init__(self):
         super().__init__(Path("video.mp4"), FrameSelection())
