@@ -15,7 +15,7 @@ from capture.input_error import InputError
 ASSUMED_FPS = 30.0
 """Frames or poses per second where no file says: folders of images, poses without times."""
 MAX_WARNINGS = 100
-"""Most problems of one source that are told."""
+"""Most problems of one source that are reported."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
