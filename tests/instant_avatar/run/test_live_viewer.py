@@ -20,11 +20,10 @@ from instant_avatar import ingest
 from instant_avatar.cli.command_line import fill_optional_value
 from instant_avatar.run import live_viewer, session_start
 from instant_avatar.run.ingest_arguments import VIEW_PORT
-from instant_avatar.run.viser_page import NEWEST
+from instant_avatar.run.live_viewer import NEWEST, PANEL_PX, SHEET_SHARE
 from tests.instant_avatar.browser import Browser, chromium, until
 
 PAPER = np.array([251, 250, 247])
-PANEL_PX = 380
 
 KINDS = ("Training", "Paused", "Writing the package")
 """What the page says of a run, in this order."""
@@ -35,9 +34,10 @@ with_viser = pytest.mark.skipif(
 with_chromium = pytest.mark.skipif(chromium() is None, reason="there is no Chromium here")
 
 
-def scene(browser: Browser) -> tuple[np.ndarray, np.ndarray]:
+def scene(browser: Browser, *, beside_px: int = PANEL_PX) -> tuple[np.ndarray, np.ndarray]:
     """The picture left of the panel, below the browser's own notes, and where it is no paper."""
-    picture = browser.picture()[:, :-PANEL_PX].astype(int)
+    picture = browser.picture()
+    picture = picture[:, : picture.shape[1] - beside_px].astype(int)
     picture[:160, :320] = PAPER  # Chromium shows its notice about a missing GPU here
     return picture, np.abs(picture - PAPER).max(axis=2) > 24
 
@@ -79,6 +79,7 @@ def test_a_user_watches_pauses_saves_and_starts_the_dance(film, tmp_path):
         with Browser(tmp_path / "browser") as browser:
             browser.go(address.group(0))
             look_and_pause(browser, film)
+            look_on_a_phone(browser)
             save(browser, out, process)
             browser.click("Resume")
             stay_and_dance(browser, log)
@@ -112,7 +113,14 @@ def look_and_pause(browser: Browser, film: Path) -> None:
     # not just a shape: it is dressed as the actor is
     assert np.abs(picture[drawn].mean(axis=0) - actors_color(film)).max() < 40.0
     assert "seen" in browser.text()
-    assert browser.run("!!document.querySelector('svg.body-map path.well')")
+
+
+def look_on_a_phone(browser: Browser) -> None:
+    """The panel is a sheet at the bottom there, and the whole person stands above it."""
+    browser.emulate(scheme="light", size=(360, 640))
+    above = int(640 * (1.0 - SHEET_SHARE))
+    until(lambda: shows_a_person(scene(browser, beside_px=0)[1][160:above]), 60.0)
+    browser.emulate(scheme="light", size=(1200, 800))
 
 
 def save(browser: Browser, out: Path, process: subprocess.Popen) -> None:
@@ -149,9 +157,9 @@ class StandInPage:
         """True until a status says so, once a package was saved."""
         return bool(self.notes) and not any("Paused" in status for status in self.statuses)
 
-    def show_status(self, status, figures, *, note=""):
+    def show_status(self, status, advice):
         self.statuses.append(status)
-        self.save_requested = not self.notes and figures[1][0] != "0"
+        self.save_requested = not self.notes and " 0 steps" not in status
 
     def notify(self, title, message):
         self.notes.append(title)
@@ -160,10 +168,6 @@ class StandInPage:
         return {}
 
     def show_frame(self, image): ...
-
-    def show_curve(self, curve): ...
-
-    def show_coverage(self, sentence, body_map): ...
 
     def close(self): ...
 
