@@ -204,25 +204,13 @@ class CoverageStats:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ForgettingStats:
-    """Forgetting of earlier videos caused by adding this one."""
+class EarlierVideoStats:
+    """The videos that the avatar was trained on before this one."""
 
     videos: tuple[str, ...]
     frames_trained: int
     wall_seconds: float
     replayed_key_frames: int
-    frames: tuple[int, ...]
-    video_of_frame: tuple[int, ...]
-    psnr_before: float | None
-    psnr_after: float | None
-    largest_drop: float | None
-
-    def sentence(self) -> str:
-        """Tell what was forgotten, for the console."""
-        return (
-            f"Held-out frames of the earlier video: {format_psnr(self.psnr_before, None)} before, "
-            f"{format_psnr(self.psnr_after, None)} now."
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,7 +233,7 @@ class Report:
     stream: StreamStats
     package: PackageStats | None
     coverage: CoverageStats | None = None
-    earlier_videos: ForgettingStats | None = None
+    earlier_videos: EarlierVideoStats | None = None
     cameras: dict[str, Any] | None = None
     tracking: dict[str, Any] | None = None
 

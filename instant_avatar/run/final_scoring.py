@@ -1,9 +1,8 @@
-"""Scores after the last step: held-out frames of this video, and of those before it.
+"""Scores after the last step, and the videos that an avatar was trained on before.
 
 A few whole images are scored, as long as time allows. The scores of the other frames are estimates
 from 4,096 of their pixels, without SSIM: they cost a sixth, and all frames in part tell more about
-the mean than a few of them in whole. Scores of earlier videos measure forgetting; key frames of
-theirs are replayed against it.
+the mean than a few of them in whole. Key frames of earlier videos are replayed against forgetting.
 """
 
 import math
@@ -37,8 +36,6 @@ from avatar.training.checkpoint import (
     INDEX_SHIFT_PER_VIDEO,
     LAST_RUN_FILE,
     SavedFrames,
-    number_in_video,
-    video_age,
 )
 from avatar.training.held_out_pose_fitting import fit_test_poses
 from avatar.training.trainer import Trainer
@@ -46,7 +43,7 @@ from export.build import ExportReport
 from instant_avatar.cli.console import Console
 from instant_avatar.report.report_schema import (
     CurvePoint,
-    ForgettingStats,
+    EarlierVideoStats,
     finite_mean,
 )
 from instant_avatar.run.run_folder import RunFolder
@@ -124,7 +121,7 @@ class TrainingResult:
     refusal: str | None = None
     ready_at: float | None = None
     scores: FinalScores = field(default_factory=FinalScores)
-    earlier_videos: ForgettingStats | None = None
+    earlier_videos: EarlierVideoStats | None = None
 
     @property
     def is_trained(self) -> bool:
@@ -251,8 +248,7 @@ def _score_in_fitted_poses(
 class EarlierVideos:
     """The videos that an avatar was trained on before this one.
 
-    Their key frames stay in the replay buffer and compete with new ones for its places; their
-    held-out frames measure forgetting.
+    Their key frames stay in the replay buffer and compete with new ones for its places.
     """
 
     def __init__(self, run: RunFolder, notes: dict[str, Any]) -> None:
@@ -266,13 +262,8 @@ class EarlierVideos:
             SavedFrames.load(run.checkpoint / EARLIER_VIDEOS_FILE) if began else SavedFrames([], [])
         )
 
-    @property
-    def held_out(self) -> list[HeldOutFrame]:
-        """Held-out frames of earlier videos."""
-        return self._kept.held_out
-
     def start_new_video(self, trainer: Trainer, console: Console) -> None:
-        """Turn the previous video into an earlier one, and score its held-out frames."""
+        """Turn the previous video into an earlier one, whose key frames are replayed."""
         self._kept = SavedFrames.load(self._run.checkpoint / LAST_RUN_FILE).as_earlier_video()
         self._kept.save(self._run.checkpoint / EARLIER_VIDEOS_FILE)
         trainer.pose_corrections = {
@@ -285,18 +276,15 @@ class EarlierVideos:
         )
         if not self._kept.replay_frames:
             console.warning(
-                "The previous video's run did not finish, so its key frames were not saved: they "
-                "cannot be replayed, and forgetting cannot be measured."
+                "The previous video's run did not finish, so its key frames were not saved and "
+                "cannot be replayed."
             )
         self.restore_key_frames(trainer, console)
-        with console.status(f"scoring {len(self.held_out)} frames of the earlier video"):
-            scores = self._score_earlier_videos(trainer)
         self._notes["before"] = {
             "videos": [*earlier_video_names(self._notes), self._previous_video_name()],
             "frames": trainer.frames_seen,
             "seconds": trainer.wall_seconds,
             "steps": trainer.steps,
-            "scores": [vars(each) for each in scores],
         }
 
     def restore_key_frames(self, trainer: Trainer, console: Console) -> None:
@@ -309,40 +297,23 @@ class EarlierVideos:
                 trainer.add_frame(frame, is_restored=True)
 
     def save_frames(self, trainer: Trainer, held_out: list[HeldOutFrame]) -> None:
-        """Save frames for the next video; `held_out` are those of the current one."""
-        kept = SavedFrames.of(trainer.replay, [*self.held_out, *held_out])
-        kept.save(self._run.checkpoint / LAST_RUN_FILE)
+        """Save the frames of this video for the next one."""
+        SavedFrames.of(trainer.replay, held_out).save(self._run.checkpoint / LAST_RUN_FILE)
 
-    def measure_forgetting(self, trainer: Trainer) -> ForgettingStats | None:
-        """Compare scores of earlier videos, if there are any, after the last step."""
+    def stats(self) -> EarlierVideoStats | None:
+        """Describe the earlier videos, if there are any."""
         if "before" not in self._notes:
             return None
-        history = self._notes["before"]
-        before = [each["psnr"] for each in history["scores"]]
-        after, videos = self._score_earlier_videos(trainer), earlier_video_names(self._notes)
-        drops = [was - now.psnr for was, now in zip(before, after, strict=True)]
-        return ForgettingStats(
-            videos=videos,
-            frames_trained=history["frames"],
-            wall_seconds=history["seconds"],
+        return EarlierVideoStats(
+            videos=earlier_video_names(self._notes),
+            frames_trained=self._notes["before"]["frames"],
+            wall_seconds=self._notes["before"]["seconds"],
             replayed_key_frames=len(self._kept.replay_frames),
-            frames=tuple(score.frame for score in after),
-            video_of_frame=tuple(
-                len(videos) + 1 - video_age(held.observation.frame.index) for held in self.held_out
-            ),
-            psnr_before=finite_mean(before),
-            psnr_after=finite_mean([score.psnr for score in after]),
-            largest_drop=max([0.0, *drops]) if drops else None,
         )
 
     def _previous_video_name(self) -> str:
         """Return the file name of the previous video."""
         return self._notes.get("name") or Path(self._notes["video"]).name
-
-    def _score_earlier_videos(self, trainer: Trainer) -> tuple[HeldOutScore, ...]:
-        """Score the held-out frames; frame numbers are those of their own video."""
-        scores = (score_frame(trainer.avatar, frame) for frame in self.held_out)
-        return tuple(replace(each, frame=number_in_video(each.frame)) for each in scores)
 
 
 def earlier_video_names(notes: dict[str, Any]) -> tuple[str, ...]:

@@ -219,15 +219,9 @@ class TrainingSession:
             self._add_curve_point(scores.sampled, wall_s, cpu_s)
         self._begin_checkpoint(trains_on=False)
         self._checkpoints.wait()
-        forgetting = None
-        if not self._is_left_out():
-            earlier = EarlierVideos(self._run, self._notes)
-            forgetting = earlier.measure_forgetting(self.trainer)
-        if forgetting is not None and forgetting.psnr_after is not None:
-            yield Noted(message=forgetting.sentence())
         result = replace(
-            self.result, scores=scores, curve=tuple(self.curve), earlier_videos=forgetting,
-            interrupted=self.stop.is_set(),
+            self.result, scores=scores, curve=tuple(self.curve), interrupted=self.stop.is_set(),
+            earlier_videos=EarlierVideos(self._run, self._notes).stats(),
         )  # fmt: skip
         if scores.given and self.curve and result.exported is not None:
             summary = scores.summarize(self.curve[-1], result.all_round_verdict().verdict)

