@@ -65,12 +65,10 @@ def evaluate(arguments: EvaluateArguments, console: Console) -> int:
     if arguments.json is not None:
         text = evaluations_to_json(scored, conditions)
         write_text_atomically(arguments.json, text, replace=arguments.overwrite)
-    if arguments.markdown is not None:
-        write_text_atomically(arguments.markdown, table, replace=arguments.overwrite)
-    if arguments.page is not None:
+    if arguments.card is not None:
         page = evaluation_page(scored, conditions)
-        write_text_atomically(arguments.page, page, replace=arguments.overwrite)
-        console.print_artifact("page", arguments.page)
+        write_text_atomically(arguments.card, page, replace=arguments.overwrite)
+        console.print_artifact("page", arguments.card)
     return INTERRUPTED if stop.is_set() else DONE
 
 

@@ -82,22 +82,10 @@ class EvaluateArguments:
     named after the dataset)."""
     json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Write conditions and the scores of every frame to this file."""
-    markdown: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """Write the table to this file as well."""
-    card: Annotated[Path | None, arg(metavar="FILE|DIR", help_behavior_hint="")] = None
-    """Write a page with conditions, scores and pictures: this .html file, or card.html in this
-    folder."""
-    dance: Annotated[tuple[Path, ...], arg(metavar="FILE", help_behavior_hint="")] = ()
-    """Motions that the page of --card shows the packages in, 6 s of each at most."""
+    card: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Write a page with conditions, scores and pictures to this file."""
     overwrite: Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")] = False
-    """Replace the files that --json, --markdown and --card name, if they exist."""
-
-    @property
-    def page(self) -> Path | None:
-        """The file of --card."""
-        if self.card is None or self.card.suffix == ".html":
-            return self.card
-        return self.card / "card.html"
+    """Replace the files that --json and --card name, if they exist."""
 
     def validate(self) -> None:
         """Check ranges, combinations and output files; an `InputError` names the option."""
@@ -117,16 +105,10 @@ class EvaluateArguments:
         of_capture += ["--frames"] * (self.frames != "::")
         if of_capture and self.on is None:
             raise InputError(f"{', '.join(of_capture)} require a capture: pass it with --on.")
-        if self.dance and self.card is None:
-            raise InputError("--dance needs a page to be shown on: pass --card FILE.")
-        for path in (*self.targets, *self.dance):
+        for path in self.targets:
             if not path.exists():
-                raise InputError(
-                    f"{path} does not exist; expected a run, a package or a data set, or for "
-                    "--dance a file of poses."
-                )
-        outputs = {"--json": self.json, "--markdown": self.markdown, "--card": self.page}
-        for flag, path in outputs.items():
+                raise InputError(f"{path} does not exist; expected a run, a package or a data set.")
+        for flag, path in (("--json", self.json), ("--card", self.card)):
             if path is not None:
                 check_output_file(path, flag, self._inputs(), overwrite=self.overwrite)
 

@@ -1,4 +1,4 @@
-"""The evaluation's page: conditions, scores, learning curve and pictures."""
+"""The evaluation's page: conditions, scores and images."""
 
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -12,8 +12,6 @@ from instant_avatar.evaluation.score_table import (
     table_cells,
 )
 from instant_avatar.report.page_rendering import render_template
-from instant_avatar.report.report_figures import curve_svg
-from instant_avatar.report.report_schema import CurvePoint
 
 POSES = {
     "given": "given (in a file, fitted before training)",
@@ -55,23 +53,9 @@ def evaluation_page(evaluations: Sequence[AvatarEvaluation], conditions: dict[st
         conditions=conditions,
         table=table_cells(evaluations),
         comparison=compare_avatars(evaluations),
-        evaluations=[
-            {
-                "name": each.name,
-                "curve": curve_svg(learning_curve(each)),
-                "shown": choose_shown(each.shown),
-                "dances": each.dances,
-            }
-            for each in evaluations
-        ],
+        shown={each.name: choose_shown(each.shown) for each in evaluations if each.shown},
         largest_error=LARGEST_SHOWN_ERROR,
     )
-
-
-def learning_curve(evaluation: AvatarEvaluation) -> list[CurvePoint]:
-    """Return the learning curve in a run's report; empty without one."""
-    points = [] if evaluation.report is None else evaluation.report.get("curve", [])
-    return [CurvePoint.from_checkpoint(point) for point in points]
 
 
 def _describe_training(evaluation: AvatarEvaluation) -> str:

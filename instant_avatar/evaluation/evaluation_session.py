@@ -16,7 +16,6 @@ from avatar.training import checkpoint
 from avatar.training.held_out_pose_fitting import fit_test_poses
 from avatar.training.trainer import Trainer
 from export.player import Player, premultiply
-from instant_avatar.animation.driving_motion import load_driving_motion
 from instant_avatar.cli.console import Console
 from instant_avatar.evaluation.evaluate_arguments import EvaluateArguments
 from instant_avatar.evaluation.evaluation_frames import (
@@ -31,8 +30,6 @@ from instant_avatar.evaluation.frame_scoring import (
     score_picture,
 )
 from instant_avatar.evaluation.score_table import AvatarEvaluation, ScoreRow
-from instant_avatar.report.page_rendering import data_uri
-from instant_avatar.report.report_writer import motion_animation
 from instant_avatar.run.run_folder import RunFolder
 from preprocess.observation import Observation
 
@@ -125,7 +122,6 @@ class EvaluationSession:
             size=scorer.size_px,
             rows=scorer.rows,
             shown=scorer.shown,
-            dances={} if package is None else self._dances(package),
             report=report,
             paper=paper,
         )
@@ -148,17 +144,6 @@ class EvaluationSession:
             if f"player {tier}" not in renderers:
                 renderers[f"player {tier}"] = partial(_play, Player.load(package, tier=tier))
         return renderers
-
-    def _dances(self, package: Path) -> dict[str, str]:
-        """Draw the motions of --dance."""
-        if not self.arguments.dance or self.stop.is_set():
-            return {}
-        player, drawn = Player.load(package), dict[str, str]()
-        for path in self.arguments.dance:
-            with self.console.status(f"drawing {path}"):
-                motion = load_driving_motion(path, player.manifest.rest_joints, self.console)
-                drawn[path.stem] = data_uri(motion_animation(player, motion))
-        return drawn
 
 
 @final

@@ -75,7 +75,6 @@ class AvatarEvaluation:
         size: Width and height of the images; None without any.
         paper: Scores in the paper of a dataset's subject, empty if it is not in it; None for other
             runs.
-        dances: Animations of novel poses as data URIs, by name.
     """
 
     name: str
@@ -85,7 +84,6 @@ class AvatarEvaluation:
     paper: dict[str, float] | None = None
     shown: Sequence[ShownFrame] = ()
     report: dict[str, Any] | None = None
-    dances: dict[str, str] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
         """Return the scores as JSON."""

@@ -37,7 +37,6 @@ from instant_avatar.report.report_schema import (
 from instant_avatar.run.final_scoring import TrainingResult
 from instant_avatar.run.run_folder import RunFolder
 from instant_avatar.run.session_events import Ended, PackageWritten, SessionEvent
-from preprocess.body.body_pose import Motion
 from preprocess.capture_session import Capture
 
 MIN_STEPS_TO_JUDGE = 60
@@ -264,12 +263,8 @@ def comparison_pairs(result: TrainingResult) -> list[ComparisonPair]:
 
 
 def demo_animation(player: Player, *, fps: float = ANIMATION_FPS) -> bytes:
-    """The avatar in a motion of our own, drawn by the player, as an animated WebP."""
-    return motion_animation(player, demo_motion(), fps=fps)
-
-
-def motion_animation(player: Player, motion: Motion, *, fps: float = ANIMATION_FPS) -> bytes:
-    """Draw the first seconds of a motion by the player, as an animated WebP."""
+    """Draw the avatar in a motion of our own by the player, as an animated WebP."""
+    motion = demo_motion()
     camera = FollowingCamera.of(player, motion, ANIMATION_PX)
     frames = ResampledMotion.of(motion, fps=fps)
     poses = [frames.pose(frame) for frame in range(min(len(frames), ANIMATION_FRAMES))]
