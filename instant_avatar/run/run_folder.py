@@ -73,76 +73,49 @@ CHECKPOINT_FILES = (STATE_FILE, "person.npz", "fit.npz", "frames.tensors", "earl
 """Files that ia-ingest writes into checkpoint/."""
 
 
+class _Inside:
+    """A path in a run's folder."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, run: "RunFolder", owner: type | None = None) -> Path:
+        """Return the path; it need not exist."""
+        return run.path / self._name
+
+
 @dataclass(frozen=True, kw_only=True)
 class RunFolder:
     """A folder that holds one run of ia-ingest; files that the user puts there stay."""
 
     path: Path
 
-    @property
-    def package(self) -> Path:
-        """The package with the avatar."""
-        return self.path / "avatar.iavatar"
-
-    @property
-    def report_json(self) -> Path:
-        """The report for machines."""
-        return self.path / "report.json"
-
-    @property
-    def report_html(self) -> Path:
-        """The report as a page."""
-        return self.path / "report.html"
-
-    @property
-    def animation(self) -> Path:
-        """The avatar in novel poses, as the report shows it."""
-        return self.path / "turning.webp"
-
-    @property
-    def checkpoint(self) -> Path:
-        """The folder from which training can continue."""
-        return self.path / "checkpoint"
-
-    @property
-    def body_file(self) -> Path:
-        """The body of the avatar, for videos that are added later."""
-        return self.checkpoint / "person.npz"
-
-    @property
-    def fit_file(self) -> Path:
-        """Body, poses and focal length fitted to the masks of the last video."""
-        return self.checkpoint / "fit.npz"
-
-    @property
-    def cameras(self) -> Path:
-        """Solved cameras."""
-        return self.path / "cameras.npz"
-
-    @property
-    def poses(self) -> Path:
-        """Poses in the world of the solved cameras."""
-        return self.path / "poses.npz"
-
-    @property
-    def tracking(self) -> Path:
-        """Folder of the poses and masks that were tracked in the video, if none were given."""
-        return self.path / "tracking"
-
-    @property
-    def tracked_poses(self) -> Path:
-        """The poses that were tracked in the video."""
-        return self.tracking / "poses.npz"
-
-    @property
-    def tracked_video(self) -> Path:
-        """The video with the poses drawn over it, of poses that were refused."""
-        return self.tracking / "skeleton.mp4"
-
-    @property
-    def tracking_grade(self) -> Path:
-        """Grades of the tracked poses, and what they were tracked for."""
-        return self.tracking / "grade.json"
+    package = _Inside("avatar.iavatar")
+    """The package with the avatar."""
+    report_json = _Inside("report.json")
+    """The report for machines."""
+    report_html = _Inside("report.html")
+    """The report as a page."""
+    animation = _Inside("turning.webp")
+    """The avatar in novel poses, as the report shows it."""
+    checkpoint = _Inside("checkpoint")
+    """The folder from which training can continue."""
+    body_file = _Inside("checkpoint/person.npz")
+    """The body of the avatar, for videos that are added later."""
+    fit_file = _Inside("checkpoint/fit.npz")
+    """Body, poses and focal length fitted to the masks of the last video."""
+    cameras = _Inside("cameras.npz")
+    """Solved cameras."""
+    poses = _Inside("poses.npz")
+    """Poses in the world of the solved cameras."""
+    tracking = _Inside("tracking")
+    """Folder of the poses and masks that were tracked in the video, if none were given."""
+    tracked_poses = _Inside("tracking/poses.npz")
+    """The poses that were tracked in the video."""
+    tracked_video = _Inside("tracking/skeleton.mp4")
+    """The video with the poses drawn over it, of poses that were refused."""
+    tracking_grade = _Inside("tracking/grade.json")
+    """Grades of the tracked poses, and what they were tracked for."""
 
     @property
     def files(self) -> tuple[Path, ...]:
