@@ -4,7 +4,6 @@ import logging
 import os
 import signal
 from collections.abc import Generator, Iterable
-from itertools import islice
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -20,8 +19,6 @@ from instant_avatar.batching.ingest_attempt import (
 )
 from instant_avatar.cli.hardware import usable_cores
 
-MAX_SUBMITTED = 1000
-"""Tasks that Ray holds at a time, running or waiting."""
 OBJECT_STORE_BYTES = 200_000_000
 """Memory for what attempts bring back (about 5 MB each), where this machine alone is used."""
 
@@ -45,13 +42,13 @@ def run_attempts(
             once: dict[str, Any] = {"max_calls": 1}  # each attempt has a process of its own
             retries = {"max_retries": arguments.retries, "retry_exceptions": [AttemptFailure]}
             task = ray.remote(**once, **retries)(learn_capture)
-            waiting, running = iter(captures), {}
-            while True:
-                for capture in islice(waiting, MAX_SUBMITTED - len(running)):
-                    named = task.options(name=capture.name, **needs[capture.name])
-                    running[named.remote(capture, arguments, scratch)] = capture
-                if not running:
-                    return
+            running = {
+                task.options(name=capture.name, **needs[capture.name]).remote(
+                    capture, arguments, scratch
+                ): capture
+                for capture in captures
+            }
+            while running:
                 (ended,), _ = ray.wait(list(running), num_returns=1)
                 yield _attempt(ray, ended, running.pop(ended))
         finally:
