@@ -172,7 +172,7 @@ def compare(arguments: CompareArguments, console: Console) -> int:
 
 def _is_done(arguments: CompareArguments, name: str) -> bool:
     """Whether a method was trained before, under the same conditions, and is to be kept."""
-    from instant_avatar.cli.hardware import Hardware
+    from benchmarks.hardware import Hardware
 
     scores = arguments.out / name / "scores.json"
     kept = json.loads(scores.read_text()) if scores.is_file() else {}
@@ -202,7 +202,7 @@ def _train_method(
     """Trains a method, and writes its folder whole; nothing if it is stopped."""
     from baselines.comparison_scores import curve_point, score_all
     from baselines.systems.compared_systems import make_system, train_config
-    from instant_avatar.cli.hardware import Hardware
+    from benchmarks.hardware import Hardware
 
     made_on = asdict(Hardware.here())
     config = train_config(data, arguments.seconds, arguments.steps, seed=arguments.seed)

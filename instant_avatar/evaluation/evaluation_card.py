@@ -1,10 +1,11 @@
 """The evaluation's page: conditions, scores and images."""
 
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from importlib.metadata import version
 
 from avatar.evaluation.perceptual import Lpips
-from instant_avatar.cli.hardware import Hardware
+from instant_avatar.cli.hardware import describe_machine
 from instant_avatar.evaluation.frame_scoring import LARGEST_SHOWN_ERROR, choose_shown
 from instant_avatar.evaluation.score_table import (
     AvatarEvaluation,
@@ -23,7 +24,7 @@ POSES = {
 
 def evaluation_conditions(evaluations: Sequence[AvatarEvaluation], lpips: Lpips) -> dict[str, str]:
     """Return what the scores depend on, by name."""
-    here, rows = Hardware.here(), [row for each in evaluations for row in each.rows]
+    here, rows = describe_machine(), [row for each in evaluations for row in each.rows]
     sizes = dict.fromkeys("{}x{}".format(*each.size) for each in evaluations if each.size)
     package = f"instant-avatar-stream {version('instant-avatar-stream')}"
     conditions = {
@@ -38,10 +39,8 @@ def evaluation_conditions(evaluations: Sequence[AvatarEvaluation], lpips: Lpips)
     return conditions | {
         "PSNR, SSIM": f"{package}: values in [0, 1]; SSIM on RGB, Gaussian of 11 pixels, σ 1.5",
         "LPIPS": lpips.describe(),
-        "machine": f"{here.processor}, {here.cores} cores, {here.memory_gb} GB, load {here.load}",
-        "software": here.software,
-        "commit": here.commit,
-        "date": here.date,
+        "machine": "{processor}, {cores} cores, {memory_mb} MB".format(**here),
+        "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"),
     }
 
 

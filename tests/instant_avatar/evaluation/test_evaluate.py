@@ -201,7 +201,7 @@ def test_a_page_holds_conditions_scores_and_images(run, call_evaluate, tmp_path)
     assert len(tags.addresses) == 3 * min(scored, SHOWN_FRAMES)
     assert all(address.startswith("data:image/webp;base64,") for address in tags.addresses)
     assert f"{avatar['rows'][0]['psnr']:.2f}" in page
-    assert conditions["software"] in page
+    assert conditions["machine"] in page
     again = call_evaluate(run, *words, *out)
     assert again.code == 2
     assert "card.html" in again.complaint("ia-evaluate") or "t.json" in again.err
