@@ -65,11 +65,13 @@ def track_images(source: FrameSource) -> tuple[TrackedImage, ...]:
     begin, end = (chosen.start + chosen.step * place for place in (first, total))
     wanted = reopen(source, slice(begin, end, chosen.step * step))
     finder, brighten = PersonFinder(), DarkFilmBrightener()
-    whole = (frame for frame in wanted.frames() if "corrupt" not in frame.flags)
-    return tuple(
-        _reduce_image(frame, next(iter(finder.persons(brighten(frame.rgb))), None))
-        for frame in whole
-    )
+    images: list[TrackedImage] = []
+    found: FoundLandmarks | None = None
+    for frame in wanted.frames():
+        if "corrupt" not in frame.flags:
+            found = finder.follow(brighten(frame.rgb), None if found is None else found.square)
+            images.append(_reduce_image(frame, found))
+    return tuple(images)
 
 
 def _reduce_image(frame: Frame, found: FoundLandmarks | None) -> TrackedImage:

@@ -22,12 +22,15 @@ from preprocess.tracking.blazepose_networks import (
     BlazePoseDetector,
     BlazePoseLandmarks,
     FoundLandmarks,
+    PersonSquare,
 )
 from preprocess.tracking.keypoints import MIN_PRESENCE
 from preprocess.tracking.video_tracking import TrackingProblem, touched_borders
 
 MIN_OTHER_SIZE = 0.5
 """Height of another person, in that of the largest, from which it counts as one in the film."""
+FITTING_STEP = 0.1
+"""Way and growth of a person, in sides of its square, up to which an earlier square fits."""
 BACKGROUND_PX = 480
 """Longer side of the images in which the background is followed, px."""
 MAX_CORNERS = 200
@@ -201,6 +204,19 @@ class PersonFinder:
             )  # fmt: skip
             rotation = 90 * best if surest > MIN_PRESENCE else 0
         return _Glimpse(size_px=(rgb.shape[1], rgb.shape[0]), persons=persons, rotation=rotation)
+
+    def follow(
+        self, rgb: UInt8[np.ndarray, "height width 3"], square: PersonSquare | None
+    ) -> FoundLandmarks | None:
+        """Find the person where it was in an earlier frame, else the largest one."""
+        if square is not None:
+            found = self._landmarks(rgb, square)
+            change = abs(np.log(found.square.side / square.side))
+            if distance_in_sides(square, found.square) + change > FITTING_STEP:
+                found = self._landmarks(rgb, found.square)
+            if found.keypoints.presence >= MIN_PRESENCE:
+                return found
+        return next(iter(self.persons(rgb)), None)
 
     def persons(self, rgb: UInt8[np.ndarray, "height width 3"]) -> list[FoundLandmarks]:
         """Find the largest person and others nearly as large, the largest first."""
