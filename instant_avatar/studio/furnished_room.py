@@ -103,7 +103,7 @@ class FurnishedRoom:
     triangles: Int32[np.ndarray, "triangles 3"]
     face_of: Int32[np.ndarray, "triangles"]
     texels: UInt8[np.ndarray, "texels 3"]
-    textures: Int64[np.ndarray, "faces 3"]
+    textures: Int32[np.ndarray, "faces 3"]
     seed: int
 
     @classmethod
@@ -141,7 +141,7 @@ class FurnishedRoom:
             triangles=triangles.astype(np.int32),
             face_of=face_of.astype(np.int32),
             texels=np.concatenate(texels),
-            textures=np.array(textures),
+            textures=np.array(textures, dtype=np.int32),
             seed=seed,
         )
 
@@ -152,14 +152,14 @@ class FurnishedRoom:
         seen = rasterize(self.points, self.triangles, camera, supersampling=SUPERSAMPLING)
         triangle, (b, c) = np.maximum(seen.face, 0), np.moveaxis(seen.barycentric, -1, 0)
         corners, shares = self.triangles[triangle], (1.0 - b - c, b, c)
-        column, row = (
-            sum(share * self.places[corners[..., k], axis] for k, share in enumerate(shares))
-            for axis in range(2)
-        )
+        column, row = np.zeros((2, *triangle.shape), dtype=np.float32)
+        for corner, share in enumerate(shares):
+            place = self.places[corners[..., corner]]
+            column, row = column + share * place[..., 0], row + share * place[..., 1]
         face = self.face_of[triangle]
         first, rows, columns = np.moveaxis(self.textures[face], -1, 0)
-        column = np.clip(column.astype(np.int64), 0, columns - 1)
-        texel = first + np.clip(row.astype(np.int64), 0, rows - 1) * columns + column
+        column = np.clip(column.astype(np.int32), 0, columns - 1)
+        texel = first + np.clip(row.astype(np.int32), 0, rows - 1) * columns + column
         rgb = self.texels[texel] * FACE_LIGHT[face % 6][..., None]
         width, height = camera.size_px
         rgb = rgb.reshape(height, SUPERSAMPLING, width, SUPERSAMPLING, 3).mean(axis=(1, 3))
