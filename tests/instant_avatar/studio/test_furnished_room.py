@@ -7,6 +7,8 @@ from capture.atomic_files import LIST_NAME as LIST
 from capture.input_error import InputError
 from instant_avatar.studio import staging
 from instant_avatar.studio.actor import Actor
+from instant_avatar.studio.furnished_room import FurnishedRoom
+from instant_avatar.studio.lighting import rasterize
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.cameras.camera_file import read_cameras
 from preprocess.poses.pose_format_registry import read_poses
@@ -92,3 +94,14 @@ def test_a_pose_file_says_in_which_space_it_is(capture, tmp_path):
     np.savez(tmp_path / "poses.npz", **changed)
     with pytest.raises(InputError, match=r"expected world or camera"):
         read_poses(tmp_path / "poses.npz")
+
+
+def test_the_room_is_closed_and_the_floor_is_darker_about_the_feet():
+    room, camera = FurnishedRoom.furnished("room", 96, 0), staging.standing_camera(1.7, 96)
+    feet = np.array([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0]])
+    seen = rasterize(room.points, room.triangles, camera, supersampling=1)
+    assert (seen.face >= 0).all()
+    with_feet, without = (room.render(camera, each, 0).astype(int) for each in (feet, feet[:0]))
+    column, row = camera.project(np.zeros(3)).round().astype(int)
+    assert (without - with_feet)[row, column].mean() > 20.0
+    assert np.array_equal(without[:10], with_feet[:10])
