@@ -50,8 +50,11 @@ def _hash(i: int, j: int, k: int, seed: int) -> np.float32:
 
 
 @compile_kernel(nogil=True)
-def value_noise(x: float, y: float, z: float, cell: float, seed: int) -> float:
-    """Smooth noise in [-1, 1] with a grain of `cell` metres."""
+def value_noise(x: float, y: float, z: float, cell: float, seed: np.uint32) -> float:
+    """Smooth noise in [-1, 1] with a grain of `cell` metres.
+
+    Seeds are `np.uint32`: for each plain integer in a kernel numba would compile it once more.
+    """
     x, y, z = x / cell + 500.0, y / cell + 500.0, z / cell + 500.0
     i, j, k = int(x), int(y), int(z)
     u, v, w = smoothstep(x - i, 0.0, 1.0), smoothstep(y - j, 0.0, 1.0), smoothstep(z - k, 0.0, 1.0)
@@ -126,7 +129,9 @@ def _shirt(
         color = _scale(color, 0.72 + 0.28 * smoothstep(abs(pocket), 0.0008, 0.0030))
         if pocket < 0.0 and y > 0.180:
             color = _lerp(_swatch(palette, TRIM), color, 0.25)
-    grain = 0.060 * value_noise(x, y, z, 0.018, 1) + 0.040 * value_noise(x, y, z, 0.010, 2)
+    grain = 0.060 * value_noise(x, y, z, 0.018, np.uint32(1)) + 0.040 * value_noise(
+        x, y, z, 0.010, np.uint32(2)
+    )
     return _scale(color, 1.0 + grain)
 
 
@@ -153,7 +158,9 @@ def _trousers(
     if y > BELT_Y - 0.22 and z > 0.05:
         thread = min(thread, abs(np.hypot(side - 0.19, y + 0.15) - 0.11))
     color = _lerp(_swatch(palette, THREAD), color, 0.35 + 0.65 * smoothstep(thread, 0.0008, 0.0028))
-    grain = 0.075 * value_noise(x, y, z, 0.018, 3) + 0.060 * value_noise(x, y, z, 0.010, 4)
+    grain = 0.075 * value_noise(x, y, z, 0.018, np.uint32(3)) + 0.060 * value_noise(
+        x, y, z, 0.010, np.uint32(4)
+    )
     return _scale(color, 1.0 + grain)
 
 
@@ -165,7 +172,10 @@ def _skin(x: float, y: float, z: float, palette: Float32[np.ndarray, "colors 3"]
     if side > 0.78:
         warm = 0.35 * smoothstep(side, 0.84, 0.91)
     color = _scale(
-        tone, 1.0 + 0.030 * value_noise(x, y, z, 0.020, 5) + 0.015 * value_noise(x, y, z, 0.009, 6)
+        tone,
+        1.0
+        + 0.030 * value_noise(x, y, z, 0.020, np.uint32(5))
+        + 0.015 * value_noise(x, y, z, 0.009, np.uint32(6)),
     )
     if y < 0.34 or z < 0.06:
         ear = smoothstep(0.040 - np.hypot(z - 0.066, y - 0.478), 0.0, 0.02) * smoothstep(
@@ -236,8 +246,8 @@ def _eye(x: float, y: float, palette: Float32[np.ndarray, "colors 3"]) -> SrgbCo
 @compile_kernel(nogil=True)
 def _hair(x: float, y: float, z: float, palette: Float32[np.ndarray, "colors 3"]) -> SrgbColor:
     along = np.arctan2(x - SYMMETRY_PLANE_X, z - 0.05)
-    strand = value_noise(along * 0.30, 0.25 * y, 0.1 * z, 0.012, 7)
-    strand += 0.6 * value_noise(along * 0.30, 0.25 * y, 0.1 * z, 0.005, 8)
+    strand = value_noise(along * 0.30, 0.25 * y, 0.1 * z, 0.012, np.uint32(7))
+    strand += 0.6 * value_noise(along * 0.30, 0.25 * y, 0.1 * z, 0.005, np.uint32(8))
     return _scale(_swatch(palette, HAIR_TONE), 1.0 + 0.30 * strand)
 
 
@@ -254,7 +264,7 @@ def _shoe(x: float, y: float, z: float, palette: Float32[np.ndarray, "colors 3"]
     toe = abs(z - 0.125) if y > -1.20 else 1.0
     upper = _scale(upper, 0.82 + 0.18 * smoothstep(toe, 0.001, 0.004))
     color = _lerp(_swatch(palette, SOLE), upper, smoothstep(y, -1.2085, -1.2065))
-    return _scale(color, 1.0 + 0.04 * value_noise(x, y, z, 0.015, 9))
+    return _scale(color, 1.0 + 0.04 * value_noise(x, y, z, 0.015, np.uint32(9)))
 
 
 @compile_kernel(nogil=True)
