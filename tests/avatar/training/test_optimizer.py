@@ -155,6 +155,7 @@ def test_compiled_steps_are_those_of_torch_and_spend_the_gradient():
         assert not torch.equal(mine, before)
 
 
+@pytest.mark.slow
 def test_a_step_and_a_checkpoint_load_no_compiler():
     root = Path(__file__).parents[3]
     done = subprocess.run(

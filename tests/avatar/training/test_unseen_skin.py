@@ -158,8 +158,8 @@ def test_unseen_skin_becomes_like_its_sources(rig, clip, generator):
         trainer = Trainer(rig, config)
         for seen in front:
             trainer.add_frame(prepare_frame(seen, rig))
-        for step in range(300):
-            trainer.step(rate=cosine_decay(step / 300), hard_surface_share=1.0)
+        for step in range(200):
+            trainer.step(rate=cosine_decay(step / 200), hard_surface_share=1.0)
         pairs = trainer.unseen.sample(4000, generator)
         raw = trainer.field.raw_outputs_at(pairs.points)
         opacity = 1.0 - torch.exp(-torch.exp(raw[:, 3].clamp(max=9.0)) * 0.01)
