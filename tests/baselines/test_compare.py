@@ -26,6 +26,9 @@ def compared(tmp_path_factory):
     return folder, words
 
 
+pytestmark = pytest.mark.slow
+
+
 def test_it_writes_scores_table_and_pictures(compared):
     out = compared[0] / "out"
     results = json.loads((out / "comparison.json").read_text())
