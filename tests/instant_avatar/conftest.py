@@ -15,7 +15,7 @@ from export.bake import bake_tables, fine_tuning
 from export.build import ExportReport
 from instant_avatar import ingest, play
 from instant_avatar.report import report_writer
-from instant_avatar.run import session_start, snapshot_writer, training_session
+from instant_avatar.run import snapshot_writer, training_session
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.open_capture import open_capture
@@ -50,19 +50,24 @@ FEW_STEPS = 10
 """Training steps where a test is not about what was learnt."""
 
 
+BRIEF_VOXEL_M = 0.008
+"""Voxels of the packages, metres: coarse enough to be baked and drawn quickly."""
 BRIEF = pytest.MonkeyPatch()
 """A shorter end of a run; undone after each test, for other folders measure what it shortens."""
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup():
-    """Fine-tune on fewer, smaller images, fit poses in fewer steps, and show a shorter film."""
+    """Bake coarser voxels, fine-tune on fewer, smaller images, fit poses in fewer steps, and show
+    a shorter film."""
+    BRIEF.setattr(bake_tables, "MIN_VOXEL_M", BRIEF_VOXEL_M)
+    BRIEF.setattr(bake_tables, "MAX_VOXEL_M", BRIEF_VOXEL_M)
     BRIEF.setattr(bake_tables, "FINE_TUNING_PICTURES", 4)
     BRIEF.setattr(fine_tuning, "TRAINING_PX", 128)
     BRIEF.setattr(fine_tuning, "VALIDATION_PX", 128)
     BRIEF.setattr(held_out_pose_fitting, "CORRECTIONS_PER_FRAME", 4)
-    BRIEF.setattr(report_writer, "ANIMATION_PX", 160)
-    BRIEF.setattr(report_writer, "ANIMATION_FRAMES", 12)
+    BRIEF.setattr(report_writer, "ANIMATION_PX", 96)
+    BRIEF.setattr(report_writer, "ANIMATION_FRAMES", 4)
 
 
 @pytest.hookimpl(trylast=True)
@@ -83,7 +88,9 @@ def film(tmp_path_factory) -> Path:
 def run(film, tmp_path_factory) -> Path:
     """What ia-ingest makes of it."""
     out = tmp_path_factory.mktemp("runs") / "run"
-    assert ingest.main([str(film), "--out", str(out), "--steps", str(ENOUGH_STEPS)]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(train, "warm_up", lambda trainer: 0.0)
+        assert ingest.main([str(film), "--out", str(out), "--steps", str(ENOUGH_STEPS)]) == 0
     return out
 
 
@@ -102,9 +109,8 @@ def capture(film, tmp_path) -> Path:
 
 
 @pytest.fixture
-def call_ingest(capsys, monkeypatch, rig) -> Command:
+def call_ingest(capsys, monkeypatch) -> Command:
     """Runs ia-ingest, for a few steps unless the test says otherwise."""
-    monkeypatch.setattr(session_start.Rig, "from_shaped_body", lambda shaped: rig)
     monkeypatch.setattr(train, "warm_up", lambda trainer: 0.0)
 
     def call(*arguments: object, steps: int = FEW_STEPS) -> Outcome:
