@@ -32,6 +32,7 @@ from benchmarks.sample_training import (
 from benchmarks.startup import measure_peak_memory, measure_startup
 from benchmarks.step_timing import encode_marks, step_marks
 from benchmarks.stopwatch import limit_threads
+from benchmarks.thread_scaling import scaling_marks
 from benchmarks.training_quality import (
     measure_by_core_seconds,
     measure_by_wall_time,
@@ -41,6 +42,7 @@ from instant_avatar.cli.command_line import run_command
 from preprocess.poses.pose_format_registry import read_poses
 
 SIZE_PX = 256
+PHONE_SIZE_PX = 304
 TEN_MINUTES = 600.0
 """What patience adds to a minute, at 540 px."""
 WARMUP_TRAINING_SECONDS = 15.0
@@ -80,7 +82,8 @@ def run_benchmark(job: Training) -> int:
 def all_marks(job: Training, folder: Path) -> Iterator[Measurement]:
     """All rows; each is also told on standard error as soon as it is known."""
     small = film_sample(folder / f"sample{SIZE_PX}", SIZE_PX)
-    groups = [operation_marks(small)]
+    phone = film_sample(folder / "phone", PHONE_SIZE_PX, like_a_phone=True)
+    groups = [scaling_marks(phone), operation_marks(small)]
     if not job.quick:
         groups += [
             measure_by_core_seconds(folder),

@@ -82,9 +82,9 @@ class FrameExposures:
 
     def neutralize(self, batch: TrainingBatch) -> TrainingBatch:
         """The batch as the neutral avatar should look; unchanged while no exposure differs."""
-        target = batch.target.clone()
-        target[:, :3] /= self.gains[batch.rays.slots.long()]
-        return batch._replace(target=target)
+        target = np.empty(batch.target.shape, dtype=np.float32)
+        _divide_by_gains(batch.rays.slots.numpy(), batch.target.numpy(), self.gains.numpy(), target)
+        return batch._replace(target=torch.from_numpy(target))
 
     def observe(self, batch: TrainingBatch, rendered: PremultipliedPixels) -> None:
         """Updates the gains by rays with their pixels as filmed, and their neutral rendering."""
@@ -95,6 +95,14 @@ class FrameExposures:
             self._avatar_frozen, self._pixels, self._rendered, gains,
         )  # fmt: skip
         self.gains[:held] = torch.from_numpy(gains)
+
+
+@compile_kernel(**FAST_MATH)
+def _divide_by_gains(slots, target, gains, neutral):
+    for ray in range(slots.shape[0]):
+        for q in range(3):
+            neutral[ray, q] = target[ray, q] / gains[slots[ray], q]
+        neutral[ray, 3] = target[ray, 3]
 
 
 @compile_kernel(**FAST_MATH)

@@ -33,12 +33,13 @@ from preprocess.observation_source import ObservationSource
 
 
 def set_threads(requested: int | None) -> int:
-    """Set the threads of torch and numba: as requested, else one per usable core.
+    """Set the threads of numba: as requested, else one per usable core; torch gets one.
 
-    Return their number; numba cannot exceed the number it started with.
+    Return their number; numba cannot exceed the number it started with. torch is left with
+    operations on small arrays, for which a second pool of threads only has to be woken.
     """
     threads = max(1, min(requested or usable_cores(), numba.get_num_threads()))
-    torch.set_num_threads(threads)
+    torch.set_num_threads(1)
     numba.set_num_threads(threads)
     return threads
 
