@@ -163,8 +163,10 @@ def export_field(
         )
         settings = {tier: QUALITY_TIERS[tier] for tier in config.tiers}
         baked = FineTuningResult(tables=baking.result(), settings=settings, psnr=None)
+        first: ExportReport | None = None
         if baked_first or not config.fine_tuning_pictures:
-            yield draft.write(baked, seconds=time.perf_counter() - started)
+            first = draft.write(baked, seconds=time.perf_counter() - started)
+            yield first
             started = time.perf_counter()
         if not config.fine_tuning_pictures:
             return
@@ -185,7 +187,11 @@ def export_field(
         )  # fmt: skip
         warnings = [] if tuned.psnr else [INTERRUPTED_WARNING]
         if tuned.psnr or not baked_first:
-            yield draft.write(tuned, warnings, seconds=time.perf_counter() - started)
+            is_checked = first is not None and tuned.settings == settings
+            yield draft.write(
+                tuned, warnings, seconds=time.perf_counter() - started,
+                difference=first.largest_difference if first and is_checked else None,
+            )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -200,9 +206,18 @@ class _PackageDraft:
     executor: Executor
 
     def write(
-        self, tuned: FineTuningResult, warnings: Sequence[str] = (), *, seconds: float
+        self,
+        tuned: FineTuningResult,
+        warnings: Sequence[str] = (),
+        *,
+        seconds: float,
+        difference: float | None = None,
     ) -> ExportReport:
-        """Check and write a package, which took `seconds` so far."""
+        """Check and write a package, which took `seconds` so far.
+
+        `difference` is that of its graphs from their references, where an earlier package of the
+        same graphs was checked: only the tables differ.
+        """
         started = time.perf_counter()
         with PackageWriter(self.path) as writer:
             compressed = self.executor.submit(writer.add_tables, tuned.tables)
@@ -212,6 +227,7 @@ class _PackageDraft:
                         tuned.tables, tuned.settings, self.rig, self.views, self.metrics
                     ),
                     self.views, self.exact, self.executor, warnings=list(warnings),
+                    difference=difference,
                 )  # fmt: skip
             finally:
                 compressed.result()
@@ -250,16 +266,19 @@ def _checked_package(
     exact: Sequence[Float32[np.ndarray, "_ _ 3"]],
     executor: Executor,
     warnings: list[str],
+    difference: float | None,
 ) -> AvatarPackage:
-    """Check every tier; add scores, warnings, golden frames and the preview."""
+    """Check every tier, its graph unless `difference` is known; add scores, warnings, pictures."""
     manifest = package.manifest
     others = {t: executor.submit(Player, package, tier=t) for t in manifest.tiers if t != "hq"}
     hq, tiers = Player(package), {}
     for tier, info in manifest.tiers.items():
         player = hq if tier == "hq" else others[tier].result()
         seen = slice(None) if tier == "hq" else slice(1)
-        frames = manifest.golden[: GRAPH_CHECK_PICTURES[tier]]
-        worst = check_graph(player, package, tier, frames)
+        worst = difference
+        if worst is None:
+            frames = manifest.golden[: GRAPH_CHECK_PICTURES[tier]]
+            worst = check_graph(player, package, tier, frames)
         score = mean_psnr_to_renderer(player, views[seen], exact[seen])
         warnings = warnings + (quality_warnings(score) if tier == "hq" else [])
         tiers[tier] = replace(info, psnr_to_renderer=score, largest_difference=worst)

@@ -67,6 +67,8 @@ class EvaluateArguments:
     """Body file that the avatars were trained with, if not the embedded body."""
     frames: str = "::"
     """Frames of --on to use: START:STOP:STEP, counted from 0."""
+    rotate: Literal[0, 90, 180, 270] = 0
+    """Turn the frames of --on clockwise by this many degrees, as in ia-ingest."""
     size: Annotated[int | None, arg(metavar="PX", help_behavior_hint="")] = None
     """Longer side of the images (default: as in training, else the original size)."""
     fitted: Annotated[bool, arg(help_behavior_hint="")] = True
@@ -102,7 +104,7 @@ class EvaluateArguments:
         parse_frame_range(self.frames)
         named = ("poses", "masks", "cameras")
         of_capture = [f"--{name}" for name in named if getattr(self, name) is not None]
-        of_capture += ["--frames"] * (self.frames != "::")
+        of_capture += ["--frames"] * (self.frames != "::") + ["--rotate"] * (self.rotate != 0)
         if of_capture and self.on is None:
             raise InputError(f"{', '.join(of_capture)} require a capture: pass it with --on.")
         for path in self.targets:
@@ -128,5 +130,6 @@ class EvaluateArguments:
             cameras=self.cameras,
             body=self.body,
             frames=parse_frame_range(self.frames),
+            rotate=self.rotate,
             refine_masks=False,
         )

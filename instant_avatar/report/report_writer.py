@@ -1,5 +1,6 @@
 """Report of a run: report.json, report.html with its images, and the verdict on the console."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -98,8 +99,8 @@ ANIMATION_PX = 480
 """Width and height of the animation on the page."""
 ANIMATION_FPS = 16.0
 """Images per second of the animation on the page."""
-FIRST_ANIMATION_FPS = 8.0
-"""Images per second while the user waits for the page."""
+VISIBLE_GAIN_DB = 1.0
+"""Gain of the fine-tuned package on the one as baked for which the animation is drawn again, dB."""
 ANIMATION_FRAMES = 96
 """Largest number of images of an animation."""
 
@@ -132,6 +133,7 @@ class ReportWriter:
         self._capture, self._run, self._console, self._copy = capture, run, console, copy
         self._command, self._started_at, self._threads = command, started_at, threads
         self._animation: bytes | None = None
+        self._drawn_psnr = -math.inf
         self._result: TrainingResult | None = None
         self.report: Report | None = None
 
@@ -143,11 +145,13 @@ class ReportWriter:
                     self._console.print_artifact("package", self._run.package)
                     self._console.print_artifact("play it", self._play_command())
                 with self._console.status("drawing the report"):
-                    player = Player.load(self._run.package)
-                    fps = ANIMATION_FPS if is_final else FIRST_ANIMATION_FPS
-                    self._animation = demo_animation(player, fps=fps)
-                    with atomic_file(self._run.animation) as part:
-                        part.write_bytes(self._animation)
+                    assert result.exported is not None
+                    psnr = result.exported.psnr_to_renderer["hq"]
+                    if psnr - self._drawn_psnr > VISIBLE_GAIN_DB:
+                        self._animation = demo_animation(Player.load(self._run.package))
+                        self._drawn_psnr = psnr
+                        with atomic_file(self._run.animation) as part:
+                            part.write_bytes(self._animation)
                     if not is_final:
                         self._write(result, is_final=False)
                 if not is_final:
@@ -262,13 +266,13 @@ def comparison_pairs(result: TrainingResult) -> list[ComparisonPair]:
     return shown
 
 
-def demo_animation(player: Player, *, fps: float = ANIMATION_FPS) -> bytes:
+def demo_animation(player: Player) -> bytes:
     """Draw the avatar in a motion of our own by the player, as an animated WebP."""
     motion = demo_motion()
     camera = FollowingCamera.of(player, motion, ANIMATION_PX)
-    frames = ResampledMotion.of(motion, fps=fps)
+    frames = ResampledMotion.of(motion, fps=ANIMATION_FPS)
     poses = [frames.pose(frame) for frame in range(min(len(frames), ANIMATION_FRAMES))]
-    return encode_webp([player.render(p, camera.camera_for(p)) for p in poses], fps=fps)
+    return encode_webp([player.render(p, camera.camera_for(p)) for p in poses], fps=ANIMATION_FPS)
 
 
 def _fitted_pose_stats(result: TrainingResult) -> HeldOutStats | None:

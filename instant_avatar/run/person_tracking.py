@@ -29,7 +29,7 @@ from preprocess.masks.mask_sources import associate_masks
 from preprocess.open_capture import ImportedCapture, align_capture, import_capture
 from preprocess.plugins import DEFAULT_TRACKER, make_tracker, segmenter_name
 from preprocess.poses.pose_file import as_stored, write_motion
-from preprocess.tracking.first_look import look_at
+from preprocess.tracking.first_look import FirstLook, look_at
 from preprocess.tracking.pose_lift import lift_keypoints
 from preprocess.tracking.tracking_grade import TrackingGrade, grade_tracking
 from preprocess.tracking.video_tracking import TrackedVideo, track_video
@@ -124,12 +124,23 @@ def _open_video(inputs: CaptureInputs, console: Console) -> tuple[CaptureInputs,
             f"One in {source.selection.step} frames is used, {source.frame_count} in all (--frames "
             "names others)."
         )
-    seen = look_at(source)
-    if seen.frames:  # of fewer than seven frames there is none
-        console.info(seen.describe())
-        for advice in seen.advice():
-            console.warning(advice)
+    print_first_look(look_at(source), inputs, console, tracks=True)
     return inputs, source
+
+
+def print_first_look(
+    seen: FirstLook, inputs: CaptureInputs, console: Console, *, tracks: bool
+) -> None:
+    """Print what a few frames show; of fewer than seven frames there is nothing to print.
+
+    Where poses are given instead of tracked, only if the networks find a person at all.
+    """
+    if not seen.frames or not (tracks or seen.found):
+        return
+    console.info(seen.describe())
+    has_cameras = inputs.cameras not in (None, "static")
+    for advice in seen.advice(tracks=tracks, has_cameras=has_cameras):
+        console.warning(advice)
 
 
 def tracked_inputs(inputs: CaptureInputs, poses: Path, masks: Path | None) -> CaptureInputs:

@@ -1,6 +1,8 @@
 """The capture of a run: read, tracked or streamed, aligned, in the world of its cameras, fitted."""
 
 import os
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
 
 from capture.atomic_files import atomic_file
@@ -8,7 +10,7 @@ from capture.input_error import InputError
 from instant_avatar.capture_validation import correction_hint, preflight_check
 from instant_avatar.cli.console import Console
 from instant_avatar.run.ingest_arguments import IngestArguments
-from instant_avatar.run.person_tracking import person_number
+from instant_avatar.run.person_tracking import person_number, print_first_look
 from instant_avatar.run.run_folder import RunFolder
 from instant_avatar.run.run_tracking import import_tracked
 from preprocess.cameras.camera_file import write_cameras
@@ -27,6 +29,7 @@ from preprocess.open_capture import (
 from preprocess.plugins import DEFAULT_TRACKER, make_tracker
 from preprocess.poses.pose_file import write_motion
 from preprocess.sfm.capture_solving import apply_camera_solution, solve_capture_cameras
+from preprocess.tracking.first_look import look_at
 
 
 def open_observations(
@@ -47,19 +50,26 @@ def open_observations(
         imported = import_tracked(arguments, inputs, run, console)
     else:
         imported = read_capture(inputs)
-    size_px = arguments.longer_side_px(imported.source)
     fit = None
-    try:
-        with console.status("opening video and poses"):
-            if resumes:
-                capture, fit = _align_as_trained(imported, run, size_px)
-            else:
-                capture = align_capture(imported, size_px=size_px)
-    except InputError as error:
-        hint = correction_hint(imported)
-        if not hint:
-            raise
-        raise InputError(f"{error} {hint}") from error
+    with ThreadPoolExecutor(1) as executor:  # the first look is taken beside opening
+        looks = inputs.kind is InputKind.POSED and not resumes
+        look = executor.submit(look_at, imported.source) if looks else None
+        try:
+            with console.status("opening video and poses"):
+                size_px = arguments.longer_side_px(imported.source)
+                if resumes:
+                    capture, fit = _align_as_trained(imported, run, size_px)
+                else:
+                    capture = align_capture(imported, size_px=size_px)
+        except InputError as error:
+            hint = correction_hint(imported)
+            if not hint:
+                raise
+            raise InputError(f"{error} {hint}") from error
+        finally:
+            if look is not None:
+                with suppress(InputError, OSError, ValueError):  # damaged: reading names it
+                    print_first_look(look.result(), inputs, console, tracks=False)
     _describe(capture, console)
     if not resumes:
         preflight_check(capture, imported.inputs, console, force=arguments.force)

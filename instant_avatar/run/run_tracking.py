@@ -111,11 +111,17 @@ def remove_tracking(run: RunFolder) -> None:
 def _describe_request(arguments: IngestArguments) -> dict[str, Any]:
     """Return what decides the tracked poses; those of another request are tracked again."""
     named = {
-        name: None if value is None else str(value)
+        name: str(value)
         for name, value in vars(arguments).items()
         if name in ("masks", "cameras", "body", "frames", "person", "tracker", "rotate")
+        and value is not None
     }
-    return {"video": str(arguments.video.resolve()), **named}
+    return _without_defaults({"video": str(arguments.video.resolve()), **named})
+
+
+def _without_defaults(request: dict[str, Any]) -> dict[str, Any]:
+    """Leave out options that were not given, so that later ones change no earlier request."""
+    return {name: value for name, value in request.items() if value not in (None, "0")}
 
 
 def _read_stored(arguments: IngestArguments, run: RunFolder) -> dict[str, Any] | None:
@@ -126,4 +132,5 @@ def _read_stored(arguments: IngestArguments, run: RunFolder) -> dict[str, Any] |
         return None
     expected = {"request", "frames", "masks", "grade"}
     usable = isinstance(stored, dict) and stored.keys() == expected and run.tracked_poses.is_file()
-    return stored if usable and stored["request"] == _describe_request(arguments) else None
+    same = usable and _without_defaults(stored["request"]) == _describe_request(arguments)
+    return stored if same else None

@@ -115,7 +115,9 @@ MAX_UNSEEN_COLOR_DISTANCE = 12.0
 """Largest difference of colors where the detector finds no person, in units of CIELAB: past it the
 networks hold on to a thing that the person passed."""
 CROWD_MEMORY = 20
-"""Frames after which another person who was near and is not seen any more does not count."""
+"""Frames for which colors tell persons apart after another one was near."""
+SEEN_AGO = WATCH_INTERVAL + 1
+"""Frames for which another person who was seen near may still be in the person's mask."""
 MASK_JUMP = 1.2
 """Factor by which the person's mask changes from one frame to the next only if another person comes
 or goes, or the film is cut: of persons who turn and dance it changes by 1.15 at most."""
@@ -176,7 +178,8 @@ class BlazePoseTracker:
             self._frames_to_watch = 0
         self._last = LastPlace(square=found.square)
         self._watch(rgb, found)
-        return replace(found.keypoints, crowded=self._crowded_frames > 0)
+        is_near = self._crowded_frames > CROWD_MEMORY - SEEN_AGO
+        return replace(found.keypoints, crowded=is_near)
 
     def _follow(self, rgb: UInt8[np.ndarray, "height width 3"]) -> FoundLandmarks | None:
         """The person, where the last frame's key points say; None if it is not there."""

@@ -100,8 +100,11 @@ class FirstLook:
             parts.append(self.motion.value)
         return f"First look at {self.frames} frames: {', '.join(parts)}."
 
-    def advice(self) -> Iterator[str]:
-        """What is wrong or limited, and what can be done, for people."""
+    def advice(self, *, tracks: bool = True, has_cameras: bool = False) -> Iterator[str]:
+        """What is wrong or limited, and what can be done, for people.
+
+        `tracks` means that no poses are given; `has_cameras`, that cameras are, or are solved.
+        """
         of = f"of {self.found} frames"
         if self.rotation:
             side = "head down" if self.rotation == 180 else "on its side"
@@ -110,22 +113,30 @@ class FirstLook:
                 f"turned, add --rotate {self.rotation}: else the avatar is turned, too."
             )
         if self.crowded:
+            followed = (
+                "The larger one is followed, or the one that --person names"
+                if tracks
+                else "The one whom the poses follow is learnt"
+            )
             yield (
-                f"Another person is in {self.crowded} {of}. The larger one is followed, or the one "
-                "that --person names; frames in which they are near each other may be lost."
+                f"Another person is in {self.crowded} {of}. {followed}; frames in which they are "
+                "near each other may be lost."
             )
         for border, count in self.cut.items():
             what = f"{border.value} in {count} {of}".capitalize()
             most = "If so in most of the video, it is refused: film again, or choose --frames."
-            yield f"{what}. {most if 2 * count > self.found else 'What is outside is a guess.'}"
+            is_refused = tracks and 2 * count > self.found
+            yield f"{what}. {most if is_refused else 'What is outside is a guess.'}"
         if self.level < DARK_LEVEL:
+            found = "It is brightened to find the person; the" if tracks else "The"
             yield (
-                f"The film is dark: its lightest parts reach {self.level:.0f} of 255. It is "
-                "brightened to find the person; the avatar will be as dark, and noisy."
+                f"The film is dark: its lightest parts reach {self.level:.0f} of 255. {found} "
+                "avatar will be as dark, and noisy."
             )
-        yield from self._camera_advice()
+        if not has_cameras:
+            yield from self._camera_advice(tracks=tracks)
 
-    def _camera_advice(self) -> Iterator[str]:
+    def _camera_advice(self, *, tracks: bool) -> Iterator[str]:
         shift = f"its background shifts by up to {self.shift:.0%} of the longer side in 0.2 s"
         solved = {
             CameraMotion.WALKS: "its way",
@@ -133,9 +144,10 @@ class FirstLook:
             CameraMotion.MOVES: "how it moves",
         }
         if self.motion in solved:
+            poses = "Poses are found for" if tracks else "Poses must be in"
             yield (
-                f"{self.motion.value.capitalize()} ({shift}). Poses are found for each frame's own "
-                f"camera; --cameras solve finds {solved[self.motion]}, too, if the background has "
+                f"{self.motion.value.capitalize()} ({shift}). {poses} each frame's own camera; "
+                f"--cameras solve finds {solved[self.motion]}, too, if the background has "
                 "structure."
             )
 

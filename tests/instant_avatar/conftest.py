@@ -151,7 +151,7 @@ def without_baking(monkeypatch) -> None:
     monkeypatch.setattr(snapshot_writer, "export_avatar", export_nothing)
     monkeypatch.setattr(training_session, "update_metrics", lambda path, metrics: 8)
     monkeypatch.setattr(report_writer, "diagnose_failure", lambda report: None)
-    monkeypatch.setattr(report_writer, "demo_animation", lambda player, fps: b"")
+    monkeypatch.setattr(report_writer, "demo_animation", lambda player: b"")
     monkeypatch.setattr(report_writer.Player, "load", lambda path: None)
 
 

@@ -208,6 +208,28 @@ def test_ctrl_c_while_tuning_leaves_the_package_as_baked(
     assert np.array_equal(package.tables["hq"].bricks.voxels, tables.bricks.voxels)
 
 
+def test_the_fine_tuned_package_has_the_graphs_that_were_checked_as_baked(
+    stand_in, renderer, coarse, views, tmp_path, monkeypatch
+):
+    checked = []
+    check = build.check_graph
+    monkeypatch.setattr(build, "check_graph", lambda *given: checked.append(0) or check(*given))
+    first, tuned = export_field(
+        stand_in.field_at,
+        stand_in.rig,
+        stand_in.occupied,
+        tmp_path / "avatar.iavatar",
+        views=list(views.values()),
+        metrics={},
+        renderer=renderer,
+        config=replace(coarse, fine_tuning_pictures=4),
+        baked_first=True,
+    )
+    assert tuned.fine_tuning_psnr is not None
+    assert len(checked) == len(tuned.psnr_to_renderer)  # each tier once
+    assert tuned.largest_difference == first.largest_difference
+
+
 def test_tiers_share_the_images_and_both_gain(stand_in, tuned, spoilt, bent, camera, tables):
     after, _, images = tuned
     assert images == 10  # four judge, six are learnt from, each for both tiers

@@ -225,6 +225,7 @@ def test_a_run_is_found_again_from_another_folder(run, film, call_evaluate, tmp_
     ("words", "told"),
     [
         (["{run}", "--frames", "0:5"], "--on"),
+        (["{run}", "--rotate", "90"], "--on"),
         (["{run}", "--lpips-weights", "{tmp}/nothing"], "--lpips-weights"),
         (["{run}/avatar.iavatar"], "--on"),
         (["{tmp}"], "neither a run"),

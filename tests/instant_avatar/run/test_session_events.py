@@ -5,6 +5,7 @@ import signal
 import threading
 from collections import Counter
 from dataclasses import asdict
+from functools import partial
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from avatar.training.trainer import Trainer
 from export.bake.bake_tables import ExportRefused
 from export.build import ExportReport
 from instant_avatar import train
+from instant_avatar.report import report_writer
 from instant_avatar.run import snapshot_writer
 from instant_avatar.run.run_folder import RunFolder
 from instant_avatar.run.session_events import Ended, PackageWritten, Scored, SessionEvent
@@ -86,7 +88,7 @@ def test_package_and_page_are_there_before_scores_are_made(learn, tmp_path):
     assert avatar.report["held_out"]["psnr"] is not None
 
 
-def write_twice(avatar, path, *, progress, **options):
+def write_twice(avatar, path, *, progress, gain_db=0.0, **options):
     """Writes a package, and then one that is fine-tuned, as `export_avatar` does."""
     for number, psnr in enumerate((None, (1.0, 2.0))):
         if number:
@@ -96,7 +98,8 @@ def write_twice(avatar, path, *, progress, **options):
                 return
         path.write_bytes(b"a" * (number + 1))
         yield ExportReport(
-            path=path, bytes=number + 1, seconds=0.0, psnr_to_renderer={"hq": 40.0},
+            path=path, bytes=number + 1, seconds=0.0,
+            psnr_to_renderer={"hq": 40.0 + number * gain_db},
             largest_difference=0.0, fine_tuning_psnr=psnr, warnings=(),
         )  # fmt: skip
 
@@ -110,6 +113,17 @@ def test_the_package_as_baked_stays_if_the_fine_tuned_one_is_refused(learn, monk
     avatar = learn()
     assert avatar.package.read_bytes() == b"a"
     assert avatar.report["package"] is not None
+
+
+@pytest.mark.parametrize(("gain_db", "drawings"), [(0.5, 1), (3.0, 2)])
+def test_the_animation_is_drawn_again_only_where_fine_tuning_shows(
+    learn, monkeypatch, gain_db, drawings
+):
+    drawn = []
+    monkeypatch.setattr(snapshot_writer, "export_avatar", partial(write_twice, gain_db=gain_db))
+    monkeypatch.setattr(report_writer, "demo_animation", lambda player: drawn.append(0) or b"")
+    learn()
+    assert len(drawn) == drawings
 
 
 @pytest.mark.parametrize("when", [None, "first", "final"])

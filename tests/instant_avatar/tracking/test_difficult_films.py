@@ -129,7 +129,7 @@ def test_a_person_who_passes_in_front_is_named_and_in_no_mask_that_is_learnt_fro
     masks = sorted((tmp_path / "out" / "masks").glob("*.png"))
     areas = np.array([(cv2.imread(str(path), 0) > 127).sum() for path in masks])
     learnt = areas[poses["frame"][poses["valid"]]]
-    assert len(learnt) > 30
+    assert len(learnt) > 55  # of 72: the other is near in a few frames only
     assert learnt.max() < 1.1 * np.median(learnt)
 
 

@@ -1,11 +1,14 @@
 """The first look: a few frames tell what is wrong with a film before minutes are spent on it."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
 from capture.source import Frame
 from capture.source_opening import open_source
+from instant_avatar.run import run_capture
 from preprocess.tracking.first_look import CameraMotion, camera_motion, look_at
 from preprocess.tracking.video_tracking import TrackingProblem
 
@@ -94,3 +97,23 @@ def test_a_camera_that_is_carried_past_near_and_far_things_walks():
     motion, shift = camera_motion(pairs, [np.full((480, 480), 255, np.uint8)] * 6)
     assert motion is CameraMotion.WALKS
     assert 8 / 480 < shift < 32 / 480
+
+
+@pytest.mark.usefixtures("without_baking")
+def test_a_film_with_poses_is_looked_at_too(
+    look, frames, filmed, call_ingest, tmp_path, monkeypatch
+):
+    seen = replace(
+        look(frames), rotations={180: 6}, crowded=3, cut={TrackingProblem.BOTTOM: 5},
+        motion=CameraMotion.TURNS,
+    )  # fmt: skip
+    monkeypatch.setattr(run_capture, "look_at", lambda source: seen)
+    done = call_ingest(filmed, "--out", tmp_path / "run")
+    assert done.code == 0, done.err
+    for words in (
+        "--rotate 180", "Another person is in 3 of 6 frames. The one whom the poses follow",
+        "What is outside is a guess", "The camera turns on the spot", "Poses must be in each frame",
+    ):  # fmt: skip
+        assert words in " ".join(done.err.split())
+    assert "is refused" not in done.err
+    assert done.err.index("First look") < done.err.index("Training for")
