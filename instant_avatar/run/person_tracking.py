@@ -1,6 +1,7 @@
 """Track the person of a recording, fit poses, body and camera, and write them as files."""
 
 import os
+import shutil
 import threading
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
@@ -27,9 +28,11 @@ from preprocess.masks.mask_files import open_masks
 from preprocess.masks.mask_refinement import MaskRefiner
 from preprocess.masks.mask_sources import associate_masks
 from preprocess.open_capture import ImportedCapture, align_capture, import_capture
-from preprocess.plugins import DEFAULT_TRACKER, make_tracker, segmenter_name
+from preprocess.plugins import DEFAULT_TRACKER, PersonTracker, make_tracker, segmenter_name
 from preprocess.poses.pose_file import as_stored, write_motion
+from preprocess.poses.pose_format_registry import read_poses
 from preprocess.tracking.first_look import FirstLook, look_at
+from preprocess.tracking.keypoints import KeypointTrack
 from preprocess.tracking.pose_lift import lift_keypoints
 from preprocess.tracking.tracking_grade import TrackingGrade, grade_tracking
 from preprocess.tracking.video_tracking import TrackedVideo, track_video
@@ -40,6 +43,9 @@ MAX_PRINTED_STRETCHES = 8
 """Doubtful stretches that are printed; reports hold all of them."""
 MAX_FRAMES = 600
 """Most frames that are tracked unless --frames says which; of longer videos every nth."""
+
+SAME_PERSON = 0.15
+"""Mean distance of one person's key points, found twice in a frame, in the person's size."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -74,18 +80,19 @@ def track_person(
     console: Console,
     *,
     stop: threading.Event | None = None,
+    resume: bool = False,
 ) -> PersonTracking:
     """Track the person, and write poses, and masks to the folder masks/ beside them.
 
     Masks that were given, or lie beside the video, are used instead of tracked ones (see
     `masks_to_use`); so are cameras. Setting `stop` ends tracking early; what was found until then
-    is written.
+    is written. With `resume`, `poses` and its masks hold the first frames, after which to go on.
 
     Raises:
         InputError: If the recording cannot be read, or no person is found in it.
         KeyboardInterrupt: If it was stopped before the person was found.
     """
-    inputs, source = _open_video(inputs, console)
+    inputs, source = _open_video(inputs, console, look=not resume)
     folder = poses.parent / "masks"
     given, names_segmenter = masks_to_use(inputs, folder), segmenter_name(inputs.masks) is not None
     own_masks = given is None and (names_segmenter or not source.has_alpha)
@@ -93,7 +100,8 @@ def track_person(
         console.info(f"Using the masks in {given}, which lie beside the video.")
     _check_parts(source, inputs, given)
     with atomic_folder(folder) if own_masks else nullcontext() as part:
-        tracked = _run_networks(source, inputs, part, console, stop)
+        before = _earlier_frames(source, poses, part) if resume else None
+        tracked = _run_networks(source, inputs, part, console, stop, before)
         for warning in source.warnings:
             console.warning(warning)
         if tracked.interrupted:  # the frames after it have no masks
@@ -114,8 +122,10 @@ def track_person(
     return PersonTracking(imported=imported, grade=grade, interrupted=tracked.interrupted)
 
 
-def _open_video(inputs: CaptureInputs, console: Console) -> tuple[CaptureInputs, FrameSource]:
-    """Open the frames that are to be tracked, and print what a few of them show."""
+def _open_video(
+    inputs: CaptureInputs, console: Console, *, look: bool
+) -> tuple[CaptureInputs, FrameSource]:
+    """Open the frames that are to be tracked; with `look` print what a few of them show."""
     source = open_source(inputs.video, frames=inputs.frames, rotate=inputs.rotate)
     inputs, step = limit_frames(inputs, source), source.selection.step
     source = reopen(source, inputs.frames)
@@ -124,7 +134,8 @@ def _open_video(inputs: CaptureInputs, console: Console) -> tuple[CaptureInputs,
             f"One in {source.selection.step} frames is used, {source.frame_count} in all (--frames "
             "names others)."
         )
-    print_first_look(look_at(source), inputs, console, tracks=True)
+    if look:
+        print_first_look(look_at(source), inputs, console, tracks=True)
     return inputs, source
 
 
@@ -190,19 +201,66 @@ def _run_networks(
     mask_folder: Path | None,
     console: Console,
     stop: threading.Event | None,
+    before: TrackedVideo | None,
 ) -> TrackedVideo:
-    """Find key points and masks in each frame."""
-    tracker = make_tracker(inputs.tracker or DEFAULT_TRACKER, person_number(inputs.person))
-    refine = MaskRefiner(source.size_px)
-    with console.progress("tracking the person", float(source.frame_count or 1)) as bar:
+    """Find key points and masks in each frame, or in each after those that were tracked before."""
+    name, person = inputs.tracker or DEFAULT_TRACKER, person_number(inputs.person)
+    tracker, total, chosen = make_tracker(name, person), source.frame_count, source.selection
+    if before is not None and _finds_again(tracker, source, before.keypoints):
+        after = int(before.keypoints.frames[-1]) + chosen.step
+        source = reopen(source, slice(after, chosen.stop, chosen.step))
+    elif before is not None:  # someone else, from here on
+        tracker, before = make_tracker(name, person), None
+    done = 0 if before is None else len(before.frame_times_s)
+    with console.progress("tracking the person", float(total or 1)) as bar:
         try:
             return track_video(
-                source, tracker, refine, mask_folder, advance=bar.set_count, stop=stop
+                source,
+                tracker,
+                MaskRefiner(source.size_px),
+                mask_folder,
+                advance=lambda count: bar.set_count(done + count),
+                stop=stop,
+                before=before,
             )
         except InputError:
             if stop is not None and stop.is_set():  # too early to tell
                 raise KeyboardInterrupt from None
             raise
+
+
+def _earlier_frames(
+    source: FrameSource, poses: Path, mask_folder: Path | None
+) -> TrackedVideo | None:
+    """Read what was tracked up to the last frame with the person, and copy its masks.
+
+    None if it is of another size, or masks are missing.
+    """
+    keypoints = read_poses(poses).keypoints
+    if keypoints is None or keypoints.times_s is None or keypoints.size_px != source.size_px:
+        return None
+    last = int(keypoints.frames[-1])
+    times = {number: at for number, at in _even_frame_times(source).items() if number <= last}
+    names = [f"{number:06d}.png" for number in times] if mask_folder is not None else []
+    stored = poses.parent / "masks"
+    if not all((stored / name).is_file() for name in names):
+        return None
+    for name in names:
+        assert mask_folder is not None
+        shutil.copyfile(stored / name, mask_folder / name)
+    times |= dict(zip(keypoints.frames.tolist(), keypoints.times_s.tolist(), strict=True))
+    return TrackedVideo(keypoints=keypoints, frame_times_s=times, interrupted=True)
+
+
+def _finds_again(tracker: PersonTracker, source: FrameSource, keypoints: KeypointTrack) -> bool:
+    """True if a new tracker takes up the same person in the last frame that was tracked."""
+    last = int(keypoints.frames[-1])
+    frame = next(iter(reopen(source, slice(last, last + 1)).frames()), None)
+    found = None if frame is None else tracker(frame.rgb)
+    if found is None:
+        return False
+    apart = np.linalg.norm(found.image_px - keypoints.image_px[-1], axis=1).mean()
+    return bool(apart < SAME_PERSON * np.ptp(keypoints.image_px[-1], axis=0).max())
 
 
 def fit_tracked_video(

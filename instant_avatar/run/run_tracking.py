@@ -1,12 +1,14 @@
 """Poses and masks that are tracked in the video of a run, and kept in its folder tracking/."""
 
 import json
+import threading
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
 from capture.atomic_files import OutputFileList, write_text_atomically
 from capture.input_error import InputError
+from instant_avatar.cli.command_line import INTERRUPTED, CommandExit, stop_on_interrupt
 from instant_avatar.cli.console import Console
 from instant_avatar.run.ingest_arguments import IngestArguments
 from instant_avatar.run.person_tracking import (
@@ -28,20 +30,23 @@ def import_tracked(
 ) -> ImportedCapture:
     """Track the person of a recording for a run; of a resumed run, read its own tracking.
 
-    Poses are written to the run's folder tracking/, as ia-track writes them.
+    Poses are written to the run's folder tracking/, as ia-track writes them. After Ctrl-C that
+    folder holds the frames before it, and a resumed run goes on with the next.
 
     Raises:
         InputError: If the poses are not good enough; they and the tracked video are kept.
+        CommandExit: After Ctrl-C.
     """
     stored = _read_stored(arguments, run) if arguments.resume else None
-    if stored is not None:
+    if stored is not None and stored["complete"]:
         if not (stored["grade"]["good_enough"] or arguments.force or run.has_checkpoint()):
             raise _refusal(stored["grade"]["summary"], run)
         return _with_grade(read_capture(_stored_inputs(stored, inputs, run)), stored)
     beside = find_own_poses(inputs.video.parent)
     if beside is not None:
         console.warning(f"{beside} lies beside the video; to use it, pass --poses.")
-    tracking = _track(inputs, run, console)
+    with stop_on_interrupt(console, "keeping the frames that were tracked") as stop:
+        tracking = _track(inputs, run, console, stop, resume=stored is not None)
     imported, grade = tracking.imported, tracking.grade
     chosen = imported.inputs.frames
     stored = {
@@ -49,8 +54,15 @@ def import_tracked(
         "frames": None if chosen is None else [chosen.start, chosen.stop, chosen.step],
         "masks": imported.inputs.masks == run.tracking / "masks",
         "grade": grade.as_json(),
+        "complete": not tracking.interrupted,
     }
     write_text_atomically(run.tracking_grade, json.dumps(stored, indent=1) + "\n")
+    if stop.is_set():
+        raise CommandExit(
+            f"stopped by Ctrl-C. {grade.frames} tracked frames are kept in {run.tracking}: to go "
+            "on from there, run the same command with --resume.",
+            INTERRUPTED,
+        )
     print_doubts(grade, console)
     if not (grade.is_good_enough or arguments.force):
         with console.status("drawing the tracked video"):
@@ -87,13 +99,20 @@ def _with_grade(imported: ImportedCapture, stored: dict[str, Any]) -> ImportedCa
     return replace(imported, provenance=(tracking,))
 
 
-def _track(inputs: CaptureInputs, run: RunFolder, console: Console) -> PersonTracking:
+def _track(
+    inputs: CaptureInputs,
+    run: RunFolder,
+    console: Console,
+    stop: threading.Event,
+    *,
+    resume: bool,
+) -> PersonTracking:
     """Track the person into the run's folder; leave no empty folder if that fails."""
     run.tracking.mkdir(parents=True, exist_ok=True)
     OutputFileList(run.tracking).create()
     OutputFileList(run.tracking).remove_temporaries()
     try:
-        return track_person(inputs, run.tracked_poses, console)
+        return track_person(inputs, run.tracked_poses, console, stop=stop, resume=resume)
     finally:
         OutputFileList(run.tracking).remove_if_empty()
         with suppress(OSError):  # not empty
@@ -130,7 +149,7 @@ def _read_stored(arguments: IngestArguments, run: RunFolder) -> dict[str, Any] |
         stored = json.loads(run.tracking_grade.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    expected = {"request", "frames", "masks", "grade"}
+    expected = {"request", "frames", "masks", "grade", "complete"}
     usable = isinstance(stored, dict) and stored.keys() == expected and run.tracked_poses.is_file()
     same = usable and _without_defaults(stored["request"]) == _describe_request(arguments)
     return stored if same else None

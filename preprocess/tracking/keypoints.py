@@ -6,7 +6,7 @@ eyes, 7-8 ears, 9-10 mouth, 11-12 shoulders, 13-14 elbows, 15-16 wrists, 17-22 f
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, Shaped, UInt8
@@ -126,6 +126,12 @@ class KeypointTrack:
             size_px=size_px,
             times_s=None if times_s is None else np.array(times_s, dtype=np.float64),
         )
+
+    def join(self, later: "KeypointTrack") -> "KeypointTrack":
+        """This track and one of later frames, both with times and problems, as one."""
+        names = ("frames", "image_px", "world_m", "visibility", "presence", "times_s", "problems")
+        both = {name: (getattr(self, name), getattr(later, name)) for name in names}
+        return replace(self, **{name: np.concatenate(parts) for name, parts in both.items()})
 
     def as_arrays(self) -> dict[str, Shaped[np.ndarray, "..."]]:
         """The arrays that a pose file holds of it."""

@@ -164,6 +164,7 @@ def track_video(
     *,
     advance: Callable[[int], None] = lambda done: None,
     stop: threading.Event | None = None,
+    before: TrackedVideo | None = None,
 ) -> TrackedVideo:
     """Find the person in each wanted frame of a recording.
 
@@ -172,6 +173,7 @@ def track_video(
             not found; None writes none.
         advance: Called with the number of frames done.
         stop: Ends tracking early once it is set; what was found until then is returned.
+        before: Result for the frames before those of `source`; it is returned with the rest.
     """
     frames, problems = list[int](), list[int]()
     found: list[PersonKeypoints] = []
@@ -203,6 +205,8 @@ def track_video(
         _refine_again(source, first, refine, mask_folder)
     track = KeypointTrack.of(frames, found, source.size_px, [times[number] for number in frames])
     track = replace(track, problems=_mark_approach(np.array(problems, dtype=np.int64)))
+    if before is not None:
+        track, times = before.keypoints.join(track), before.frame_times_s | times
     _require_person(source, len(track), len(times))
     return TrackedVideo(keypoints=track, frame_times_s=times, interrupted=interrupted)
 

@@ -4,6 +4,7 @@ import json
 import signal
 from concurrent.futures import Future
 
+import numpy as np
 import pytest
 
 from avatar.training import train
@@ -11,10 +12,12 @@ from avatar.training.trainer import Trainer
 from capture.source_opening import open_source
 from capture.video_writer import H264, write_video
 from instant_avatar import ingest
+from instant_avatar.cli.console import Console
 from instant_avatar.evaluation.evaluation_frames import held_out_frames
 from instant_avatar.run import person_tracking, run_tracking
 from instant_avatar.run.run_folder import RunFolder
 from preprocess import tracked_stream
+from preprocess.capture_inputs import CaptureInputs
 from preprocess.fitting import tracked_frames
 from preprocess.masks.mask_refinement import MaskRefiner
 from preprocess.poses.pose_format_registry import read_poses
@@ -111,15 +114,33 @@ class CountingTracker(BlazePoseTracker):
 
 
 @pytest.mark.usefixtures("without_baking")
-def test_an_interrupted_tracking_leaves_nothing_and_can_be_repeated(ingest_video, monkeypatch):
+def test_ctrl_c_keeps_the_frames_that_were_tracked(ingest_video, monkeypatch):
     monkeypatch.setattr(CountingTracker, "frames", 0)
     monkeypatch.setattr(person_tracking, "make_tracker", lambda name, person: CountingTracker())
     done, out = ingest_video()
     assert done.code == 130
-    again, out = ingest_video()
+    assert "9 tracked frames are kept" in done.complaint()
+    assert "--resume" in done.complaint()
+    first = read_poses(out / "tracking" / "poses.npz").keypoints
+    again, out = ingest_video("--resume")
     assert again.code == 0, again.err
-    frames = read_poses(out / "tracking" / "poses.npz").keypoints.frames
-    assert frames.tolist() == list(range(20))
+    assert CountingTracker.frames == 9 + 1 + 11  # the ninth again: is it the same person?
+    all_frames = read_poses(out / "tracking" / "poses.npz").keypoints
+    assert all_frames.frames.tolist() == list(range(20))
+    np.testing.assert_array_equal(all_frames.image_px[:9], first.image_px)
+    assert len(list((out / "tracking" / "masks").glob("*.png"))) == 20
+
+
+def test_a_resumed_run_does_not_join_two_persons(video, tmp_path, monkeypatch):
+    poses = tmp_path / "out" / "poses.npz"
+    inputs = CaptureInputs(video=video, frames=slice(0, 8))
+    person_tracking.track_person(inputs, poses, Console())
+    monkeypatch.setattr(person_tracking, "SAME_PERSON", 0.0)
+    monkeypatch.setattr(person_tracking, "make_tracker", lambda name, person: CountingTracker())
+    monkeypatch.setattr(CountingTracker, "frames", 10)
+    inputs = CaptureInputs(video=video, frames=slice(0, 10))
+    person_tracking.track_person(inputs, poses, Console(), resume=True)
+    assert CountingTracker.frames == 10 + 1 + 10  # all once more
 
 
 @pytest.mark.slow
