@@ -24,8 +24,7 @@ from benchmarks.hardware import Hardware
 from capture.camera import Camera
 from capture.input_error import InputError
 from instant_avatar.studio.shoot import ShootConfig, film_capture
-from preprocess.alignment.capture_geometry import CaptureGeometry
-from preprocess.alignment.mask_alignment import body_height_m, rescale_motion, scale_to_height
+from preprocess.alignment.capture_geometry import CaptureGeometry, rescale_motion
 from preprocess.cameras.camera_file import CameraTrack, read_cameras
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.capture_session import Capture
@@ -165,10 +164,10 @@ def scale_errors_by_height(capture: Path) -> tuple[float, float]:
     """Errors of the scale if the tracker's body is too tall: without, and with the height."""
     solved, _ = solve_film(capture)
     plain = open_unsolved(capture)
-    tall = body_height_m(plain.shaped)
+    tall = plain.shaped.height_m
 
     def sized(recording: Capture, height_m: float) -> Capture:
-        body = scale_to_height(recording.shaped, height_m)
+        body = recording.shaped.scaled_to(height_m)
         claim = CaptureGeometry.of(recording.motion, recording.cameras, recording.source)
         return replace(recording, shaped=body, motion=rescale_motion(claim, recording.shaped, body))
 

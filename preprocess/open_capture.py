@@ -10,13 +10,7 @@ from pathlib import Path
 from capture.input_error import InputError
 from capture.source import FrameSource, PacingClock, RealtimePlayback, TransposedSource
 from capture.source_opening import open_live_source, open_source
-from preprocess.alignment.capture_alignment import (
-    BodyAlignment,
-    estimate_focal_length,
-    fit_person,
-    place_motion,
-)
-from preprocess.alignment.capture_evidence import CaptureEvidence
+from preprocess.alignment.capture_geometry import CaptureGeometry, rescale_motion
 from preprocess.body.body_pose import Motion
 from preprocess.body.parametric_body import (
     BodyModel,
@@ -24,7 +18,9 @@ from preprocess.body.parametric_body import (
     load_body_model,
     read_shaped_body,
 )
+from preprocess.body.proportion_space import shape_for_motion
 from preprocess.cameras.camera_file import (
+    ASSUMED_CAMERA_SOURCE,
     CameraTrack,
     assume_camera,
     assume_static_camera,
@@ -36,9 +32,9 @@ from preprocess.capture_paths import (
     find_capture_paths,
     find_own_masks,
     find_own_poses,
-    find_stream_cameras,
 )
 from preprocess.capture_session import Capture, Provenance
+from preprocess.fitting.coarse_start import start_distances, start_focal_length
 from preprocess.masks.mask_files import Masks, open_masks
 from preprocess.masks.mask_refinement import GivenMaskRefiner
 from preprocess.masks.mask_sources import (
@@ -54,6 +50,7 @@ from preprocess.plugins import (
     make_segmenter,
     segmenter_name,
 )
+from preprocess.poses.motion_builder import place_in_camera_world
 from preprocess.poses.plausibility import (
     lost_pose_warnings,
     plausibility_warnings,
@@ -67,6 +64,11 @@ from preprocess.tracked_stream import (
     TrackedStream,
 )
 from preprocess.tracking.video_tracking import MaskRefinement
+
+HEIGHT_TOLERANCE_M = 0.015
+"""Largest difference between a stated height and the avatar's own, metres."""
+MAX_HEIGHT_DIFFERENCE = 0.08
+"""Relative difference in height beyond which it may not be the same person."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -125,7 +127,7 @@ def read_capture(inputs: CaptureInputs) -> ImportedCapture:
     paths = find_capture_paths(inputs.video, inputs.poses, named_masks, inputs.cameras)
     source = open_source(paths.video, frames=inputs.frames, rotate=inputs.rotate)
     body = load_body_model(inputs.body)
-    motion = read_poses(paths.poses, default_model=body.family, person=inputs.person)
+    motion = read_poses(paths.poses, person=inputs.person)
     return import_capture(inputs, paths, source, body, motion)
 
 
@@ -168,69 +170,106 @@ def align_capture(
     Raises:
         InputError: If they do not fit together.
     """
-    source, motion = imported.source, imported.motion
+    motion = imported.motion
     warnings: tuple[str, ...] = ()
     if not skip_checks:
         warnings = tuple(plausibility_warnings(motion))
         motion = require_plausible(motion, imported.paths.poses)
-    given = imported.given_masks()
-    fit, cameras = _align(imported, motion, given, avatar_body)
-    masks = given or _estimated_masks(imported.segmenter, fit.shaped)
-    capture = Capture(
-        paths=imported.paths,
-        source=source,
-        motion=fit.motion,
-        masks=masks,
-        cameras=cameras,
-        shaped=fit.shaped,
-        size_px=size_px or max(source.size_px),
-        provenance=(
-            *imported.provenance,
-            Provenance(
-                "poses",
-                imported.paths.poses.name,
-                (fit.motion.note, *lost_pose_warnings(motion), *warnings),
-                uncertainty=0.0 if motion.proportions is None else 1.0,
-            ),
-            Provenance("cameras", cameras.source, (cameras.note,)),
-            _mask_provenance(masks, imported.segmenter),
-            _body_provenance(fit),
-        ),
+    capture = _place(imported, motion, avatar_body, size_px or max(imported.source.size_px))
+    poses = Provenance(
+        "poses",
+        imported.paths.poses.name,
+        (motion.note, *lost_pose_warnings(motion), *warnings),
+        uncertainty=0.0 if motion.proportions is None else 1.0,
     )
+    cameras = Provenance("cameras", capture.cameras.source, (capture.cameras.note,))
+    masks = _mask_provenance(capture.masks, imported.segmenter)
+    made = (*imported.provenance, poses, cameras, masks, *capture.provenance)
+    capture = replace(capture, provenance=made)
     if not skip_checks:
         capture.check()
     return capture
 
 
-def _align(
-    imported: ImportedCapture, motion: Motion, given: GivenMasks | None, avatar_body: Path | None
-) -> tuple[BodyAlignment, CameraTrack]:
-    """Place poses in the cameras' world, and fit body, distance and an unknown focal length."""
+def _place(
+    imported: ImportedCapture, motion: Motion, avatar_body: Path | None, size_px: int
+) -> Capture:
+    """Join the parts in the cameras' world, with the person, distances and focal length meant.
+
+    Poses of another body model have another size, and those of an added video another person's.
+    """
     source, named = imported.source, imported.paths.cameras
     cameras = (
         assume_static_camera(motion, source.size_px)
         if named is None
         else read_cameras(named, source.size_px, source)
     )
-    evidence, is_given = CaptureEvidence(source, given, cameras), named is not None
-    motion, shaped = place_motion(motion, imported.body, evidence, cameras_given=is_given)
-    if not is_given and motion.intrinsic is None and motion.assumed_focal is None:
-        cameras = estimate_focal_length(evidence, motion, shaped)
-        evidence = evidence._replace(cameras=cameras)
-    height_m = imported.inputs.height_m
-    fit = fit_person(motion, shaped, evidence, avatar_body=avatar_body, height_m=height_m)
-    return fit, cameras
-
-
-def _body_provenance(fit: BodyAlignment) -> Provenance:
-    family, note = fit.shaped.body.family, fit.description
-    if fit.motion.body_model != family:
+    posed = shape_for_motion(imported.body, motion)
+    motion = place_in_camera_world(motion, posed, cameras, cameras_given=named is not None)
+    person = _find_person(posed, imported.inputs, cameras, avatar_body)
+    is_foreign = posed.body.family not in ("smpl", motion.body_model)
+    is_other = not person.is_same_person(posed)
+    if is_other:
+        motion = rescale_motion(CaptureGeometry.of(motion, cameras, source), posed, person)
+    given = imported.given_masks()
+    capture = Capture(
+        paths=imported.paths, source=source, motion=motion,
+        masks=given or _estimated_masks(imported.segmenter, person),
+        cameras=cameras, shaped=person, size_px=size_px, provenance=(),
+    )  # fmt: skip
+    note, figures = "", None
+    if is_other and avatar_body is not None and not is_foreign:
+        note = _describe_difference(posed, person)
+    if is_foreign:
         note = (
-            f"The poses were made for the body model {fit.motion.body_model!r}, but {family!r} is "
-            f"used (--body), with joints where the mean shape has them. {note}".strip()
+            f"The poses were made for the body model {motion.body_model!r}, but "
+            f"{posed.body.family!r} is used (--body), with joints where the mean shape has them."
         )
-    figures = None if fit.placement is None else fit.placement.as_json()
-    return Provenance("body", family, (note,), figures=figures)
+    if is_foreign or (is_other and avatar_body is not None and given is not None):
+        own = None if is_other else posed.body.with_shape()
+        capture, said, figures = start_distances(capture, own=own)
+        note = f"{note} {said}".strip()
+    elif given is not None and cameras.source == ASSUMED_CAMERA_SOURCE:
+        capture = start_focal_length(capture)
+    if given is None and is_foreign:  # those estimated before do not count
+        capture = replace(capture, masks=_estimated_masks(imported.segmenter, capture.shaped))
+    return replace(
+        capture, provenance=(Provenance("body", person.body.family, (note,), figures=figures),)
+    )
+
+
+def _find_person(
+    posed: ShapedBody, inputs: CaptureInputs, cameras: CameraTrack, avatar_body: Path | None
+) -> ShapedBody:
+    """The person of a finished avatar, or that of the poses, of a height that may be stated."""
+    height_m = inputs.height_m
+    if avatar_body is None:
+        if height_m is None:
+            return posed
+        if not cameras.is_moving:
+            return posed.scaled_to(height_m)
+        raise InputError(
+            f"--height-cm contradicts {cameras.source}, whose cameras move through a world of a "
+            "size of its own. Leave one of them out."
+        )
+    person = read_shaped_body(avatar_body, posed.body)
+    if height_m is not None and abs(height_m - person.height_m) > HEIGHT_TOLERANCE_M:
+        raise InputError(
+            f"--height-cm is {100.0 * height_m:.0f}, but the avatar in --out is "
+            f"{100.0 * person.height_m:.0f} cm tall, which was settled by its first video. Leave "
+            "it out, or train it from the start (--overwrite)."
+        )
+    return person
+
+
+def _describe_difference(posed: ShapedBody, person: ShapedBody) -> str:
+    """Describe how the poses' body differs from the avatar's."""
+    ratio = posed.height_m / person.height_m
+    doubt = " Is it the same person?" if abs(ratio - 1.0) > MAX_HEIGHT_DIFFERENCE else ""
+    return (
+        f"Their betas state a body of {100.0 * posed.height_m:.0f} cm, the avatar's has "
+        f"{100.0 * person.height_m:.0f} cm: it keeps its own, and these poses follow.{doubt}"
+    )
 
 
 def _mask_provenance(masks: MaskSource, segmenter: str | None) -> Provenance:
@@ -294,7 +333,6 @@ def open_tracked_stream(
         shaped,
         assume_camera(inputs.video, inputs.cameras, tracking.stream),
         fixed_body=avatar_body is not None,
-        stated_focal=find_stream_cameras(inputs.video, inputs.cameras) is not None,
     )
     masks: MaskSource = TrackedMasks(tracking, make_refinement(source.size_px))
     made = Provenance("masks", masks.origin, uncertainty=1.0)

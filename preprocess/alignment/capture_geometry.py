@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from capture.camera import Camera
 from capture.source import FrameSource
 from preprocess.body.body_pose import Motion
+from preprocess.body.parametric_body import ShapedBody
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.poses.plausibility import lost_pose_warnings, plausibility_warnings
 
@@ -189,6 +190,18 @@ def _row_frames(motion: Motion, source: FrameSource) -> Float[np.ndarray, "poses
     if abs(len(motion) - source.frames_in_file) <= abs(len(motion) - wanted):
         return rows
     return source.selection.start + rows * source.selection.step
+
+
+def rescale_motion(geometry: CaptureGeometry, shaped: ShapedBody, resized: ShapedBody) -> Motion:
+    """Move a motion so that a resized body looks the same from its cameras.
+
+    The poses were made for `shaped`; distances from the camera grow with the body.
+    """
+    factor = resized.height_m / shaped.height_m
+    eyes = geometry.camera_centers()[geometry.camera_rows()]
+    pelves = shaped.joints[0] + geometry.motion.root_translations
+    moved = eyes + factor * (pelves - eyes)
+    return replace(geometry.motion, root_translations=moved - resized.joints[0])
 
 
 def relative_change(before: CaptureGeometry, after: CaptureGeometry) -> float:

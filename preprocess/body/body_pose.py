@@ -74,7 +74,6 @@ class Motion:
         valid: Which rows may be used (finite, and not marked as lost by the tracker).
         betas: Shape coefficients; they are valid only for the body family named in `body_model`.
         body_model: Body family whose tracker made the poses: "smpl" or "body24".
-        model_is_stated: Whether the file names that family; if not, it is a guess.
         frames: Index of the video frame that each row belongs to, if the file says so.
         times_s: Time of each row in seconds, if the file says so.
         intrinsic: The tracker's own camera matrix K, if the file holds one.
@@ -97,7 +96,6 @@ class Motion:
     valid: Bool[np.ndarray, "poses"]
     betas: Float[np.ndarray, "betas"]
     body_model: str
-    model_is_stated: bool = True
     frames: Int[np.ndarray, "poses"] | None = None
     times_s: Float[np.ndarray, "poses"] | None = None
     intrinsic: Float[np.ndarray, "3 3"] | None = None

@@ -4,7 +4,7 @@ Models are read from SMPL's keys (.npz or .pkl); the resting body of an avatar i
 """
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -52,6 +52,10 @@ class BodyModel:
         return ShapedBody(body=self, vertices=vertices, joints=joints)
 
 
+SAME_SHAPE_M = 5e-4
+"""Largest distance between the resting surfaces of bodies that are the same, metres."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShapedBody:
     """One person's body at rest: vertices and joints in metres.
@@ -62,6 +66,26 @@ class ShapedBody:
     body: BodyModel
     vertices: Float[np.ndarray, "vertices 3"]
     joints: Float[np.ndarray, "24 3"]
+
+    @property
+    def height_m(self) -> float:
+        """Height from the soles to the crown at rest, metres: barefoot, without hair."""
+        return float(np.ptp(self.vertices[:, 1]))
+
+    def scaled_to(self, height_m: float) -> "ShapedBody":
+        """This person with another height; proportions stay."""
+        factor, body = height_m / self.height_m, self.body
+        directions = body.pose_directions
+        if directions is not None:
+            body = replace(body, pose_directions=factor * directions)
+        return ShapedBody(body=body, vertices=factor * self.vertices, joints=factor * self.joints)
+
+    def is_same_person(self, other: "ShapedBody") -> bool:
+        """Check whether two shapes of one body model are the same person."""
+        pairs = ((self.vertices, other.vertices), (self.joints, other.joints))
+        return self.vertices.shape == other.vertices.shape and all(
+            bool(np.abs(one - another).max() < SAME_SHAPE_M) for one, another in pairs
+        )
 
     def with_pose(self, pose: BodyPose) -> "PosedBody":
         """This person in one pose."""

@@ -11,24 +11,13 @@ import numpy as np
 from jaxtyping import Float
 
 from capture.source import FrameSource
-from capture.source_opening import reopen
-from preprocess.alignment.capture_evidence import CaptureEvidence
-from preprocess.alignment.capture_geometry import CaptureGeometry
-from preprocess.alignment.mask_alignment import body_height_m, rescale_motion, scale_to_height
-from preprocess.alignment.silhouette_objective import (
-    MaskSample,
-    SilhouetteObjective,
-    reduce_masks,
-)
+from preprocess.alignment.capture_geometry import CaptureGeometry, rescale_motion
 from preprocess.body.body_pose import Motion
-from preprocess.body.body_surface import SkinPoints
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.proportion_space import SIGMA_BETA, ProportionSpace
 from preprocess.capture_session import Capture, Provenance
 from preprocess.fitting.capture_fit import CaptureFit
 from preprocess.fitting.clip_fitting import (
-    SIGMA_LOG_ASSUMED_FOCAL,
-    SIGMA_LOG_FOCAL,
     TRACKED_WEIGHTS,
     USUAL_WEIGHTS,
     ClipFitter,
@@ -38,7 +27,8 @@ from preprocess.fitting.clip_fitting import (
 )
 from preprocess.fitting.keypoint_poses import blend_poses, weigh_keypoint_poses
 from preprocess.fitting.outlines import OUTLINE_PERSON_PX, OutlineDistances
-from preprocess.observation import Observation, associate_cameras
+from preprocess.fitting.silhouettes import read_silhouettes
+from preprocess.observation import associate_cameras
 
 KEY_FRAMES = 50
 """Frames, evenly spread, whose masks are fitted."""
@@ -86,9 +76,9 @@ def apply_fit(capture: Capture, fit: CaptureFit, *, height_m: float | None = Non
     motion, cameras = fit.correct_motion(geometry), fit.scale_focal_lengths(capture.cameras)
     shaped = fit.shape(capture.shaped) if fit.fits_body else capture.shaped
     if height_m is None and not cameras.is_moving:
-        height_m = body_height_m(shaped) * _size_ratio(capture.shaped, shaped)
+        height_m = shaped.height_m * _size_ratio(capture.shaped, shaped)
     if height_m is not None and fit.fits_body:
-        sized = scale_to_height(shaped, height_m)
+        sized = shaped.scaled_to(height_m)
         there = CaptureGeometry.of(motion, cameras, capture.source)
         motion, shaped = rescale_motion(there, shaped, sized), sized
     return capture.with_part(
@@ -147,7 +137,7 @@ def _take_keypoints(capture: Capture, fitter: ClipFitter, share: float) -> float
     if evidence is None:
         return 0.0
     turns, weight = fitter.camera_rotations, evidence.weight
-    fitter.expect(blend_poses(fitter.given, evidence.poses, weight, turns))
+    fitter.expect(blend_poses(fitter.given, fitter.as_stated(evidence.poses), weight, turns))
     fitter.poses = blend_poses(fitter.poses, evidence.poses, weight, turns)
     for _ in range(BLENDED_ITERATIONS):
         fitter.iterate(FitParameters(proportions=False, focal=False))
@@ -215,7 +205,6 @@ def make_fitter(capture: Capture) -> ClipFitter | None:
         space,
         frames,
         track=track,
-        sigma_log_focal=SIGMA_LOG_FOCAL if capture.paths.cameras else SIGMA_LOG_ASSUMED_FOCAL,
         frames_per_prior=TRACKED_FRAMES_PER_PRIOR,
         weights=TRACKED_WEIGHTS if outlines else USUAL_WEIGHTS,
     )
@@ -254,46 +243,13 @@ def _read_outlines(
     capture: Capture, geometry: CaptureGeometry, count: int
 ) -> dict[int, OutlineDistances]:
     """Outlines of evenly spread masks, by frame."""
-    objective = _observe_silhouettes(capture, count)
-    if objective is None and capture.masks.is_given:
-        evidence = CaptureEvidence(capture.source, capture.masks, capture.cameras)
-        skin = SkinPoints.of(capture.shaped, 1)
-        objective = evidence.silhouettes(skin, geometry, count, OUTLINE_PERSON_PX)
-    if objective is None:
-        return {}
     return {
         sample.index: OutlineDistances.of(
-            sample.alpha, geometry.camera_at(sample.camera_row, objective.size_px)
+            sample.alpha, geometry.camera_at(sample.camera_row, sample.alpha.shape[::-1])
         )
-        for sample in objective.samples
+        for sample in read_silhouettes(capture, count)
         if geometry.row_for_frame(sample.index) is not None
     }
-
-
-def _observe_silhouettes(capture: Capture, count: int) -> SilhouetteObjective | None:
-    """Estimated or refined masks of evenly spread frames, which are decoded.
-
-    What refines masks then knows the background from the video's first frame on. None if there is
-    no such mask: given ones that stay as they are can be read without frames.
-    """
-    masks, tracked = capture.masks, capture.motion.keypoints is not None
-    if masks.is_given and (tracked or not masks.needs_all_frames):
-        return None
-    source, observe = capture.source, capture.observation_builder()
-    chosen, camera_row = source.selection, associate_cameras(capture.cameras, source)
-    stride = chosen.step * max(1, -(-(source.frame_count or 1) // count))
-    some = slice(chosen.start + stride // 2 // chosen.step * chosen.step, chosen.stop, stride)
-    samples = []
-    for each in map(observe, reopen(source, some).frames()):
-        if isinstance(each, Observation):
-            index = each.frame.index
-            samples.append(MaskSample(index=index, camera_row=camera_row(index), alpha=each.alpha))
-        if not masks.needs_all_frames:
-            return None
-    if not samples or (masks.is_given and not masks.is_refined):
-        return None
-    samples = reduce_masks(samples, source.size_px, OUTLINE_PERSON_PX)
-    return SilhouetteObjective(samples=samples, skin=SkinPoints.of(capture.shaped, 1))
 
 
 def _reduction(capture: Capture, fitter: ClipFitter) -> float:

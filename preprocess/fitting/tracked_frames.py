@@ -19,7 +19,6 @@ from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.fitting.clip_fitting import (
-    SIGMA_LOG_ASSUMED_FOCAL,
     TRACKED_WEIGHTS,
     USUAL_WEIGHTS,
     ClipFitter,
@@ -74,19 +73,17 @@ def fit_first_frames(
     camera: Camera,
     *,
     fixed: bool = False,
-    sigma_log_focal: float = SIGMA_LOG_ASSUMED_FOCAL,
 ) -> tuple[Motion, ShapedBody, Camera]:
     """Fit proportions, focal length and poses to the first frames of a stream.
 
     Args:
         shaped: The body's mean shape, or (`fixed`) the person, whose proportions stay.
         camera: Camera of the frames, whose focal length is not exact.
-        sigma_log_focal: Prior standard deviation of the focal length's logarithm.
     """
     space = ProportionSpace.around(shaped)
     fitter = _fitter(
         seen, None, OutlineModel(space), camera, range(len(seen)),
-        sigma_log_focal=sigma_log_focal, weights=USUAL_WEIGHTS,
+        weights=USUAL_WEIGHTS,
     )  # fmt: skip
     everything = FitParameters(proportions=not fixed)
     for _ in range(FIRST_ITERATIONS[0]):
@@ -216,7 +213,6 @@ def _fitter(
     camera: Camera,
     outlined: Collection[int],
     *,
-    sigma_log_focal: float = SIGMA_LOG_ASSUMED_FOCAL,
     weights: EvidenceWeights = TRACKED_WEIGHTS,
 ) -> ClipFitter:
     """The fit of some frames, of which those at some places are compared with their masks."""
@@ -238,7 +234,7 @@ def _fitter(
     return ClipFitter(
         motion, model.space, frames, model=model, track=_track(seen, camera),
         settled=poses is not None,
-        sigma_log_focal=sigma_log_focal, weights=weights,
+        weights=weights,
     )  # fmt: skip
 
 

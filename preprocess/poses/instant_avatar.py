@@ -60,7 +60,7 @@ SCALE_TOLERANCE = 0.01
 """A stated scale that is nearer to 1 says nothing."""
 
 
-def parse_instant_avatar(content: Any, path: Path, default_model: str) -> MotionByPerson | None:
+def parse_instant_avatar(content: Any, path: Path) -> MotionByPerson | None:
     """The person of the file; None if it has other keys."""
     if not isinstance(content, dict):
         return None
@@ -74,10 +74,9 @@ def parse_instant_avatar(content: Any, path: Path, default_model: str) -> Motion
             beside |= content["camera"]
         around = normalize_keys(beside)
         named |= {key: around[key] for key in SIBLING_KEYS if key in around and key not in named}
-        named.setdefault("model", "smpl")
     if not any(set(keys) <= named.keys() for keys in POSE_KEY_LAYOUTS):
         return None
-    motion = motion_from_arrays(collect_arrays(named, path), path, default_model=default_model)
+    motion = motion_from_arrays(collect_arrays(named, path), path)
     if "global_t" in held:
         motion = replace(motion, assumed_focal=CLIFF_FOCAL, space="camera")
     return {"0": motion}
@@ -86,24 +85,19 @@ def parse_instant_avatar(content: Any, path: Path, default_model: str) -> Motion
 def normalize_keys(held: Mapping[Any, Any]) -> dict[str, Any]:
     """Rename other programs' keys to ours, where ours are missing.
 
-    The body model follows from other keys: hands and face are SMPL-X's; a gender, or other names,
-    mean SMPL.
+    The body model follows from other keys: hands and face are SMPL-X's.
     """
     found = {str(key): value for key, value in held.items() if value is not None}
-    foreign, ours = False, any(set(keys) <= found.keys() for keys in POSE_KEY_LAYOUTS)
     for key, others in KEY_ALIASES.items():
         known = next((other for other in others if other in found), None)
         if key not in found and known is not None and not isinstance(found[known], dict):
             found[key] = found[known]
-            foreign = not ours
     if "K" not in found and {"focal", "princpt"} <= found.keys():
         found["K"] = _intrinsic_matrix(found["focal"], found["princpt"])
     if "model" not in found:
         kind = str(found.get("surface_model_type", "")).replace("-", "").lower()
         if SMPLX_KEYS & found.keys() or "smplx" in kind:
             found["model"] = "smplx"
-        elif "gender" in found or foreign:
-            found["model"] = "smpl"  # only our own programs know the embedded body
     return found
 
 
@@ -155,7 +149,7 @@ ROW_KEYS = (*ROTATION_KEYS, *ROW_SHAPES, "frame", "time", "valid")
 """All keys that are read of one row."""
 
 
-def parse_per_frame(content: Any, path: Path, default_model: str) -> MotionByPerson | None:
+def parse_per_frame(content: Any, path: Path) -> MotionByPerson | None:
     """The people of the folder or file; None if it does not hold a pose an item."""
     if isinstance(content, list):
         content = {str(row): item for row, item in enumerate(content)}
@@ -169,8 +163,7 @@ def parse_per_frame(content: Any, path: Path, default_model: str) -> MotionByPer
     for (person, number), item in zip(_person_and_frame(poses), poses.values(), strict=True):
         people.setdefault(str(item.get("id", person)), []).append((number, item))
     return {
-        name: motion_from_arrays(_stack_items(rows, path), path, default_model=default_model)
-        for name, rows in people.items()
+        name: motion_from_arrays(_stack_items(rows, path), path) for name, rows in people.items()
     }
 
 

@@ -30,12 +30,12 @@ MAX_PROPORTION = 100.0
 Arrays = dict[str, Shaped[np.ndarray, "..."]]
 
 
-def motion_from_arrays(arrays: Arrays, path: Path, *, default_model: str = "body24") -> Motion:
+def motion_from_arrays(arrays: Arrays, path: Path) -> Motion:
     """The poses in the arrays of a file: axis-angles and metres, one row a pose.
 
     Keys: global_orient (N, 3) and body_pose (N, 69), or thetas or poses (N, 72); transl or trans
     (N, 3); optional betas (B,), (1, B) or (N, B), frame (N), time (N), valid (N), K (3, 3) or
-    (N, 3, 3), camera (4, 4) or (N, 4, 4) camera-from-world, model (else `default_model`), space
+    (N, 3, 3), camera (4, 4) or (N, 4, 4) camera-from-world, model (else SMPL's), space
     ("world", or "camera": each row is in the camera of its frame), proportions (see `Motion`), and
     the arrays of `KeypointTrack`. Rows with NaN are marked as not valid. Rotations may be 3x3
     matrices; a body_pose of 63 numbers has no hands.
@@ -43,10 +43,10 @@ def motion_from_arrays(arrays: Arrays, path: Path, *, default_model: str = "body
     An InputError names the file and the key that holds something else.
     """
     with explain_damage(path, "poses"):
-        return _motion(arrays, default_model)
+        return _motion(arrays)
 
 
-def _motion(arrays: Arrays, default_model: str) -> Motion:
+def _motion(arrays: Arrays) -> Motion:
     layout = next((keys for keys in POSE_KEY_LAYOUTS if set(keys) <= arrays.keys()), None)
     if layout is None:
         expected = "; or ".join(" and ".join(keys) for keys in POSE_KEY_LAYOUTS)
@@ -71,8 +71,7 @@ def _motion(arrays: Arrays, default_model: str) -> Motion:
         joint_rotations=poses[:, 3:].reshape(count, 23, 3),
         valid=_valid(arrays, np.column_stack([poses, translations]), times),
         betas=_betas(arrays),
-        body_model=str(arrays["model"]) if "model" in arrays else default_model,
-        model_is_stated="model" in arrays,
+        body_model=str(arrays["model"]) if "model" in arrays else "smpl",
         frames=_frame_numbers(arrays, count),
         times_s=times,
         intrinsic=_intrinsic(arrays),

@@ -34,7 +34,6 @@ TRACKERS: dict[str, Callable[[Any, bool], MotionByPerson | None]] = {
 def read_poses(
     path: Path,
     *,
-    default_model: str = "body24",
     person: str | None = None,
     prefer_world: bool = False,
 ) -> Motion:
@@ -46,14 +45,13 @@ def read_poses(
 
     Args:
         path: The file or folder; of a capture folder the poses in it.
-        default_model: Body family of files that do not say theirs.
         person: Whose poses, by the file's own number or name.
         prefer_world: Reads poses in the world rather than in a camera, to drive an avatar.
     """
     path = resolve_pose_path(path)
     refuse_pipe(path)
     content = read_untrusted_file(path)
-    tool, people = _recognize(content, path, default_model, prefer_world)
+    tool, people = _recognize(content, path, prefer_world)
     motion = _select_person(people, person, path)
     if tool is None:
         return motion
@@ -68,20 +66,18 @@ def read_poses(
     return replace(whole, note=note)
 
 
-def _recognize(
-    content: Any, path: Path, default_model: str, driving: bool
-) -> tuple[str | None, MotionByPerson]:
+def _recognize(content: Any, path: Path, driving: bool) -> tuple[str | None, MotionByPerson]:
     """The tracker of the file (None: in our own keys), and the people in it."""
     for tool, tracks in TRACKERS.items():
         with explain_damage(path, f"a file of {tool}"):
             people = tracks(content, driving)
         if people:
             return tool, people
-    people = parse_instant_avatar(content, path, default_model)
+    people = parse_instant_avatar(content, path)
     if people is not None:
         return None, people
     with explain_damage(path, "a pose a frame"):
-        people = parse_per_frame(content, path, default_model)
+        people = parse_per_frame(content, path)
     if people is None:
         raise InputError(
             f"{path} holds no poses that are known: {_describe_content(content)}. Expected "

@@ -12,7 +12,6 @@ from capture.input_error import InputError
 from export.bake.bake_tables import ExportRefused
 from instant_avatar.run import run_capture
 from instant_avatar.studio.shoot import ShootConfig, film_capture
-from preprocess.alignment.mask_alignment import body_height_m
 from preprocess.cameras.camera_file import read_cameras, write_cameras
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.open_capture import open_capture
@@ -139,9 +138,9 @@ def test_a_camera_that_only_turns_stays_in_one_place_of_a_metric_world(walkaroun
 
 def test_a_stated_height_is_the_size_of_everything(walkaround, solution):
     plain = open_capture(inputs_of(walkaround))
-    tall = body_height_m(plain.shaped)
+    tall = plain.shaped.height_m
     taller = open_capture(inputs_of(walkaround, height_m=1.1 * tall))
-    assert body_height_m(taller.shaped) == pytest.approx(1.1 * tall)
+    assert taller.shaped.height_m == pytest.approx(1.1 * tall)
     for row in (0, 9):  # pictures cannot tell
         np.testing.assert_allclose(
             taller.cameras[0].project(taller.shaped.with_pose(taller.motion[row]).joints()),

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from avatar.training import checkpoint
-from preprocess.alignment.mask_alignment import body_height_m
 from preprocess.body.parametric_body import load_body_model, read_shaped_body
 
 GIVEN = "--no-refine-poses"
@@ -63,11 +62,11 @@ def test_an_added_video_keeps_the_avatars_body_and_says_how_its_own_differs(
     betas = np.zeros(10)
     betas[0] = 3.0
     stated = body.with_shape(betas)
-    assert abs(body_height_m(stated) - body_height_m(person)) > 0.02
+    assert abs(stated.height_m - person.height_m) > 0.02
     changed(other / "poses.npz", betas=betas)
     outcome = call_ingest(other, "--out", out, "--resume", *FEW)
     assert outcome.code == 0
-    assert f"state a body of {100 * body_height_m(stated):.0f} cm" in " ".join(outcome.err.split())
+    assert f"state a body of {100 * stated.height_m:.0f} cm" in " ".join(outcome.err.split())
     kept = read_shaped_body(out / "checkpoint" / "person.npz", body)
     np.testing.assert_array_equal(kept.vertices, person.vertices)
     trainer, _ = checkpoint.load(out / "checkpoint")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from capture.input_error import InputError
-from preprocess.body.parametric_body import load_body_model
+from preprocess.body.parametric_body import load_body_model, smpl_rest_joints, with_smpl_joints
 from preprocess.body.proportion_space import ProportionSpace, shape_for_motion
 
 
@@ -26,3 +26,18 @@ def test_fitted_proportions_are_the_persons_shape_whatever_the_betas(motion):
 def test_proportions_of_another_body_are_refused(motion):
     with pytest.raises(InputError, match="7 proportions"):
         shape_for_motion(load_body_model(), replace(motion, proportions=np.zeros(7)))
+
+
+def test_the_bodys_joints_move_exactly_as_smpls_do(motion):
+    shaped = shape_for_motion(load_body_model(), replace(motion, body_model="smpl"))
+    offset = shaped.joints - smpl_rest_joints()
+    np.testing.assert_allclose(offset, np.broadcast_to(offset[0], (24, 3)), atol=1e-12)
+
+
+def test_the_skin_moves_with_its_joints(shaped):
+    moved = with_smpl_joints(shaped)
+    rigid = shaped.body.weights.max(axis=1) > 0.999
+    joint = shaped.body.weights[rigid].argmax(axis=1)
+    before = shaped.vertices[rigid] - shaped.joints[joint]
+    after = moved.vertices[rigid] - moved.joints[joint]
+    np.testing.assert_allclose(after, before, atol=2e-3)

@@ -144,7 +144,7 @@ WRITERS = [
 
 @pytest.mark.parametrize("write", WRITERS, ids=lambda write: write.__name__)
 def test_a_file_gives_the_joints_that_were_written_to_a_millimetre(world, shaped, joints_of, write):
-    motion = read_poses(write(world), default_model="body24")
+    motion = read_poses(write(world))
     assert motion.body_model == ("smplx" if write in (ex_avatar, file_a_frame) else "smpl")
     assert motion.valid.all()
     motion = place_in_camera_world(motion, shaped, own_camera(motion), cameras_given=False)
@@ -199,7 +199,7 @@ def test_a_world_that_is_not_metric_is_refused(world):
 
 
 @pytest.mark.parametrize(
-    ("numbers", "model"), [(165, "smplx"), (156, "smpl"), (72, "body24")], ids=str
+    ("numbers", "model"), [(165, "smplx"), (156, "smpl"), (72, "smpl")], ids=str
 )
 def test_the_number_of_joints_tells_the_body(world, numbers, model):
     poses = np.column_stack([world.thetas[:, :66], np.zeros((40, numbers - 66))])

@@ -131,10 +131,9 @@ def test_betas_of_one_row_many_rows_or_none(write, motion):
     assert read_poses(write(betas=None)).betas.shape == (0,)
 
 
-def test_the_model_is_what_the_file_says_or_else_the_readers(write):
-    assert read_poses(write()).body_model == "body24"
-    assert read_poses(write(), default_model="smpl").body_model == "smpl"
-    assert read_poses(write(model=np.array("smpl"))).body_model == "smpl"
+def test_the_model_is_what_the_file_says_or_else_smpls(write):
+    assert read_poses(write()).body_model == "smpl"
+    assert read_poses(write(model=np.array("body24"))).body_model == "body24"
 
 
 def test_rows_with_nan_or_marked_as_lost_are_not_valid(write, motion):

@@ -347,7 +347,7 @@ def own_camera(motion: Motion) -> CameraTrack:
 def test_a_file_gives_the_joints_that_were_written_to_a_millimetre(
     world, shaped, joints_of, write, driving
 ):
-    motion = read_poses(write(world), default_model="smpl", prefer_world=driving)
+    motion = read_poses(write(world), prefer_world=driving)
     assert np.flatnonzero(motion.valid).tolist() == list(range(40))
     motion = place_in_camera_world(motion, shaped, own_camera(motion), cameras_given=False)
     away = np.linalg.norm(joints_of(motion)[:40] - joints_of(world.truth), axis=-1)
@@ -372,7 +372,7 @@ def test_rows_without_numbers_have_times_or_are_matched_by_order(world):
     [(wham, "smpl"), (easymocap, "smpl"), (gvhmr, "smplx"), (amass_smplx, "smplx")],
 )
 def test_the_body_model_is_the_trackers(world, write, model):
-    assert read_poses(write(world), default_model="body24").body_model == model
+    assert read_poses(write(world)).body_model == model
 
 
 @pytest.mark.parametrize("write", [phalp, wham, vibe, tram, romp, easymocap, instant_avatar])

@@ -1,0 +1,71 @@
+"""Small masks of frames spread over a capture: given, refined or estimated."""
+
+from contextlib import suppress
+from dataclasses import replace
+
+from capture.input_error import InputError
+from capture.source_opening import reopen
+from preprocess.alignment.silhouette_objective import MaskSample, reduce_masks, sample_masks
+from preprocess.body.body_surface import SkinPoints
+from preprocess.capture_session import Capture
+from preprocess.fitting.outlines import OUTLINE_PERSON_PX
+from preprocess.observation import Observation, associate_cameras
+
+FIRST_FRAMES = 240
+"""Frames at the beginning of a video over which the first masks are spread that are estimated:
+decoding takes longest."""
+FIRST_SIZE_PX = 320
+"""Longer side of the images in which they are estimated."""
+
+
+def read_first_silhouettes(capture: Capture, count: int) -> tuple[MaskSample, ...]:
+    """Masks as they are given, or as the beginning of the video shows them; none without any."""
+    with suppress(InputError):
+        if capture.masks.is_given:
+            return _read_given(capture, count)
+        total = min(capture.source.frame_count or 1, FIRST_FRAMES)
+        small = replace(capture, size_px=min(capture.size_px, FIRST_SIZE_PX))
+        return _observe(small, count, total)
+    return ()
+
+
+def read_silhouettes(capture: Capture, count: int) -> tuple[MaskSample, ...]:
+    """Masks as training sees them, of evenly spread frames; none without any.
+
+    Frames are decoded where masks are estimated or refined. What refines masks then knows the
+    background from the video's first frame on.
+    """
+    masks, tracked = capture.masks, capture.motion.keypoints is not None
+    with suppress(InputError):
+        if not masks.is_given or (masks.needs_all_frames and not tracked):
+            samples = _observe(capture, count, capture.source.frame_count or 1)
+            if masks.is_refined or not masks.is_given:
+                return samples
+        return _read_given(capture, count)
+    return ()
+
+
+def _read_given(capture: Capture, count: int) -> tuple[MaskSample, ...]:
+    skin = SkinPoints.of(capture.shaped, 1)
+    return sample_masks(
+        capture.source, capture.masks, capture.cameras, skin,
+        count=count, person_px=OUTLINE_PERSON_PX,
+    ).samples  # fmt: skip
+
+
+def _observe(capture: Capture, count: int, total: int) -> tuple[MaskSample, ...]:
+    """Masks of at most `count` of the first `total` frames; ends once none needs to be decoded."""
+    source, masks = capture.source, capture.masks
+    observe, camera_row = capture.observation_builder(), associate_cameras(capture.cameras, source)
+    chosen = source.selection
+    stride = chosen.step * max(1, -(-total // count))
+    start = chosen.start + stride // 2 // chosen.step * chosen.step
+    stop = chosen.start + total * chosen.step if total < (source.frame_count or 1) else chosen.stop
+    samples = []
+    for each in map(observe, reopen(source, slice(start, stop, stride)).frames()):
+        if isinstance(each, Observation):
+            index = each.frame.index
+            samples.append(MaskSample(index=index, camera_row=camera_row(index), alpha=each.alpha))
+        if not masks.needs_all_frames:
+            break
+    return reduce_masks(samples, source.size_px, OUTLINE_PERSON_PX) if samples else ()
