@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32
 
 from capture.camera import Camera
 from preprocess.alignment.capture_geometry import CaptureGeometry
-from preprocess.alignment.silhouette_objective import SilhouetteObjective, mean_score
+from preprocess.alignment.silhouette_objective import MaskSample, SilhouetteObjective, mean_score
 from preprocess.body.body_surface import NEAR_PLANE_M, SkinPoints
 from preprocess.body.kinematics import rotation_matrices
 from preprocess.body.parametric_body import ShapedBody
@@ -31,11 +31,13 @@ shift towards the camera look alike."""
 SIGMA_SIDE_PX = 3.0
 """Error of a box's side, px of the reduced masks, beyond which it counts ever less (Cauchy)."""
 MIN_AGREEMENT = 0.6
-"""Mean IoU of body and masks from which a start is taken."""
+"""Mean IoU of body and masks from which a start is taken, better than by chance."""
 MIN_GAIN = 0.01
 """Gain in mean IoU from which a start is taken."""
 
 
+MIN_OWN_GAIN = 0.02
+"""Gain in mean IoU by which the body's own proportions must beat SMPL's."""
 NO_PERSON_FOUND = (
     "There are no masks, and where the poses put the body no person was found in the images; "
     "distances stay as they are. Do poses and video belong together? Give --masks, from which "
@@ -61,19 +63,29 @@ class _Start(NamedTuple):
 
     @property
     def is_taken(self) -> bool:
-        """Whether body and masks agree better by it, and better than by chance."""
+        """Whether body and masks agree better by it, and well enough."""
         return self.after >= max(MIN_AGREEMENT, self.before + MIN_GAIN)
 
 
-def start_distances(capture: Capture) -> tuple[Capture, str, dict[str, Any] | None]:
+def start_distances(
+    capture: Capture, *, own: ShapedBody | None = None
+) -> tuple[Capture, str, dict[str, Any] | None]:
     """Divide distances from the cameras and shift the pelvis, so that the body fits the masks.
+
+    `own` is the body as it is, whose proportions are taken if they fit better than the capture's:
+    files state SMPL for poses that were fitted to another body.
 
     Returns:
         The capture, words for people, and figures for the report.
     """
-    start = _find_start(capture, by_focal_length=False)
-    if start is None:
+    samples = read_first_silhouettes(capture, START_FRAMES)
+    if not samples:
         return capture, "" if capture.masks.is_given else NO_PERSON_FOUND, None
+    start = _find_start(capture, samples, by_focal_length=False)
+    if own is not None:
+        other = _find_start(replace(capture, shaped=own), samples, by_focal_length=False)
+        if other.is_taken and other.after > start.after + MIN_OWN_GAIN:
+            capture, start = replace(capture, shaped=own), other
     moved_cm = 100.0 * float(np.linalg.norm(start.shift_m))
     figures = {
         "taken": start.is_taken,
@@ -100,7 +112,8 @@ def start_distances(capture: Capture) -> tuple[Capture, str, dict[str, Any] | No
 
 def start_focal_length(capture: Capture) -> Capture:
     """Multiply a focal length that no file states, so that the body fits the masks."""
-    start = _find_start(capture, by_focal_length=True)
+    samples = read_first_silhouettes(capture, START_FRAMES)
+    start = _find_start(capture, samples, by_focal_length=True) if samples else None
     if start is None or not start.is_taken:
         return capture
     usual_px = capture.cameras[0].focal_px[0]
@@ -114,11 +127,10 @@ def start_focal_length(capture: Capture) -> Capture:
     return replace(capture, cameras=cameras)
 
 
-def _find_start(capture: Capture, *, by_focal_length: bool) -> _Start | None:
-    """Bring the boxes of body and masks together; None if no mask can be read or estimated."""
-    samples = read_first_silhouettes(capture, START_FRAMES)
-    if not samples:
-        return None
+def _find_start(
+    capture: Capture, samples: tuple[MaskSample, ...], *, by_focal_length: bool
+) -> _Start:
+    """Bring the boxes of body and masks together."""
     objective = SilhouetteObjective(samples=samples, skin=SkinPoints.of(capture.shaped))
     stated = geometry = capture.geometry()
     magnification, shift = 1.0, np.zeros(3)
