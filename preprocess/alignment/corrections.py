@@ -12,7 +12,6 @@ from jaxtyping import Float
 
 from preprocess.alignment.capture_geometry import FULL_WINDOW, CaptureGeometry
 from preprocess.alignment.keypoint_objective import KeypointObjective
-from preprocess.alignment.silhouette_objective import SilhouetteObjective, mean_with_missing
 
 CAUSES = (
     "mask_polarity", "second_person", "world_frame", "opengl_axes", "root_rotation", "frame_offset",
@@ -198,26 +197,6 @@ def _with_intrinsics(
     intrinsics[:, [0, 1], [0, 1]] *= focal_scale
     intrinsics[:, :2, 2] += np.array(shift_px)
     return replace(geometry, intrinsics=intrinsics)
-
-
-def fit_factor(
-    make: Callable[[float], Correction], geometry: CaptureGeometry, objective: SilhouetteObjective
-) -> Correction:
-    """Fit the one factor of a correction to masks: a coarse grid, then a bounded scalar search.
-
-    `make` gives the correction of a factor (`scale_focal_length`, `divide_distances`).
-    """
-    from scipy.optimize import minimize_scalar  # 0.1 s that a capture in order does not need
-
-    logs = np.linspace(-0.8, 0.8, 9)
-
-    def loss(log: float) -> float:
-        return -mean_with_missing(objective.frame_scores(make(float(np.exp(log))).apply(geometry)))
-
-    center = float(logs[int(np.argmin([loss(log) for log in logs]))])
-    bounds = (center - 0.2, center + 0.2)
-    found = minimize_scalar(loss, bounds=bounds, method="bounded", options={"maxiter": 10})
-    return make(float(np.exp(found.x)))
 
 
 def fit_to_keypoints(
