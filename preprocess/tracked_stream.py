@@ -23,6 +23,7 @@ from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.capture_session import Capture
+from preprocess.fitting.clip_fitting import SIGMA_LOG_FOCAL, SIGMA_LOG_LIVE_FOCAL
 from preprocess.fitting.tracked_frames import (
     LAG_FRAMES,
     EarlierPoses,
@@ -141,6 +142,7 @@ class LiveTracking:
         camera: Camera,
         *,
         fixed_body: bool = False,
+        stated_focal: bool = False,
     ) -> tuple[Motion, ShapedBody, CameraTrack]:
         """Track the first frames, and fit them, the person and a static camera to each other.
 
@@ -148,6 +150,7 @@ class LiveTracking:
             shaped: The body's mean shape, or the person of a finished avatar.
             camera: Its focal length is not exact.
             fixed_body: Whether `shaped` is the person.
+            stated_focal: Whether the focal length comes from a file and is no guess.
         """
         while len(self._seen) < START_FRAMES and self.stream.take_next():
             pass
@@ -157,7 +160,10 @@ class LiveTracking:
                 f"No person was found in {self.stream.path} ({len(self.times_s)} frames were "
                 "searched). Tracking needs one person, from head to feet in the picture."
             )
-        motion, person, camera = fit_first_frames(seen, shaped, camera, fixed=fixed_body)
+        motion, person, camera = fit_first_frames(
+            seen, shaped, camera, fixed=fixed_body,
+            sigma_log_focal=SIGMA_LOG_LIVE_FOCAL if stated_focal else SIGMA_LOG_FOCAL,
+        )  # fmt: skip
         self._fitter, self._earlier = FramePoseFitter(person, camera), EarlierPoses(person, camera)
         self.stream.on_end = self._earlier.fit_rest
         for row, each in enumerate(seen):

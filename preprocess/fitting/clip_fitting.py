@@ -31,6 +31,8 @@ FRAMES_PER_PRIOR = 10.0
 SIGMA_LOG_FOCAL = 0.3
 """Prior standard deviation of the logarithm of the focal length: what files state is often the
 tracker's own guess (with 0.08 a stated one stays 1.25 times too short that is 1.38 times so)."""
+SIGMA_LOG_LIVE_FOCAL = 0.08
+"""The same of a camera file of a stream, whose first frames show the person from one side."""
 MAX_TURN_STEP_RAD = 0.25
 """Largest change of a rotation's component in one iteration, radians."""
 MAX_PLACE_STEP_M = 0.5
@@ -105,6 +107,7 @@ class ClipFitter:
         *,
         track: KeypointTrack | None = None,
         settled: bool = False,
+        sigma_log_focal: float = SIGMA_LOG_FOCAL,
         frames_per_prior: float = FRAMES_PER_PRIOR,
         weights: EvidenceWeights = USUAL_WEIGHTS,
         model: OutlineModel | None = None,
@@ -116,6 +119,7 @@ class ClipFitter:
             track: Key points, as further evidence. With them the poses are merely human; without,
                 they are near the motion's.
             settled: Whether these poses were fitted to key points before.
+            sigma_log_focal: Prior standard deviation of the focal length's logarithm.
             frames_per_prior: Frames that count as one for the proportions.
             model: The person at the space's origin, where several clips share it.
         """
@@ -125,7 +129,7 @@ class ClipFitter:
         seen = sum(frame.mask is not None for frame in frames) if track is None else len(frames)
         self._priors, self.weights = max(1.0, seen / frames_per_prior), weights
         self.coefficients = np.zeros(space.count)
-        self.log_focal = 0.0
+        self.log_focal, self._sigma_log_focal = 0.0, sigma_log_focal
         self.given = ClipPoses.of(motion, [frame.row for frame in self.frames])
         self.poses = self.given
         self.camera_rotations = np.stack(
@@ -177,7 +181,9 @@ class ClipFitter:
         steps = self._add_priors(equations, fitted)
         found, step = equations.solve()
         moved = (steps @ found[..., None])[..., 0]
-        zoom = float(np.clip(step[-1] * SIGMA_LOG_FOCAL, -MAX_LOG_FOCAL_STEP, MAX_LOG_FOCAL_STEP))
+        zoom = float(
+            np.clip(step[-1] * self._sigma_log_focal, -MAX_LOG_FOCAL_STEP, MAX_LOG_FOCAL_STEP)
+        )
         moved[:, :72] = np.clip(moved[:, :72], -MAX_TURN_STEP_RAD, MAX_TURN_STEP_RAD)
         moved[:, 72:] = np.clip(moved[:, 72:], -MAX_PLACE_STEP_M, MAX_PLACE_STEP_M)
         moved[:, 74] += zoom * self._depths_m(self.poses)  # distances go with the focal length
@@ -219,7 +225,7 @@ class ClipFitter:
             squares += float(weight @ seen.residuals**2)
             total += float(weight.sum())
             zoomed = seen.focal_jacobian + depths[index] * seen.pose_jacobian[:, 74]
-            shared = np.column_stack([seen.shape_jacobian, SIGMA_LOG_FOCAL * zoomed])
+            shared = np.column_stack([seen.shape_jacobian, self._sigma_log_focal * zoomed])
             equations.add(index, seen.pose_jacobian * POSE_SIGMA, shared, seen.residuals, weight)
         self._add_keypoints(equations, fitted.outlines)
         return equations, float(np.sqrt(squares / max(total, 1e-9)))
@@ -238,7 +244,7 @@ class ClipFitter:
         )
         depths = self._depths_m(self.poses)[:, None]
         zoomed = seen.focal_jacobian + depths * seen.pose_jacobian[..., 74]
-        focal = SIGMA_LOG_FOCAL * zoomed[..., None]
+        focal = self._sigma_log_focal * zoomed[..., None]
         equations.add_all(
             seen.pose_jacobian * POSE_SIGMA,
             np.concatenate([seen.shape_jacobian, focal], axis=-1),
@@ -255,7 +261,7 @@ class ClipFitter:
         """
         steps = self._prior.add_to(equations, self.as_stated(self.poses))
         precision = np.full(len(self.coefficients) + 1, self._priors)
-        state = np.concatenate([self.coefficients, [self.log_focal / SIGMA_LOG_FOCAL]])
+        state = np.concatenate([self.coefficients, [self.log_focal / self._sigma_log_focal]])
         equations.add_shared(precision, state)
         held = np.zeros(len(state))
         held[:-1] = 0.0 if fitted.proportions else HELD_PRECISION

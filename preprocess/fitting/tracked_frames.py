@@ -19,6 +19,7 @@ from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.fitting.clip_fitting import (
+    SIGMA_LOG_FOCAL,
     TRACKED_WEIGHTS,
     USUAL_WEIGHTS,
     ClipFitter,
@@ -73,17 +74,19 @@ def fit_first_frames(
     camera: Camera,
     *,
     fixed: bool = False,
+    sigma_log_focal: float = SIGMA_LOG_FOCAL,
 ) -> tuple[Motion, ShapedBody, Camera]:
     """Fit proportions, focal length and poses to the first frames of a stream.
 
     Args:
         shaped: The body's mean shape, or (`fixed`) the person, whose proportions stay.
         camera: Camera of the frames, whose focal length is not exact.
+        sigma_log_focal: Prior standard deviation of the focal length's logarithm.
     """
     space = ProportionSpace.around(shaped)
     fitter = _fitter(
         seen, None, OutlineModel(space), camera, range(len(seen)),
-        weights=USUAL_WEIGHTS,
+        sigma_log_focal=sigma_log_focal, weights=USUAL_WEIGHTS,
     )  # fmt: skip
     everything = FitParameters(proportions=not fixed)
     for _ in range(FIRST_ITERATIONS[0]):
@@ -213,6 +216,7 @@ def _fitter(
     camera: Camera,
     outlined: Collection[int],
     *,
+    sigma_log_focal: float = SIGMA_LOG_FOCAL,
     weights: EvidenceWeights = TRACKED_WEIGHTS,
 ) -> ClipFitter:
     """The fit of some frames, of which those at some places are compared with their masks."""
@@ -234,7 +238,7 @@ def _fitter(
     return ClipFitter(
         motion, model.space, frames, model=model, track=_track(seen, camera),
         settled=poses is not None,
-        weights=weights,
+        sigma_log_focal=sigma_log_focal, weights=weights,
     )  # fmt: skip
 
 

@@ -193,6 +193,18 @@ def test_a_finished_avatars_person_keeps_the_body(standing):
     assert np.allclose(kept.joints, person.joints)
 
 
+def test_a_stated_focal_length_changes_less_than_an_assumed_one(standing):
+    changes = []
+    for stated in (False, True):
+        stream = TrackedStream(Pictures())
+        tracking = LiveTracking(stream, Tracker(standing))
+        guess = assume_camera(Path("film.mp4"), "static", stream).scale_focal(1.3)
+        shaped = load_body_model(None).with_shape()
+        _, _, cameras = tracking.start(shaped, guess, stated_focal=stated)
+        changes.append(abs(np.log(cameras[0].focal_px[0] / guess.focal_px[0])))
+    assert changes[1] < 0.5 * changes[0]
+
+
 @pytest.mark.parametrize("beside", [False, True])
 def test_a_live_folder_takes_the_focal_length_of_a_camera_file(standing, tmp_path, beside):
     folder = tmp_path / "frames"
