@@ -20,7 +20,7 @@ demo: install
 	$(BIN)/python -m instant_avatar.ingest $(DEMO)/capture/video.mp4 --poses $(DEMO)/capture/poses.npz --out $(DEMO)/run --seconds 60 --overwrite
 	cp $(DEMO)/capture/video.mp4 $(DEMO)/video.mp4
 	$(BIN)/python -m instant_avatar.ingest $(DEMO)/video.mp4 --out $(DEMO)/from-video --seconds 60 --overwrite
-	$(BIN)/python -m instant_avatar.evaluate $(DEMO)/run $(DEMO)/from-video --markdown $(DEMO)/comparison.md --overwrite
+	$(BIN)/python -m instant_avatar.evaluate $(DEMO)/run $(DEMO)/from-video
 	$(BIN)/python -m instant_avatar.play $(DEMO)/run/avatar.iavatar --poses $(DEMO)/capture/dance.npz --out $(DEMO)/dance.mp4 --overwrite
 
 web: install # what `ia-play --web` needs: onnxruntime-web, pinned, through npm
