@@ -23,8 +23,9 @@ from jaxtyping import Bool, Float32
 from torch import Tensor
 
 from avatar.config import TrainConfig
+from avatar.kernels.numba_priors import OPACITY_LENGTH_M
 from avatar.kernels.operands import DensityGrid, HashLevels, RaySamples
-from avatar.radiance_field import OPACITY_LENGTH_M, RadianceField
+from avatar.radiance_field import RadianceField
 from avatar.rig import Rig
 from avatar.training.frame_stream import TrainingFrame
 from avatar.training.replay_buffer import TrainingBatch
