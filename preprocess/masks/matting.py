@@ -36,10 +36,7 @@ LIKELIHOOD_FLOOR = 1e-4
 LIKELIHOOD_EXPONENT = 0.6
 """Exponent of the color likelihood: errors of neighboring pixels are correlated."""
 CONTRAST = 2.0
-"""Steepening of the filtered mask around `BORDER_ALPHA`."""
-BORDER_ALPHA = 0.54
-"""Value of the filtered mask at the person's border. Masks of segmenters are too wide; by half, the
-filtered ones kept a sixth of that."""
+"""Steepening of the filtered mask around 1/2."""
 SURE_ALPHA = 0.8
 """Alpha above which a pixel teaches the person's color beside the border."""
 NEARBY_PX = 3
@@ -193,8 +190,8 @@ def apply_coefficients(
 
 
 def steepen(alpha: Plane) -> Plane:
-    """Steepen a mask around `BORDER_ALPHA`, which becomes 1/2."""
-    steep = np.float32(CONTRAST) * alpha + np.float32(0.5 - BORDER_ALPHA * CONTRAST)
+    """Steepen a mask around 1/2."""
+    steep = np.float32(CONTRAST) * alpha + np.float32(0.5 - 0.5 * CONTRAST)
     return np.clip(steep, np.float32(0.0), np.float32(1.0))
 
 

@@ -221,15 +221,6 @@ def test_given_masks_are_refined_where_they_miss_the_edges() -> None:
     assert "--no-refine-masks" in refiner.note
 
 
-def test_masks_that_are_too_wide_keep_little_of_that() -> None:
-    """Areas are nearly the person's: what is left would be a rim of the backdrop."""
-    clip = _given_masks(GivenMaskRefiner(), wrong=True)[6:]
-    before = float(np.mean([(given - truth).sum() for given, _, truth in clip]))
-    after = float(np.mean([(found - truth).sum() for _, found, truth in clip]))
-    assert before > 500.0
-    assert abs(after) < 0.06 * before
-
-
 def test_exact_masks_stay_as_they_are() -> None:
     """No pixel of them changes."""
     refiner = GivenMaskRefiner()
