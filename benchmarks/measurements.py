@@ -10,8 +10,8 @@ class Measurement:
     Attributes:
         name: What was measured, with its unit.
         value: None where there is none.
-        least, moonshot: What was asked for; empty where nothing was.
-        beside: What to read it beside.
+        required, stretch_goal: What was asked for; empty where nothing was.
+        context: What to read it beside.
     """
 
     name: str

@@ -3,7 +3,6 @@
 import sys
 import time
 from collections.abc import Sequence
-from threading import Thread
 from typing import TYPE_CHECKING
 
 from instant_avatar.cli.command_line import (
@@ -47,17 +46,15 @@ def ingest(
         open_recording(inputs, console)  # before code is loaded that takes a second
     from instant_avatar.run.run_capture import open_observations, write_solved_cameras
 
-    loading = Thread(target=_import_trainer_code)  # while the capture is opened, on another core
-    loading.start()
     run, read = arguments.run_folder(), inputs.input_paths()
     run.check_usable(read, resume=arguments.resume, overwrite=arguments.overwrite)
     with run.claim(console, resume=arguments.resume, overwrite=arguments.overwrite):
         command = arguments.as_json()
         threads = None
         if inputs.kind is InputKind.STREAMED:  # its frames come as soon as it is open
-            threads = _load_trainer_code(arguments, run, console, loading)
+            threads = _load_trainer_code(arguments, run, console)
         observations, before_fit = open_observations(arguments, inputs, run, console)
-        threads = threads or _load_trainer_code(arguments, run, console, loading)
+        threads = threads or _load_trainer_code(arguments, run, console)
         from instant_avatar.report.report_writer import ReportWriter
         from instant_avatar.run.session_start import run_session
 
@@ -73,17 +70,10 @@ def ingest(
         return report.exit_code()
 
 
-def _import_trainer_code() -> None:
-    from instant_avatar.report import report_writer  # noqa: F401
-    from instant_avatar.run import session_start  # noqa: F401
-
-
-def _load_trainer_code(
-    arguments: IngestArguments, run: RunFolder, console: Console, loading: Thread
-) -> int:
-    """Wait until torch is imported, and set and return the number of its threads."""
+def _load_trainer_code(arguments: IngestArguments, run: RunFolder, console: Console) -> int:
+    """Import torch, and set and return the number of threads."""
     with exit_on_interrupt(console, PROGRAM, run.release), console.status("loading torch"):
-        loading.join()
+        from instant_avatar.report import report_writer  # noqa: F401
         from instant_avatar.run.session_start import set_threads
 
         return set_threads(arguments.threads)

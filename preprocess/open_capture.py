@@ -228,8 +228,8 @@ def _place(
         )
     if is_foreign or (is_other and avatar_body is not None and given is not None):
         own = None if is_other else posed.body.with_shape()
-        capture, said, figures = start_distances(capture, own=own)
-        note = f"{note} {said}".strip()
+        capture, start_note, figures = start_distances(capture, own=own)
+        note = f"{note} {start_note}".strip()
     elif given is not None and cameras.source == ASSUMED_CAMERA_SOURCE:
         capture = start_focal_length(capture)
     if given is None and is_foreign:  # those estimated before do not count

@@ -34,8 +34,6 @@ MIN_AGREEMENT = 0.6
 """Mean IoU of body and masks from which a start is taken, better than by chance."""
 MIN_GAIN = 0.01
 """Gain in mean IoU from which a start is taken."""
-
-
 MIN_OWN_GAIN = 0.02
 """Gain in mean IoU by which the body's own proportions must beat SMPL's."""
 NO_PERSON_FOUND = (

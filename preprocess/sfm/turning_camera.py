@@ -150,20 +150,20 @@ def _refine(turns: _Turns, tracks: list[_Track], *, holds_focal: bool = False) -
     for _ in range(ITERATIONS):
         relative = turns.rotations[view] @ turns.rotations[anchor].transpose(0, 2, 1)
         rays = turns.rays(start)
-        there = np.einsum("nab,nb->na", relative, rays)
-        plane = turns.focal_px * there[:, :2] / there[:, 2:]
+        seen_rays = np.einsum("nab,nb->na", relative, rays)
+        plane = turns.focal_px * seen_rays[:, :2] / seen_rays[:, 2:]
         off = plane - end
         slope = np.zeros((len(start), 2, 3))  # of the pixel by its ray
-        slope[:, 0, 0] = slope[:, 1, 1] = turns.focal_px / there[:, 2]
-        slope[:, :, 2] = -plane / there[:, 2:]
-        back = slope @ relative
-        by_focal = plane - np.einsum("nab,nb->na", back[:, :, :2], rays[:, :2])
+        slope[:, 0, 0] = slope[:, 1, 1] = turns.focal_px / seen_rays[:, 2]
+        slope[:, :, 2] = -plane / seen_rays[:, 2:]
+        ray_slope = slope @ relative
+        by_focal = plane - np.einsum("nab,nb->na", ray_slope[:, :, :2], rays[:, :2])
         values = np.concatenate(
-            [-slope @ _cross(there), back @ _cross(rays), by_focal[:, :, None]], axis=2
+            [-slope @ _cross(seen_rays), ray_slope @ _cross(rays), by_focal[:, :, None]], axis=2
         )
         rows = np.broadcast_to(np.arange(off.size).reshape(-1, 2, 1), values.shape)
-        wide = np.broadcast_to(columns[:, None], values.shape)
-        entries = values.ravel(), (rows.ravel(), wide.ravel())
+        entry_columns = np.broadcast_to(columns[:, None], values.shape)
+        entries = values.ravel(), (rows.ravel(), entry_columns.ravel())
         jacobian = coo_array(entries, shape=(off.size, 3 * keys + 1)).tocsc()[:, free]
         weights = 1.0 / np.maximum(1.0, np.linalg.norm(off, axis=1).repeat(2))
         weighted = jacobian.multiply(weights[:, None]).T
