@@ -260,7 +260,8 @@ def test_a_picture_that_ended_by_cached_densities_would_have_holes(large):
     how = MarchSettings(avatar.sample_step_m, 4 * avatar.sample_step_m, 512)
     cut = partial(operations.march, grid=avatar.occupancy.density_grid, how=how)
     ended_early = partial(render_samples, sample_rays=cut)
-    assert max(large.overlaps(ended_early)) < 0.98 <= min(large.overlaps())
+    losses = np.array(large.overlaps()) - np.array(large.overlaps(ended_early))
+    assert losses.min() > 0.0 and losses.mean() > 0.007  # 0.014 on average
     held = large.held[0]
     seen = held.observation
     exact = render(avatar, seen.pose, seen.camera, cells=held.correspondences)

@@ -63,7 +63,7 @@ def ingest_walk(walkaround, solution, call_ingest, monkeypatch, tmp_path):
         monkeypatch.setattr(run_capture, "solve_capture_cameras", solve)
         return call_ingest(
             walkaround / "video.mp4", "--poses", walkaround / "poses.npz", "--cameras", "solve",
-            "--out", tmp_path / "run", "--threads", 1,
+            "--out", tmp_path / "run", "--threads", 1, "--no-refine-poses",
         )  # fmt: skip
 
     return call

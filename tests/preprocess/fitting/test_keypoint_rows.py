@@ -34,12 +34,12 @@ def test_a_person_fits_its_own_key_points(problem):
     assert np.abs(problem().residuals[:, 66:]).max() < 0.5  # depth: perspective is not known
 
 
-@pytest.mark.parametrize("parameter", [0, 4, 8, 3 * 4, 3 * 16 + 1, 3 * 19, 3 * 15 + 2, 72, 73, 74])
-def test_the_jacobian_of_poses(problem, parameter):
-    step = np.zeros(75)
-    step[parameter] = 1e-5
-    slope = (problem(step).residuals - problem(-step).residuals) / 2e-5
-    np.testing.assert_allclose(problem().pose_jacobian[..., parameter], slope, atol=1e-3)
+def test_the_jacobian_of_poses(problem):
+    for parameter in (0, 4, 8, 3 * 4, 3 * 16 + 1, 3 * 19, 3 * 15 + 2, 72, 73, 74):
+        step = np.zeros(75)
+        step[parameter] = 1e-5
+        slope = (problem(step).residuals - problem(-step).residuals) / 2e-5
+        np.testing.assert_allclose(problem().pose_jacobian[..., parameter], slope, atol=1e-3)
 
 
 def test_the_jacobians_of_proportions_and_focal_length(problem):
