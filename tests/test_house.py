@@ -155,6 +155,7 @@ def test_the_player_loads_with_numpy_and_onnxruntime_alone():
     assert loads(["export.player"], PLAYER_FREE) == []
 
 
+@pytest.mark.slow
 def test_the_checks_of_what_is_loaded_can_fail():
     assert loads(["avatar.rig", "capture.video"], ("scipy", "cv2", "onnx")) == [
         "scipy",

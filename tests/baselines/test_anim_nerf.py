@@ -87,6 +87,7 @@ def test_fog_has_the_opacity_of_its_closed_form(fine_samples):
     np.testing.assert_array_equal(rgba[2], np.zeros(4))
 
 
+@pytest.mark.slow
 def test_training_moves_field_and_poses_and_repeats_exactly(person, rig, clip):
     frames = [prepare_frame(seen, rig) for seen in clip.observations[:3]]
 

@@ -53,6 +53,7 @@ def test_a_sparse_convolution_is_the_dense_one_where_it_is_active(stride):
         assert set(map(tuple, to.places.tolist())) == set(map(tuple, seen.nonzero().tolist()))
 
 
+@pytest.mark.slow
 def test_it_learns(person, rig, clip):
     frames = [prepare_frame(seen, rig) for seen in clip.observations[:2]]
     torch.manual_seed(0)

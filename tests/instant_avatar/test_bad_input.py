@@ -43,6 +43,7 @@ def test_a_video_that_is_not_there(refused, tmp_path):
     refused(tmp_path / "none.mp4", "--poses", tmp_path / "none.npz", words=["none.mp4"])
 
 
+@pytest.mark.slow
 def test_a_video_that_cannot_be_tracked_well_leaves_what_was_tracked(
     call_ingest, capture, tmp_path
 ):

@@ -136,6 +136,7 @@ FILM_SPOILS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cause", quick_where(FILM_SPOILS, ("video_mirrored",)))
 def test_a_mistake_of_the_film_alone_is_named_and_corrected(cause, spoilt, tmp_path, call_check):
     folder, out = spoilt(FILM_SPOILS[cause]), tmp_path / "corrected"
@@ -191,6 +192,7 @@ def test_two_people_in_the_masks_are_named_and_one_is_taken_away(spoilt, tmp_pat
     assert len(alone) > 35  # an arm that touches the other person makes one part of both
 
 
+@pytest.mark.slow
 def test_without_masks_the_key_points_name_the_mistake(spoilt, call_check, tmp_path):
     folder = spoilt(capture_corruptions.use_opengl_poses)
     shutil.rmtree(folder / "masks")

@@ -150,6 +150,7 @@ def test_an_actor_who_turns_twice_is_seen_from_all_sides(report):
     assert coverage["parts"]["torso"]["back"] > 0.95
 
 
+@pytest.mark.slow
 def test_a_clip_of_the_front_alone_asks_for_a_turn(capture, call_ingest, without_baking, tmp_path):
     out = tmp_path / "run"
     outcome = call_ingest(capture, "--out", out, "--frames", "0:3")

@@ -89,6 +89,7 @@ def test_what_learning_needs_is_an_extra():
     assert needed.isdisjoint(LEARN_PACKAGES)
 
 
+@pytest.mark.slow
 def test_playing_checking_and_meshes_need_nothing_of_it(place, film):
     commands = [*PLAY, ["check", str(film), "--sheet", "sheet.png"]]
     ended = without(LEARN_PACKAGES, commands, place)

@@ -93,6 +93,7 @@ def test_poses_of_another_person_from_the_middle_on_are_no_offset(capture, diagn
     assert code == 2
 
 
+@pytest.mark.slow
 def test_boxes_are_called_boxes_and_no_focal_length_is_fitted_to_them(capture, diagnosed):
     def boxed(_, mask):
         rows, columns = np.nonzero(mask > 127)

@@ -160,6 +160,7 @@ def test_of_a_long_stream_a_bounded_spread_of_held_out_frames_stays(held, count,
         assert indices == list(places)
 
 
+@pytest.mark.slow
 def test_a_warp_that_is_solved_when_it_is_needed_gives_the_same_score(rig, held, learnt):
     lazy = HeldOutFrame(observation=held.observation)
     assert score_frame(learnt.trainer.avatar, lazy) == score_frame(

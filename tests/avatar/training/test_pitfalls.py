@@ -139,6 +139,7 @@ def forgotten(rig, *, decay: float, updates: int) -> float:
     return float(np.mean(shares))
 
 
+@pytest.mark.slow
 def test_a_decay_of_six_tenths_with_one_probe_a_cell_would_forget_thin_surfaces(rig):
     """A probe misses with probability 1 - p; after n misses in a row the cell counts as empty."""
     for decay, misses in ((0.6, 11), (OCCUPANCY_DECAY, 51)):
@@ -261,7 +262,8 @@ def test_a_picture_that_ended_by_cached_densities_would_have_holes(large):
     cut = partial(operations.march, grid=avatar.occupancy.density_grid, how=how)
     ended_early = partial(render_samples, sample_rays=cut)
     losses = np.array(large.overlaps()) - np.array(large.overlaps(ended_early))
-    assert losses.min() > 0.0 and losses.mean() > 0.007  # 0.014 on average
+    assert losses.min() > 0.0
+    assert losses.mean() > 0.007  # 0.014 on average
     held = large.held[0]
     seen = held.observation
     exact = render(avatar, seen.pose, seen.camera, cells=held.correspondences)

@@ -156,6 +156,7 @@ def test_tuning_lowers_the_error_on_a_view_that_it_did_not_see(
     assert not after.tables.bricks.voxels[0].any()
 
 
+@pytest.mark.slow
 def test_what_is_exact_already_stays(tune, renderer, tables):
     after = tune(tables, renderer)
     assert after.tables is tables
@@ -181,7 +182,7 @@ def test_progress_only_grows(tuned):
     assert len(shares) == 13  # four judge, six are learnt from, and three rounds
 
 
-@pytest.mark.parametrize("baked_first", [False, True])
+@pytest.mark.parametrize("baked_first", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_ctrl_c_while_tuning_leaves_the_package_as_baked(
     stand_in, renderer, coarse, views, tables, tmp_path, monkeypatch, baked_first
 ):

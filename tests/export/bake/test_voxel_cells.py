@@ -101,6 +101,7 @@ def test_shared_codes_are_means_weighted_by_what_shows():
     assert summed.color_normalizer == pytest.approx(np.full(VOXELS, 2.0 * VOXELS))
 
 
+@pytest.mark.slow
 def test_chunks_do_not_change_shared_codes(tables, monkeypatch):
     given = VoxelCodes.of(tables.bricks)
     generator = np.random.default_rng(4)

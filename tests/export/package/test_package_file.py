@@ -173,6 +173,7 @@ def export(stand_in, views, truth, coarse, tmp_path):
     return run
 
 
+@pytest.mark.slow
 def test_a_player_that_differs_from_the_renderer_is_written_with_a_warning(export, truth):
     report = export(renderer=lambda pose, camera: np.roll(truth["bent"], 12, axis=1))
     assert report.psnr_to_renderer["hq"] < POOR_PSNR

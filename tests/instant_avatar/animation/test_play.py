@@ -208,7 +208,7 @@ def test_a_provider_that_is_not_there_is_named(call_play, package):
         assert "no provider 'abacus' here; it has: " in outcome.complaint("ia-play")
 
 
-@pytest.mark.parametrize("mode", ["--verify", "--bench"])
+@pytest.mark.parametrize("mode", ["--verify", pytest.param("--bench", marks=pytest.mark.slow)])
 def test_warnings_of_the_package_are_printed(call_play, package, tmp_path, mode):
     sound, path = read_package(package, tier=None), tmp_path / "avatar.iavatar"
     manifest = replace(sound.manifest, metrics={"warnings": ["It is fog."]})

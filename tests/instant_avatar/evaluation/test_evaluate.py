@@ -96,6 +96,7 @@ def psnrs(ended):
     return [line.split("|")[6] for line in ended.out.splitlines()]
 
 
+@pytest.mark.slow
 def test_the_papers_frames_are_learnt_scored_and_set_beside_the_papers_figures(
     dataset, call_evaluate, without_baking, tmp_path
 ):

@@ -178,6 +178,7 @@ def test_without_masks_the_posed_body_says_where_the_person_is(walkaround):
     assert around.sum() < 2.5 * mask.sum()
 
 
+@pytest.mark.slow
 def test_a_run_learns_in_the_world_of_its_solved_cameras(
     walkaround, ingest_walk, tmp_path, without_baking
 ):

@@ -51,6 +51,7 @@ def test_another_video_is_added_and_both_are_learnt_from(
     assert json.loads((out / "report.json").read_text())["earlier_videos"] == extended
 
 
+@pytest.mark.slow
 def test_an_added_video_keeps_the_avatars_body_and_says_how_its_own_differs(
     capture, call_ingest, without_baking, tmp_path, changed, rig
 ):

@@ -115,7 +115,9 @@ def test_the_package_as_baked_stays_if_the_fine_tuned_one_is_refused(learn, monk
     assert avatar.report["package"] is not None
 
 
-@pytest.mark.parametrize(("gain_db", "drawings"), [(0.5, 1), (3.0, 2)])
+@pytest.mark.parametrize(
+    ("gain_db", "drawings"), [(0.5, 1), pytest.param(3.0, 2, marks=pytest.mark.slow)]
+)
 def test_the_animation_is_drawn_again_only_where_fine_tuning_shows(
     learn, monkeypatch, gain_db, drawings
 ):
@@ -126,7 +128,7 @@ def test_the_animation_is_drawn_again_only_where_fine_tuning_shows(
     assert len(drawn) == drawings
 
 
-@pytest.mark.parametrize("when", [None, "first", "final"])
+@pytest.mark.parametrize("when", [None, "first", pytest.param("final", marks=pytest.mark.slow)])
 def test_ctrl_c_after_the_package_leaves_out_the_rest_and_keeps_everything(
     learn, tmp_path, monkeypatch, when
 ):

@@ -99,6 +99,7 @@ def test_a_camera_that_is_carried_past_near_and_far_things_walks():
     assert 8 / 480 < shift < 32 / 480
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_baking")
 def test_a_film_with_poses_is_looked_at_too(
     look, frames, filmed, call_ingest, tmp_path, monkeypatch

@@ -70,6 +70,7 @@ def test_a_growing_folder_becomes_an_avatar(watch, studio):
     assert report["training"]["steps"] > 0
 
 
+@pytest.mark.slow
 def test_a_live_source_that_goes_on_is_left_when_the_time_is_up(watch, studio):
     folder, _ = studio
     began = time.perf_counter()
@@ -79,6 +80,7 @@ def test_a_live_source_that_goes_on_is_left_when_the_time_is_up(watch, studio):
     assert time.perf_counter() - began < 120.0
 
 
+@pytest.mark.slow
 def test_a_camera_becomes_an_avatar(watch, filmed):
     """A file stands in for the camera, opened through the same class."""
     code, report = watch(f"camera:{filmed / 'video.mp4'}", "--seconds", "1.5")

@@ -94,6 +94,7 @@ def test_ia_check_grades_tracked_poses(tracked, tmp_path, capsys):
     assert json.loads(told.read_text())["tracking"]["found_share"] == 1.0
 
 
+@pytest.mark.slow
 def test_tracking_beside_the_video_reads_and_repeats(video, capsys):
     words = ["--out", str(video.with_name("poses.npz")), "--frames", ":8", "--overwrite"]
     assert track.main([str(video), *words]) in (0, 1)

@@ -113,6 +113,7 @@ class CountingTracker(BlazePoseTracker):
         return super().__call__(rgb)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_baking")
 def test_ctrl_c_keeps_the_frames_that_were_tracked(ingest_video, monkeypatch):
     monkeypatch.setattr(CountingTracker, "frames", 0)
@@ -131,6 +132,7 @@ def test_ctrl_c_keeps_the_frames_that_were_tracked(ingest_video, monkeypatch):
     assert len(list((out / "tracking" / "masks").glob("*.png"))) == 20
 
 
+@pytest.mark.slow
 def test_a_resumed_run_does_not_join_two_persons(video, tmp_path, monkeypatch):
     poses = tmp_path / "out" / "poses.npz"
     inputs = CaptureInputs(video=video, frames=slice(0, 8))
@@ -154,6 +156,7 @@ def test_given_poses_replace_tracked_ones(ingest_video, filmed):
     assert not (out / "tracking").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_baking")
 def test_a_video_played_at_its_own_speed_is_tracked_meanwhile(ingest_video, monkeypatch):
     monkeypatch.setattr(tracked_stream, "MAX_LATENESS_S", 1e9)  # on a busy machine, too

@@ -105,7 +105,9 @@ def turning(here, degrees, shake_m=0.0):
     return cameras
 
 
-@pytest.mark.parametrize(("shake_m", "most_deg"), [(0.0, 0.1), (0.01, 0.4)])
+@pytest.mark.parametrize(
+    ("shake_m", "most_deg"), [(0.0, 0.1), pytest.param(0.01, 0.4, marks=pytest.mark.slow)]
+)
 def test_a_camera_that_turns_on_the_spot_is_solved_as_one(
     room, walked, tmp_path, monkeypatch, shake_m, most_deg
 ):
@@ -145,6 +147,7 @@ def test_a_walk_along_a_flat_wall_is_not_taken_for_a_turn(room, walked, tmp_path
         )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_turn_that_tells_no_focal_length_is_not_believed(room, walked, tmp_path):
     here = walked(1, degrees=0.0, size_px=SIZE, focal_px=260.0)[0]
     cameras = turning(here, np.linspace(-1.5, 1.5, KEYS))
