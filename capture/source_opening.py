@@ -8,6 +8,7 @@ import numpy as np
 from capture.image_folder import IMAGE_SUFFIXES, ImageFolder, list_images
 from capture.input_error import InputError
 from capture.live_sources import CameraDevice, WatchedImageFolder
+from capture.received_video import ReceivedVideo, note_of
 from capture.source import Frame, FrameSelection, FrameSource, PacingClock, RotatedSource
 from capture.video import VIDEO_SUFFIXES, VideoFile
 
@@ -124,10 +125,10 @@ def open_live_source(
     watch_s: float | None = None,
     rotate: int = 0,
 ) -> FrameSource:
-    """Open a camera, or a folder that another program writes images to.
+    """Open a camera, a folder that another program writes images to, or a video that is received.
 
     Args:
-        path: The folder; a capture folder's images lie in its `images/`.
+        path: The folder, or the video; a capture folder's images lie in its `images/`.
         camera: Number or address of a camera instead.
         idle_s: Time without a new image after which a folder ends, seconds.
         watch_s: Time after which a folder ends even so; None: never.
@@ -137,6 +138,8 @@ def open_live_source(
     source: FrameSource
     if camera is not None:
         source = CameraDevice(camera, selection, pace)
+    elif note_of(path).is_file():
+        source = ReceivedVideo(path, selection, pace, idle_s=idle_s)
     else:
         folder = path / "images" if (path / "images").is_dir() else path
         source = WatchedImageFolder(folder, selection, pace, idle_s=idle_s, watch_s=watch_s)

@@ -55,7 +55,7 @@ class DecodedFrame(NamedTuple):
                 rgb = self.frame.to_ndarray(format="rgb24", **size)
         except (FFmpegError, ValueError):
             return None
-        return np.ascontiguousarray(np.rot90(rgb, _quarter_turns(self.frame)))
+        return np.ascontiguousarray(np.rot90(rgb, quarter_turns(self.frame)))
 
 
 class VideoFile(FrameSource):
@@ -75,7 +75,7 @@ class VideoFile(FrameSource):
                 duration_s = (container.duration or 0) / av.time_base
                 claimed_frames = int(stream.frames) or round(duration_s * self._fps)
                 pixel_aspect = float(stream.sample_aspect_ratio or 1.0)
-                first = next(_decode(container, stream), None)
+                first = next(decode(container, stream), None)
         except IndexError as cause:
             raise InputError(f"{path} holds no images, only sound or text.") from cause
         except (FFmpegError, ValueError, OSError) as cause:
@@ -89,7 +89,7 @@ class VideoFile(FrameSource):
             raise InputError(f"No frame of {path} could be decoded; the video is empty or damaged.")
         self.is_hdr = int(first.frame.color_trc) in HDR_TRANSFERS
         width, height = int(first.frame.width), int(first.frame.height)
-        self.size_px = (height, width) if _quarter_turns(first.frame) % 2 else (width, height)
+        self.size_px = (height, width) if quarter_turns(first.frame) % 2 else (width, height)
         self.frames_in_file = claimed_frames if claimed_frames > 0 else self.count_frames()
         self.frame_count = selection.count(self.frames_in_file)
         span = selection.span(self.frames_in_file)
@@ -128,7 +128,7 @@ class VideoFile(FrameSource):
             entries, start = stream.index_entries, stream.start_time or 0
             keys = np.array([entry.timestamp for entry in entries if entry.is_keyframe])
             keys_s = (keys - start) * float(stream.time_base)
-            frames, now_s = _decode(container, stream), -1.0
+            frames, now_s = decode(container, stream), -1.0
             for time_s in times_s:
                 near = np.flatnonzero((keys_s > now_s) & (keys_s <= time_s))
                 if len(near):
@@ -176,7 +176,7 @@ class VideoFile(FrameSource):
 
     def _decode_all(self) -> Iterator[DecodedFrame]:
         with av.open(str(self.path)) as container:
-            yield from _decode(container, container.streams.video[0])
+            yield from decode(container, container.streams.video[0])
 
     def _compare_with_claim(self, count: int, end_s: float) -> None:
         """Warn if the container claims more than was decoded."""
@@ -201,9 +201,12 @@ class VideoFile(FrameSource):
             )
 
 
-def _decode(container: Any, stream: Any) -> Iterator[DecodedFrame]:
-    """Yield the frames of a stream; those that fail to decode are skipped."""
-    stream.thread_type = "AUTO"
+def decode(container: Any, stream: Any, *, at_once: bool = False) -> Iterator[DecodedFrame]:
+    """Yield the frames of a stream; those that fail to decode are skipped.
+
+    With `at_once` no frame waits for the next ones, which other threads would decode beside it.
+    """
+    stream.thread_type = "SLICE" if at_once else "AUTO"
     packets, failures = container.demux(stream), 0
     start = stream.start_time or 0
     while failures < MAX_DECODE_FAILURES:
@@ -220,6 +223,6 @@ def _decode(container: Any, stream: Any) -> Iterator[DecodedFrame]:
             failures = 0
 
 
-def _quarter_turns(frame: Any) -> int:
+def quarter_turns(frame: Any) -> int:
     """Return the counter-clockwise quarter turns that make a frame upright."""
     return int(frame.rotation) // 90 % 4

@@ -19,7 +19,9 @@ from instant_avatar.run.run_folder import RunFolder
 from preprocess.capture_inputs import InputKind
 
 if TYPE_CHECKING:  # it imports torch
+    from capture.source import Frame
     from instant_avatar.run.session_events import EventReader
+    from preprocess.tracking.keypoints import PersonKeypoints
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -53,7 +55,14 @@ def ingest(
         threads = None
         if inputs.kind is InputKind.STREAMED:  # its frames come as soon as it is open
             threads = _load_trainer_code(arguments, run, console)
-        observations, before_fit = open_observations(arguments, inputs, run, console)
+
+        def show_tracked(frame: "Frame", person: "PersonKeypoints | None") -> None:
+            from instant_avatar.run.session_events import Tracked
+
+            for reader in readers:
+                reader(Tracked(frame=frame, person=person))
+
+        observations, before_fit = open_observations(arguments, inputs, run, console, show_tracked)
         threads = threads or _load_trainer_code(arguments, run, console)
         from instant_avatar.report.report_writer import ReportWriter
         from instant_avatar.run.session_start import run_session

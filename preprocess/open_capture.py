@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from capture.input_error import InputError
-from capture.source import FrameSource, PacingClock, RealtimePlayback, TransposedSource
+from capture.source import Frame, FrameSource, PacingClock, RealtimePlayback, TransposedSource
 from capture.source_opening import open_live_source, open_source
 from preprocess.alignment.capture_geometry import CaptureGeometry, rescale_motion
 from preprocess.body.body_pose import Motion
@@ -64,6 +64,7 @@ from preprocess.tracked_stream import (
     TrackedObservations,
     TrackedStream,
 )
+from preprocess.tracking.keypoints import PersonKeypoints
 from preprocess.tracking.video_tracking import MaskRefinement
 
 HEIGHT_TOLERANCE_M = 0.015
@@ -301,8 +302,9 @@ def open_tracked_stream(
     *,
     longer_side_px: Callable[[FrameSource], int] = lambda source: max(source.size_px),
     avatar_body: Path | None = None,
+    on_tracked: Callable[[Frame, PersonKeypoints | None], object] = lambda *_: None,
 ) -> TrackedObservations:
-    """Open a live source, or a recording that is played at its own speed, and find the person.
+    """Open a live source, or a recording at its own speed, and find the person.
 
     Masks of a recording that are named or lie beside it, an installed segmenter's, and the images'
     alpha channel are learnt from; only without any are the tracker's.
@@ -313,6 +315,7 @@ def open_tracked_stream(
         poses: File to which the poses will be written in the end.
         longer_side_px: Longer side of the training images for a source.
         avatar_body: File of a finished avatar's person, who is filmed again.
+        on_tracked: Receives each frame that was searched, and the person in it.
 
     Raises:
         InputError: If it cannot be read, or no person is found in it.
@@ -326,10 +329,9 @@ def open_tracked_stream(
     own = None if inputs.is_live else find_own_masks(inputs.video)
     segmenter = _choose_segmenter(inputs, own, source)
     given = _open_stream_masks(inputs, own, source) if segmenter is None else None
-    tracking = LiveTracking(TrackedStream(source), tracker)
-    shaped = load_body_model(inputs.body).with_shape()
-    if avatar_body is not None:
-        shaped = read_shaped_body(avatar_body, shaped.body)
+    tracking = LiveTracking(TrackedStream(source), tracker, on_tracked)
+    mean = load_body_model(inputs.body).with_shape()
+    shaped = mean if avatar_body is None else read_shaped_body(avatar_body, mean.body)
     motion, person, cameras = tracking.start(
         shaped,
         assume_camera(inputs.video, inputs.cameras, tracking.stream),
@@ -341,13 +343,12 @@ def open_tracked_stream(
     if segmenter is None or inputs.masks is not None:
         masks = given or _estimated_masks(segmenter, person)
         made = _mask_provenance(masks, segmenter)
-    unread = tuple(_unread_live_parts(inputs))
     capture = Capture(
         paths=CapturePaths(video=inputs.video, poses=poses, masks=own, cameras=None),
         source=tracking.stream, motion=motion, masks=masks, cameras=cameras,
         shaped=person, size_px=longer_side_px(source),
         provenance=(
-            Provenance("poses", "tracked", unread, uncertainty=1.0),
+            Provenance("poses", "tracked", tuple(_unread_live_parts(inputs)), uncertainty=1.0),
             Provenance("cameras", cameras.source, uncertainty=1.0),
             made,
         ),

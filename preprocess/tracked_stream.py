@@ -41,6 +41,7 @@ from preprocess.observation import (
 )
 from preprocess.observation_source import ObservationSource
 from preprocess.plugins import PersonTracker
+from preprocess.tracking.keypoints import PersonKeypoints
 from preprocess.tracking.video_tracking import NOT_FOUND, MaskRefinement
 
 START_FRAMES = 8
@@ -125,9 +126,17 @@ class LiveTracking:
 
     latest: SeenPerson
 
-    def __init__(self, stream: TrackedStream, tracker: PersonTracker) -> None:
-        """Connect a stream with its tracker; nothing is read yet."""
-        self.stream, self._tracker = stream, tracker
+    def __init__(
+        self,
+        stream: TrackedStream,
+        tracker: PersonTracker,
+        on_tracked: Callable[[Frame, PersonKeypoints | None], object] = lambda *_: None,
+    ) -> None:
+        """Connect a stream with its tracker; nothing is read yet.
+
+        `on_tracked` receives each frame that was searched, and the person in it.
+        """
+        self.stream, self._tracker, self._on_tracked = stream, tracker, on_tracked
         self.times_s: dict[int, float] = {}
         self.lost: list[int] = []
         self._seen: dict[int, SeenPerson] = {}
@@ -203,6 +212,7 @@ class LiveTracking:
         """Find the person in a frame, and fit its pose once there is a person to fit."""
         self.times_s[frame.index] = frame.time_s
         found = None if "corrupt" in frame.flags else self._tracker(frame.rgb)
+        self._on_tracked(frame, found)
         if found is None:
             self.lost.append(frame.index)
             return

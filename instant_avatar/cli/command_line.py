@@ -87,6 +87,7 @@ EXTRAS = {
     **dict.fromkeys(("torch", "numba", "onnx", "pycolmap"), "learn"),
     **dict.fromkeys(("ray", "fsspec"), "learn,cluster"),
     "viser": "viewer",
+    **dict.fromkeys(("aiohttp", "cryptography", "segno"), "phone"),
     "h5py": "datasets",
 }
 """Optional packages, and the extras that install them."""

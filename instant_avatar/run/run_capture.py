@@ -1,12 +1,14 @@
 """The capture of a run: read, tracked or streamed, aligned, in the world of its cameras, fitted."""
 
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 
 from capture.atomic_files import atomic_file
 from capture.input_error import InputError
+from capture.source import Frame
 from instant_avatar.capture_validation import correction_hint, preflight_check
 from instant_avatar.cli.console import Console
 from instant_avatar.run.ingest_arguments import IngestArguments
@@ -30,12 +32,19 @@ from preprocess.plugins import DEFAULT_TRACKER, make_tracker
 from preprocess.poses.pose_file import write_motion
 from preprocess.sfm.capture_solving import apply_camera_solution, solve_capture_cameras
 from preprocess.tracking.first_look import look_at
+from preprocess.tracking.keypoints import PersonKeypoints
 
 
 def open_observations(
-    arguments: IngestArguments, inputs: CaptureInputs, run: RunFolder, console: Console
+    arguments: IngestArguments,
+    inputs: CaptureInputs,
+    run: RunFolder,
+    console: Console,
+    on_tracked: Callable[[Frame, PersonKeypoints | None], object] = lambda *_: None,
 ) -> tuple[ObservationSource, Capture]:
     """Open what a run learns from, whatever the input is.
+
+    `on_tracked` receives each frame of a stream that was searched, and the person in it.
 
     Returns:
         The observations, and their capture before it was fitted to the masks.
@@ -43,7 +52,7 @@ def open_observations(
     resumes = arguments.resume and run.has_checkpoint()
     if inputs.kind is InputKind.STREAMED:
         with console.status("opening video and poses"):
-            stream = _open_stream(arguments, inputs, run, resumes=resumes)
+            stream = _open_stream(arguments, inputs, run, on_tracked, resumes=resumes)
         _describe(stream.capture, console)
         return stream, stream.capture
     if inputs.kind is InputKind.UNTRACKED:
@@ -98,13 +107,18 @@ def _align_as_trained(
 
 
 def _open_stream(
-    arguments: IngestArguments, inputs: CaptureInputs, run: RunFolder, *, resumes: bool
+    arguments: IngestArguments,
+    inputs: CaptureInputs,
+    run: RunFolder,
+    on_tracked: Callable[[Frame, PersonKeypoints | None], object],
+    *,
+    resumes: bool,
 ) -> ObservationSource:
     tracker = make_tracker(inputs.tracker or DEFAULT_TRACKER, person_number(inputs.person))
     person = run.body_file if resumes and run.body_file.is_file() else None
     return open_tracked_stream(
         inputs, tracker, MaskRefiner, run.tracked_poses,
-        longer_side_px=arguments.longer_side_px, avatar_body=person,
+        longer_side_px=arguments.longer_side_px, avatar_body=person, on_tracked=on_tracked,
     )  # fmt: skip
 
 

@@ -10,8 +10,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from avatar.evaluation.coverage import Coverage
 from avatar.events import TrainEvent
+from avatar.training.trainer import Trainer
+from capture.source import Frame
 from instant_avatar.run.final_scoring import TrainingResult
+from preprocess.body.parametric_body import ShapedBody
+from preprocess.tracking.keypoints import PersonKeypoints
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,6 +25,26 @@ class Progressed:
 
     stage: str
     share: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Tracked:
+    """A stream's frame was searched for the person; None if it was not found.
+
+    It comes on the thread that reads frames, also before the session starts.
+    """
+
+    frame: Frame
+    person: PersonKeypoints | None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Started:
+    """Training begins; readers may look at these between two events, and change nothing."""
+
+    trainer: Trainer
+    coverage: Coverage
+    shaped: ShapedBody
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,6 +84,9 @@ class Ended:
     result: TrainingResult
 
 
-SessionEvent = TrainEvent | Progressed | Noted | CheckpointSaved | PackageWritten | Scored | Ended
+SessionEvent = (
+    TrainEvent | Progressed | Tracked | Started | Noted
+    | CheckpointSaved | PackageWritten | Scored | Ended
+)  # fmt: skip
 EventReader = Callable[[SessionEvent], object]
 """Reads every event of a session, on the thread that trains: what it takes is not trained."""

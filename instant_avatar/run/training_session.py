@@ -41,6 +41,7 @@ from instant_avatar.run.session_events import (
     Progressed,
     Scored,
     SessionEvent,
+    Started,
 )
 from instant_avatar.run.snapshot_writer import (
     CheckpointWriter,
@@ -114,6 +115,8 @@ class TrainingSession:
         self._report_progress = lambda stage, share: report_progress(
             Progressed(stage=stage, share=share)
         )
+        shaped = self._capture.shaped
+        yield Started(trainer=self.trainer, coverage=self.coverage, shaped=shaped)
         yield from self._train()
         self._check_trained()
         self.trainer.replay.clear_correspondences()  # nothing is learnt from here on

@@ -42,7 +42,9 @@ def chromium() -> str | None:
 class Browser:
     """One page of a fresh browser; use it in a `with` block."""
 
-    def __init__(self, folder: Path, *, size: tuple[int, int] = (1200, 800)) -> None:
+    def __init__(
+        self, folder: Path, *, size: tuple[int, int] = (1200, 800), flags: list[str] | None = None
+    ) -> None:
         program = chromium()
         assert program is not None
         window = f"--window-size={size[0]},{size[1]}"
@@ -51,7 +53,7 @@ class Browser:
         launch = [sys.executable, "-S", "-c", LAUNCH, str(hears), str(says)]
         profile = f"--user-data-dir={folder}"
         self._process = subprocess.Popen(
-            [*launch, program, *FLAGS, window, profile, "about:blank"],
+            [*launch, program, *FLAGS, *(flags or []), window, profile, "about:blank"],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             pass_fds=(hears, says),

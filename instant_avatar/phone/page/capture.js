@@ -1,0 +1,188 @@
+// The page: a film of the camera app, a file or the page's own camera in; an avatar out.
+
+import { Growing, Stored, ask, send } from "./upload.js";
+
+const $ = (id) => document.getElementById(id);
+const COUNTDOWN_S = 5;
+const PIECE_MS = 200; // length of what the camera hands over at once
+const SPOKEN_AGAIN_MS = 9000;
+const KINDS = ["video/webm;codecs=h264", "video/webm;codecs=vp8", "video/mp4;codecs=avc1.42E01E", "video/webm", "video/mp4"];
+let adding = "", facing = "environment", stream = null, shown = "";
+
+function view(name) {
+  for (const id of ["home", "filming", "done"]) $(id).hidden = id !== name;
+  $("warning").hidden = true;
+  scrollTo(0, 0);
+}
+
+function warn(text) {
+  $("warning").textContent = text;
+  $("warning").hidden = false;
+}
+
+let spoken = "", spokenAt = 0;
+function say(text) {
+  $("advice").textContent = text;
+  if (!$("speak").checked || !window.speechSynthesis || (text === spoken && Date.now() - spokenAt < SPOKEN_AGAIN_MS)) return;
+  spoken = text; spokenAt = Date.now();
+  speechSynthesis.cancel();
+  speechSynthesis.speak(new SpeechSynthesisUtterance(text));
+}
+
+/** Begin a film and listen to what the server tells of it; resolves when it is this film's turn. */
+async function begin(type, size) {
+  view("filming");
+  $("map").replaceChildren(); $("preview").hidden = true; $("seen").textContent = ""; $("progress").value = 0;
+  const body = JSON.stringify({ name: $("name").value, type, size, avatar: adding });
+  const { film } = await ask("films", { method: "POST", body });
+  const events = new EventSource(`films/${film}/messages`);
+  const on = (kind, act) => events.addEventListener(kind, (event) => act(JSON.parse(event.data)));
+  on("advice", ({ text, time }) => { say(text); $("advice").dataset.time = time; });
+  on("seconds", ({ seconds }) => { $("seconds").textContent = `${seconds.toFixed(0)} s looked at`; });
+  on("map", ({ svg, seen }) => { $("map").innerHTML = svg; $("seen").textContent = ` · ${Math.round(100 * seen)} % of you seen`; });
+  on("preview", ({ image }) => { $("preview").src = image; $("preview").hidden = false; });
+  on("progress", ({ text, share }) => { $("progress").value = share; if (!$("done").hidden) $("note").textContent = `${text} …`; });
+  on("warning", ({ text }) => warn(text));
+  on("avatar", ({ name, final }) => open(name, final ? "It is ready." : "It can be played; finer detail follows."));
+  on("failed", ({ text }) => { finish(); view("home"); warn(text); });
+  on("over", () => { events.close(); listEarlier(); });
+  await new Promise((resolve) => on("state", ({ state, behind, text }) => {
+    if (state === "waiting") say(`Waiting for ${behind.join(", ")} …`);
+    if (state === "filming") resolve();
+    if (state === "finishing") say(text);
+    if (state === "done" && !$("done").hidden) $("note").textContent = "It is ready.";
+  }));
+  return film;
+}
+
+async function transfer(film, source) {
+  await send(film, source, (bytes) => {
+    $("sent").textContent = `${(bytes / 1e6).toFixed(1)} MB sent`;
+    if (source instanceof Stored) $("progress").value = bytes / source.end;
+  });
+}
+
+async function upload(file) {
+  if (!file) return;
+  $("stage").classList.add("ended");
+  $("stop").hidden = $("turn").hidden = true;
+  try {
+    const film = await begin(file.type || "video/mp4", file.size);
+    say("Learning while the film arrives …");
+    await transfer(film, new Stored(file));
+  } catch (error) {
+    view("home");
+    warn(error.message);
+  }
+}
+
+async function openCamera() {
+  finish();
+  const video = { facingMode: facing, width: { ideal: 1280 }, height: { ideal: 720 }, frameRate: { ideal: 30 } };
+  stream = await navigator.mediaDevices.getUserMedia({ video, audio: false });
+  $("camera").srcObject = stream;
+  $("camera").classList.toggle("front", facing === "user");
+}
+
+function finish() {
+  for (const track of stream?.getTracks() ?? []) track.stop();
+  stream = null;
+  $("camera").srcObject = null;
+}
+
+async function live() {
+  if (document.documentElement.dataset.live === "elsewhere" && !window.isSecureContext) {
+    location.href = "live";
+    return;
+  }
+  try {
+    $("stage").classList.remove("ended"); $("stop").hidden = true; $("turn").hidden = false;
+    await openCamera();
+    const type = KINDS.find((kind) => MediaRecorder.isTypeSupported(kind)) ?? "";
+    const film = await begin(type || "video/mp4", null);
+    for (let left = Number(new URLSearchParams(location.search).get("countdown") ?? COUNTDOWN_S); left > 0; left--) {
+      $("countdown").textContent = left;
+      say(left === COUNTDOWN_S ? "Step into the outline." : $("advice").textContent);
+      await new Promise((resolve) => setTimeout(resolve, 1000));
+    }
+    $("countdown").textContent = "";
+    $("turn").hidden = true;
+    await record(film, type);
+  } catch (error) {
+    finish();
+    view("home");
+    warn(error.name === "NotAllowedError" ? "The camera may not be used: allow it in the browser's settings for this page." : error.message);
+  }
+}
+
+async function record(film, type) {
+  const source = new Growing();
+  const recorder = new MediaRecorder(stream, { ...(type && { mimeType: type }), videoBitsPerSecond: 8e6 });
+  recorder.ondataavailable = ({ data }) => { if (data.size) source.add(data); };
+  recorder.onstop = () => { source.finish(); finish(); $("stage").classList.add("ended"); };
+  recorder.start(PIECE_MS);
+  $("stop").hidden = false;
+  $("stop").onclick = () => { $("stop").hidden = true; recorder.stop(); };
+  const lock = await navigator.wakeLock?.request("screen").catch(() => null);
+  await transfer(film, source);
+  await lock?.release();
+}
+
+function open(name, note) {
+  finish();
+  adding = "";
+  if ($("done").hidden || shown !== name) {
+    view("done");
+    $("player").src = `avatars/${encodeURIComponent(name)}/`;
+  }
+  shown = name;
+  $("title").textContent = name;
+  $("note").textContent = note;
+  for (const [id, file] of [["package", "avatar.iavatar"], ["glb", "avatar.glb"], ["ply", "avatar.ply"], ["obj", "avatar.obj"]]) {
+    $(id).href = `avatars/${encodeURIComponent(name)}/${file}`;
+  }
+  $("share").onclick = () => share(name);
+  $("more").onclick = () => {
+    adding = name;
+    $("adding").textContent = `The next film is added to ${name}.`;
+    $("adding").hidden = false;
+    view("home");
+  };
+}
+
+async function share(name) {
+  const blob = await (await fetch($("package").href)).blob();
+  const file = new File([blob], `${name}.iavatar`, { type: "application/zip" });
+  if (navigator.canShare?.({ files: [file] })) await navigator.share({ files: [file], title: name }).catch(() => {});
+  else $("package").click();
+}
+
+async function listEarlier() {
+  const names = await ask("avatars");
+  $("earlier").hidden = !names.length;
+  $("avatars").replaceChildren(...names.map((name) => {
+    const [item, button, image] = ["li", "button", "img"].map((tag) => document.createElement(tag));
+    Object.assign(image, { src: `avatars/${encodeURIComponent(name)}/poster.png`, alt: "", loading: "lazy" });
+    button.type = "button";
+    button.append(image, name);
+    button.onclick = () => open(name, "");
+    item.append(button);
+    return item;
+  }));
+}
+
+$("file").onchange = () => upload($("file").files[0]);
+$("stored").onchange = () => upload($("stored").files[0]);
+$("live").onclick = live;
+$("turn").onclick = () => { facing = facing === "user" ? "environment" : "user"; openCamera().catch((error) => warn(error.message)); };
+$("again").onclick = () => { adding = ""; $("adding").hidden = true; $("name").value = ""; view("home"); };
+$("live").hidden = document.documentElement.dataset.live === "no" && !window.isSecureContext;
+$("why").hidden = document.documentElement.dataset.live !== "elsewhere" || window.isSecureContext;
+for (const kind of ["dragover", "dragleave", "drop"]) {
+  document.addEventListener(kind, (event) => {
+    event.preventDefault();
+    document.body.classList.toggle("over", kind === "dragover");
+    if (kind === "drop") upload(event.dataTransfer.files[0]);
+  });
+}
+listEarlier();

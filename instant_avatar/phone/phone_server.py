@@ -1,0 +1,292 @@
+"""The server of the phone page: films come in pieces, messages go out, avatars are played."""
+
+import asyncio
+import json
+import tempfile
+import threading
+from collections import deque
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+from aiohttp import web
+
+from capture.input_error import InputError
+from export.package.package_file import read_package
+from export.player import Player
+from export.player_page import build_page
+from instant_avatar.animation.driving_motion import demo_motion, pose_rate
+from instant_avatar.animation.web_server import MIME_TYPES, web_clip
+from instant_avatar.cli.console import Console
+from instant_avatar.export import ExportArguments, export
+from instant_avatar.phone.access_control import AccessControl
+from instant_avatar.phone.film_queue import Film, FilmQueue, FilmRefused
+
+PAGE = Path(__file__).with_name("page")
+"""Folder of the page's own files."""
+COOKIE = "session"
+"""Name of the cookie that a browser gets for its token."""
+MAX_PIECE_BYTES = 8 << 20
+"""Largest piece of a film, bytes."""
+MAX_REQUESTS_PER_S = 60
+"""Requests of one browser in a second, above which it must wait."""
+PIECE_TIMEOUT_S = 60.0
+"""Longest time that one piece may take, seconds."""
+HEARTBEAT_S = 5.0
+"""Longest time without a message to a page, seconds: proxies cut silent connections."""
+MESH_TRIANGLES = 20_000
+"""Triangles of the meshes that the page offers."""
+HEADERS = {
+    "Cross-Origin-Opener-Policy": "same-origin", "Cross-Origin-Embedder-Policy": "require-corp",
+    "Cross-Origin-Resource-Policy": "same-origin", "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer", "Cache-Control": "no-cache",
+    "X-Frame-Options": "SAMEORIGIN",
+}  # fmt: skip
+"""Headers of all answers; the first two isolate the page, so that its player may use threads."""
+REFUSED = (
+    "This page is opened by the address that ia-capture prints. Each address opens it once, in one "
+    "browser: scan the newest code, or look at the terminal for it.\n"
+)
+"""Answer to a browser without a session."""
+
+
+@final
+class PhoneServer:
+    """Serves the page on a thread of its own; `queue` is filled, others take from it."""
+
+    def __init__(self, queue: FilmQueue, access: AccessControl, live_port: int | None) -> None:
+        """Serve nothing yet; `live_port` is that of the page with TLS, if there is one."""
+        self._queue, self._access, self._live_port = queue, access, live_port
+        self.on_entered: Callable[[], object] = lambda: None
+        self._loop = asyncio.new_event_loop()
+        self._pages: dict[str, tuple[float, dict[str, bytes]]] = {}
+        self._requests: dict[str, deque[float]] = {}
+        self._listeners: dict[str, set[asyncio.Event]] = {}
+        self._app = web.Application(client_max_size=MAX_PIECE_BYTES, middlewares=[self._guard])
+        self._app.add_routes(
+            [
+                web.get("/", self._index),
+                web.get("/live", self._go_live),
+                web.get("/page/{file}", self._file),
+                web.post("/films", self._begin),
+                web.get("/films/{number}", self._state),
+                web.put("/films/{number}", self._piece),
+                web.post("/films/{number}/end", self._end),
+                web.get("/films/{number}/messages", self._messages),
+                web.get("/avatars", self._avatars),
+                web.get("/avatars/{name}/{file:.*}", self._avatar),
+            ]
+        )
+
+    def start(self, host: str, sites: list[tuple[int, Any]]) -> None:
+        """Serve at ports, each with a TLS context or None; raise an OSError if one is in use."""
+        runner = web.AppRunner(self._app, access_log=None, shutdown_timeout=1.0)
+
+        async def listen() -> None:
+            await runner.setup()
+            for port, context in sites:
+                await web.TCPSite(runner, host, port, ssl_context=context).start()
+
+        self._runner = runner
+        self._loop.run_until_complete(listen())
+        threading.Thread(target=self._loop.run_forever, daemon=True).start()
+
+    def close(self) -> None:
+        """End all connections."""
+        for film in self._queue:
+            film.is_over = True
+        closing = asyncio.run_coroutine_threadsafe(self._runner.cleanup(), self._loop)
+        closing.result(timeout=10.0)
+        self._loop.call_soon_threadsafe(self._loop.stop)
+
+    @web.middleware
+    async def _guard(
+        self,
+        request: web.Request,
+        handler: Callable[[web.Request], Awaitable[web.StreamResponse]],
+    ) -> web.StreamResponse:
+        """Refuse browsers without a session, pages of other sites, and more than the limits."""
+        session = request.cookies.get(COOKIE, "")
+        try:
+            if request.path == "/" and "token" in request.query:
+                return self._enter(request)
+            if not self._access.is_known(session):
+                raise FilmRefused(403, REFUSED)
+            origin = request.headers.get("Origin")
+            is_foreign = origin is not None and origin.split("://")[-1] != request.host
+            if is_foreign or (request.method != "GET" and origin is None):
+                raise FilmRefused(403, "Another page may not use this one.\n")
+            self._limit_rate(session)
+            answer = await handler(request)
+        except FilmRefused as refused:
+            answer = web.json_response({"message": str(refused)}, status=refused.status)
+        except InputError as error:
+            answer = web.json_response({"message": str(error)}, status=404)
+        except (ValueError, KeyError, TypeError) as error:
+            answer = web.json_response({"message": f"Malformed: {error}"}, status=400)
+        if not answer.prepared:
+            answer.headers.update(HEADERS)
+        return answer
+
+    def _enter(self, request: web.Request) -> web.Response:
+        session = self._access.enter(request.query["token"])
+        if session is None:
+            raise FilmRefused(403, REFUSED)
+        answer = web.Response(status=303, headers={"Location": "/", **HEADERS})
+        answer.set_cookie(
+            COOKIE, session, httponly=True, samesite="Strict", secure=request.secure, path="/"
+        )
+        self.on_entered()
+        return answer
+
+    def _limit_rate(self, session: str) -> None:
+        now, recent = self._loop.time(), self._requests.setdefault(session, deque())
+        while recent and recent[0] < now - 1.0:
+            recent.popleft()
+        if len(recent) >= MAX_REQUESTS_PER_S:
+            raise FilmRefused(429, "Too many requests in a second. Wait a moment.")
+        recent.append(now)
+
+    async def _index(self, request: web.Request) -> web.Response:
+        text = (PAGE / "index.html").read_text(encoding="utf-8")
+        policy = "default-src 'self'; img-src 'self' data: blob:; media-src 'self' blob:"
+        headers = {"Content-Security-Policy": f"{policy}; base-uri 'none'; form-action 'none'"}
+        live = "here" if request.secure else "elsewhere" if self._live_port else "no"
+        text = text.replace("{{live}}", live)
+        return web.Response(text=text, content_type="text/html", headers=headers)
+
+    async def _go_live(self, request: web.Request) -> web.Response:
+        """Go on at the page with TLS, which has cookies of its own."""
+        host = request.host.rsplit(":", 1)[0]
+        address = f"https://{host}:{self._live_port}/?token={self._access.token}"
+        return web.Response(status=303, headers={"Location": address})
+
+    async def _file(self, request: web.Request) -> web.Response:
+        path = PAGE / request.match_info["file"]
+        if path.parent != PAGE or path.suffix not in (".js", ".css") or not path.is_file():
+            raise InputError("There is no such file.")
+        kind = MIME_TYPES[path.suffix]
+        return web.Response(body=path.read_bytes(), headers={"Content-Type": kind})
+
+    def _film(self, request: web.Request) -> Film:
+        return self._queue.find(request.match_info["number"], request.cookies[COOKIE])
+
+    async def _begin(self, request: web.Request) -> web.Response:
+        given = await request.json()
+        size = given.get("size")
+        if size is not None and (not isinstance(size, int) or isinstance(size, bool)):
+            raise ValueError("size is a number of bytes, or null")
+        film = self._queue.begin(
+            request.cookies[COOKIE],
+            name=str(given.get("name", "")), kind=str(given["type"]), size=size,
+            avatar=str(given.get("avatar") or ""),
+        )  # fmt: skip
+        film.on_message = lambda: self._loop.call_soon_threadsafe(self._wake, film.number)
+        return web.json_response({"film": film.number, "next": 0}, status=201)
+
+    async def _state(self, request: web.Request) -> web.Response:
+        return self._progress(self._film(request))
+
+    def _progress(self, film: Film) -> web.Response:
+        file = film.file
+        return web.json_response(
+            {"next": file.next_offset(), "received": file.received, "ended": file.ended,
+             "reason": file.reason}
+        )  # fmt: skip
+
+    async def _piece(self, request: web.Request) -> web.Response:
+        """Write a piece as it comes, so that a broken connection keeps what it has brought."""
+        film, offset = self._film(request), int(request.query["offset"])
+        length = request.content_length
+        if offset < 0 or not length or length > MAX_PIECE_BYTES:
+            raise FilmRefused(413 if length else 400, "A piece has 1 byte to 8 MiB.")
+        if film.file.ended:
+            raise FilmRefused(409, film.file.reason or "The film is whole.")
+        async with asyncio.timeout(PIECE_TIMEOUT_S):
+            async for content, _ in request.content.iter_chunks():
+                await asyncio.to_thread(film.write, offset, content)
+                offset += len(content)
+        return self._progress(film)
+
+    async def _end(self, request: web.Request) -> web.Response:
+        film, total = self._film(request), int(request.query["size"])
+        if film.file.received < total:
+            return self._progress(film)
+        film.file.end()
+        return self._progress(film)
+
+    def _wake(self, number: str) -> None:
+        for listener in self._listeners.get(number, ()):
+            listener.set()
+
+    async def _messages(self, request: web.Request) -> web.StreamResponse:
+        """Send the newest message of each kind; a slow browser misses older ones."""
+        film, woken, after = self._film(request), asyncio.Event(), 0
+        headers = {**HEADERS, "Content-Type": "text/event-stream"}
+        answer = web.StreamResponse(headers=headers)
+        await answer.prepare(request)
+        listeners = self._listeners.setdefault(film.number, set())
+        listeners.add(woken)
+        try:
+            while True:
+                is_over = film.is_over
+                for number, kind, content in film.messages(after):
+                    after = number
+                    text = f"event: {kind}\ndata: {json.dumps(content)}\n\n"
+                    await answer.write(text.encode())
+                if is_over:
+                    await answer.write(b"event: over\ndata: {}\n\n")
+                    return answer
+                woken.clear()
+                try:
+                    await asyncio.wait_for(woken.wait(), HEARTBEAT_S)
+                except TimeoutError:
+                    await answer.write(b": alive\n\n")
+        except ConnectionError:
+            return answer
+        finally:
+            listeners.discard(woken)
+
+    async def _avatars(self, request: web.Request) -> web.Response:
+        return web.json_response(self._queue.avatars())
+
+    async def _avatar(self, request: web.Request) -> web.StreamResponse:
+        """A file of an avatar's player page, its poster, its package, or a mesh of it."""
+        name, file = request.match_info["name"], request.match_info["file"] or "index.html"
+        package = self._queue.package(name)
+        saved = {"Content-Disposition": f'attachment; filename="{name}{Path(file).suffix}"'}
+        if file == "avatar.iavatar":
+            return web.FileResponse(package, headers=saved | HEADERS)
+        if file in ("avatar.glb", "avatar.ply", "avatar.obj"):
+            content = await asyncio.to_thread(_mesh, package, file)
+            return web.Response(body=content, headers=saved)
+        if file == "poster.png":
+            content = await asyncio.to_thread(lambda: read_package(package).preview)
+            return web.Response(body=content, content_type="image/png")
+        written = package.stat().st_mtime
+        if self._pages.get(name, (0.0,))[0] != written:
+            self._pages = {name: (written, await asyncio.to_thread(_player_page, package, name))}
+        files = self._pages[name][1]
+        if file not in files:
+            raise InputError("There is no such file.")
+        kind = MIME_TYPES.get(Path(file).suffix, "application/octet-stream")
+        return web.Response(body=files[file], headers={"Content-Type": kind})
+
+
+def _player_page(package: Path, name: str) -> dict[str, bytes]:
+    """The files of the player page with the built-in motion."""
+    player, motion = Player.load(package), demo_motion()
+    rows = tuple(int(row) for row in np.flatnonzero(motion.valid))
+    clip = web_clip(player, motion, rows, pose_rate(motion))
+    return build_page(package, clip, name=name, compression_level=1)
+
+
+def _mesh(package: Path, file: str) -> bytes:
+    """A mesh of an avatar, as ia-export writes it."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / file
+        to: Any = out.suffix[1:]
+        chosen = ExportArguments(run=package, to=to, out=out, triangles=MESH_TRIANGLES)
+        export(chosen, Console())
+        return out.read_bytes()

@@ -1,0 +1,89 @@
+"""The phone page in headless Chromium, whose fake camera plays a film of the actor."""
+
+import signal
+import subprocess
+import sys
+
+import av
+import pytest
+
+from capture.input_error import InputError
+from capture.source_opening import open_source
+from export import player_page
+from instant_avatar.studio.shoot import ShootConfig, film_capture
+from tests.instant_avatar.browser import Browser, chromium, until
+
+pytest.importorskip("aiohttp")
+pytest.importorskip("segno")
+
+
+def has_runtime():
+    try:
+        player_page.runtime_files()
+    except InputError:
+        return False
+    return True
+
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(chromium() is None, reason="there is no Chromium here"),
+    pytest.mark.skipif(not has_runtime(), reason="onnxruntime-web is not here (make web)"),
+]
+
+
+@pytest.fixture(scope="module")
+def camera_film(tmp_path_factory):
+    """A film of the actor for Chromium's fake camera."""
+    folder = tmp_path_factory.mktemp("camera")
+    film_capture(folder / "film", ShootConfig(frames=60, size=240, turns=1.0, like_a_phone=True))
+    path = folder / "camera.mjpeg"
+    with av.open(str(path), "w", format="mjpeg") as container:
+        stream = None
+        frames = [frame.rgb for frame in open_source(folder / "film").frames()]
+        for rgb in [*frames, *frames[::-1]]:
+            if stream is None:
+                stream = container.add_stream("mjpeg", rate=15, options={"qmin": "2", "qmax": "4"})
+                stream.height, stream.width = rgb.shape[:2]
+                stream.pix_fmt = "yuvj420p"
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(rgb, format="rgb24")))
+        container.mux(stream.encode())
+    return path
+
+
+def test_a_film_of_the_pages_camera_becomes_an_avatar_in_its_player(camera_film, tmp_path):
+    command = [
+        sys.executable, "-m", "instant_avatar.phone.phone_command", "--out", str(tmp_path / "out"),
+        "--host", "127.0.0.1", "--port", "8731", "--size", "160", "--no-tls",
+    ]  # fmt: skip
+    server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    flags = [
+        "--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream",
+        f"--use-file-for-fake-video-capture={camera_film}",
+    ]  # fmt: skip
+    try:
+        address = server.stdout.readline().strip()
+        with Browser(tmp_path / "browser", size=(360, 740), flags=flags) as browser:
+            browser.emulate(scheme="light", size=(360, 740))
+            browser.go(address)
+            until(lambda: "Film an avatar" in browser.text(), 30.0)
+            assert browser.run("crossOriginIsolated")
+            browser.run("document.getElementById('name').value = 'Anna'")
+            browser.run("document.getElementById('live').click()")
+            until(lambda: "seen" in browser.text(), 120.0)
+            assert browser.run("document.documentElement.scrollWidth") <= 360
+            until(lambda: browser.run("!document.getElementById('preview').hidden"), 60.0)
+            browser.click("Stop")
+            until(lambda: browser.run("!document.getElementById('done').hidden"), 180.0)
+            played = "!!document.getElementById('player').contentWindow.player"
+            until(lambda: browser.run(played), 120.0)
+            assert browser.run(
+                "document.getElementById('player').contentWindow.crossOriginIsolated"
+            )
+    finally:
+        server.send_signal(signal.SIGINT)
+        assert server.wait(timeout=60.0) in (0, 130)
+        server.stdout.close()
+    (film,) = (tmp_path / "out" / "Anna").glob("film.*[!d]")
+    assert film.stat().st_size > 10_000
+    assert (tmp_path / "out" / "Anna" / "run" / "avatar.iavatar").is_file()

@@ -1,0 +1,189 @@
+"""The phone page's server, with clients that are slow, broken or hostile; nothing is trained."""
+
+import http.client
+import json
+import shutil
+import time
+
+import pytest
+
+pytest.importorskip("aiohttp")
+
+from instant_avatar.phone import film_queue, phone_server
+from instant_avatar.phone.access_control import AccessControl
+from instant_avatar.phone.film_queue import FilmQueue
+from instant_avatar.phone.phone_server import PhoneServer
+
+CONTENT = bytes(range(256)) * 40
+
+
+@pytest.fixture
+def queue(tmp_path, monkeypatch):
+    monkeypatch.setattr(film_queue, "MIN_FREE_BYTES", 0)
+    return FilmQueue(tmp_path, 0.2)
+
+
+@pytest.fixture
+def phone(queue):
+    """A browser that has entered with the token."""
+    access = AccessControl()
+    server = PhoneServer(queue, access, None)
+    server.start("127.0.0.1", [(0, None)])
+    port = server._runner.addresses[0][1]
+    yield Phone(port, access)
+    server.close()
+
+
+class Phone:
+    def __init__(self, port, access):
+        self.port, self.access = port, access
+        self.host = f"127.0.0.1:{port}"
+        entered = self.ask("GET", f"/?token={access.token}", cookie="")
+        assert entered.status == 303
+        self.cookie = entered.headers["Set-Cookie"].split(";")[0]
+
+    def ask(self, method, path, body=None, *, cookie=None, origin=None, **headers):
+        line = http.client.HTTPConnection("127.0.0.1", self.port, timeout=10.0)
+        sent = {"Cookie": self.cookie if cookie is None else cookie, **headers}
+        sent["Origin"] = origin or f"http://{self.host}"
+        line.request(method, path, body=body, headers=sent)
+        with line.getresponse() as answer:
+            answer.content = answer.read()
+        line.close()
+        return answer
+
+    def begin(self, **given):
+        note = {"name": "Anna", "type": "video/mp4", "size": len(CONTENT), **given}
+        answer = self.ask("POST", "/films", json.dumps(note))
+        assert answer.status == 201, answer.content
+        return json.loads(answer.content)["film"]
+
+
+def test_a_token_opens_the_page_once(phone):
+    old = phone.access.token
+    assert phone.ask("GET", f"/?token={old}", cookie="").status == 303
+    assert phone.ask("GET", f"/?token={old}", cookie="").status == 403
+    page = phone.ask("GET", "/")
+    assert page.status == 200
+    assert page.headers["Cross-Origin-Embedder-Policy"] == "require-corp"
+
+
+@pytest.mark.parametrize("path", ["/", "/films", "/avatars", "/page/capture.js", "/avatars/x/"])
+def test_without_a_session_everything_is_refused(phone, path):
+    assert phone.ask("GET", path, cookie="").status == 403
+    assert phone.ask("GET", path, cookie="session=guess").status == 403
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null"])
+def test_pages_of_other_sites_are_refused(phone, origin):
+    assert phone.ask("POST", "/films", "{}", origin=origin).status == 403
+
+
+def test_a_film_survives_two_broken_connections(phone, queue):
+    film = phone.begin()
+    for start, end in ((0, 3000), (3000, 7000)):
+        line = http.client.HTTPConnection("127.0.0.1", phone.port, timeout=10.0)
+        line.putrequest("PUT", f"/films/{film}?offset={start}")
+        for name, value in (("Cookie", phone.cookie), ("Origin", f"http://{phone.host}"),
+                            ("Content-Length", str(len(CONTENT) - start))):  # fmt: skip
+            line.putheader(name, value)
+        line.endheaders(CONTENT[start:end])
+        deadline = time.perf_counter() + 10.0
+        while json.loads(phone.ask("GET", f"/films/{film}").content)["received"] < end:
+            assert time.perf_counter() < deadline
+            time.sleep(0.05)  # fewer requests than a browser may send
+        line.close()
+    state = json.loads(phone.ask("GET", f"/films/{film}").content)
+    assert state["next"] == 7000
+    done = phone.ask("PUT", f"/films/{film}?offset=7000", CONTENT[7000:])
+    assert json.loads(done.content)["ended"]
+    assert next(iter(queue)).file.path.read_bytes() == CONTENT
+
+
+@pytest.mark.parametrize(
+    ("query", "size", "status"),
+    [
+        ("offset=-1", 10, 400),
+        ("offset=x", 10, 400),
+        ("", 10, 400),
+        ("offset=0", 0, 400),
+        ("offset=10000", 1000, 413),
+    ],
+)
+def test_malformed_and_oversized_pieces_are_refused(phone, query, size, status):
+    film = phone.begin()
+    answer = phone.ask("PUT", f"/films/{film}?{query}", bytes(size))
+    assert answer.status == (413 if query == "offset=-1" else status)
+    assert json.loads(phone.ask("GET", f"/films/{film}").content)["received"] == 0
+
+
+@pytest.mark.parametrize(
+    ("given", "status"),
+    [
+        ({"type": "text/html"}, 415),
+        ({"size": 1 << 40}, 413),
+        ({"size": -1}, 413),
+        ({"size": "many"}, 400),
+        ({"avatar": "../../etc"}, 404),
+        ({"avatar": "nothing"}, 404),
+    ],
+)
+def test_films_that_cannot_be_are_refused(phone, given, status):
+    note = {"name": "Anna", "type": "video/mp4", "size": 100, **given}
+    assert phone.ask("POST", "/films", json.dumps(note)).status == status
+
+
+def test_names_are_no_paths(phone, queue):
+    phone.begin(name="../../evil/../name")
+    film = next(iter(queue))
+    assert film.place.parent == queue.folder
+
+
+def test_a_gap_in_what_is_being_filmed_is_refused(phone):
+    film = phone.begin(size=None)
+    assert phone.ask("PUT", f"/films/{film}?offset=5", b"late").status == 409
+
+
+def test_another_browser_does_not_see_the_film(phone):
+    film = phone.begin()
+    entered = phone.ask("GET", f"/?token={phone.access.token}", cookie="")
+    other = entered.headers["Set-Cookie"].split(";")[0]
+    assert phone.ask("GET", f"/films/{film}", cookie=other).status == 404
+    assert phone.ask("PUT", f"/films/{film}?offset=0", b"x", cookie=other).status == 404
+
+
+def test_a_full_disk_ends_the_film_and_keeps_what_came(phone, queue, monkeypatch):
+    film = phone.begin()
+    assert phone.ask("PUT", f"/films/{film}?offset=0", CONTENT[:1000]).status == 200
+    full = shutil.disk_usage(queue.folder)._replace(free=-1)
+    monkeypatch.setattr(film_queue.shutil, "disk_usage", lambda place: full)
+    assert phone.ask("PUT", f"/films/{film}?offset=1000", CONTENT[1000:2000]).status == 507
+    state = json.loads(phone.ask("GET", f"/films/{film}").content)
+    assert state["ended"]
+    assert "disk" in state["reason"]
+    assert state["received"] == 1000
+
+
+def test_a_silent_phone_ends_its_film_by_name(phone, queue):
+    phone.begin()
+    film = queue.take_next(1.0)
+    film.heard_at -= 1.0
+    queue.end_silent()
+    assert film.file.ended
+    assert "fell silent" in film.file.reason
+
+
+def test_films_wait_for_those_before_them_by_name(phone, queue):
+    phone.begin(name="Anna")
+    phone.begin(name="Ben")
+    first, second = queue
+    assert queue.take_next(1.0) is first
+    kinds = {kind: content for _, kind, content in second.messages(0)}
+    assert kinds["state"] == {"state": "waiting", "behind": ["Anna"]}
+    queue.finish(first)
+    assert queue.take_next(1.0) is second
+
+
+def test_too_many_requests_must_wait(phone, monkeypatch):
+    monkeypatch.setattr(phone_server, "MAX_REQUESTS_PER_S", 3)
+    assert 429 in [phone.ask("GET", "/avatars").status for _ in range(8)]
