@@ -8,7 +8,7 @@ import numpy as np
 
 from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.coverage import coverage_advice
-from avatar.events import Finished, FrameArrived, Stepped, WaitingForFrame, Warned
+from avatar.events import Finished, FrameArrived, Stepped, WaitingForFrame
 from avatar.rig import canonical_rotations
 from instant_avatar.phone.film_queue import Film
 from instant_avatar.report.page_rendering import webp_data_uri
@@ -95,8 +95,6 @@ class FilmFeedback:
             case PackageWritten(is_final=is_final):
                 name = self._film.place.name
                 self._film.tell("avatar", name=name, final=is_final)
-            case Warned(message=message):
-                self._film.tell("warning", text=message)
             case Ended():
                 self._film.tell("state", state="done")
 

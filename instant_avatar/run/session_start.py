@@ -291,6 +291,9 @@ def _announce_duration(arguments: IngestArguments, trainer: Trainer, console: Co
     """Print how long training will take, and roughly what comes after it."""
     config = trainer.config
     if arguments.live and arguments.seconds is None and arguments.steps is None:
+        if arguments.video.is_file():
+            console.info("Training while the film comes, until its end.")
+            return
         console.info(
             f"Training while images come: until a file {DONE_FILE_NAME} lies in {arguments.video}, "
             f"no image has come for {arguments.idle_seconds:g} s, or Ctrl-C."
