@@ -16,7 +16,7 @@ from jaxtyping import Float, UInt8
 
 from capture.source import Frame, FrameSource
 from capture.source_opening import glance
-from preprocess.masks.color_models import DARK_LEVEL
+from preprocess.masks.color_models import DARK_LEVEL, DarkFilmBrightener
 from preprocess.tracking.blazepose import OVERLAPPING, distance_in_sides
 from preprocess.tracking.blazepose_networks import (
     BlazePoseDetector,
@@ -154,9 +154,9 @@ class FirstLook:
 
 def look_at(source: FrameSource) -> FirstLook:
     """Look at a few frames of a recording; nothing else of it is decoded."""
-    pairs, finder = glance(source), PersonFinder()
+    pairs, finder, brighten = glance(source), PersonFinder(), DarkFilmBrightener()
     first = [pair[0] for pair in pairs]
-    seen = [finder.find(frame.rgb) for frame in first]
+    seen = [finder.find(brighten(frame.rgb)) for frame in first]
     found = [each for each in seen if each.persons]
     cut: Counter[TrackingProblem] = Counter()
     for each in found:

@@ -76,6 +76,7 @@ def test_feet_that_are_cut_off_are_named(look, frames):
 def test_a_dark_film_is_named_with_its_brightness(look, frames):
     seen = look([(0.06 * frame).astype(np.uint8) for frame in frames])
     assert seen.level < 20.0
+    assert seen.found == seen.frames
     assert any(f"reach {seen.level:.0f} of 255" in advice for advice in seen.advice())
 
 
