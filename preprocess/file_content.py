@@ -133,6 +133,8 @@ def _decode(data: bytes, path: Path) -> Any:
         if inflater.unconsumed_tail:
             raise ValueError(f"it unpacks to more than {MAX_BYTES >> 20} MiB")
         return _plain(load_safe_pickle(unpacked), {})
+    if data.startswith(b"glTF") or data[:64].lstrip().startswith(b"HIERARCHY"):
+        return data  # skeletons, which have their own readers
     if data[:64].lstrip()[:1] in (b"{", b"["):
         try:
             return json.loads(data.decode("utf-8"))

@@ -85,6 +85,7 @@ class PlayArguments:
         ia-play run/avatar.iavatar --turntable --background transparent
         ia-play run/avatar.iavatar --poses dance.npz --out dance.mp4
         ia-play run/avatar.iavatar --poses amass.npz --orbit 40 --size 1280x720
+        ia-play run/avatar.iavatar --poses walk.bvh
 
     Needs no GPU and no torch. Without --camera the camera stands in front of the first pose,
     follows the pelvis and shows the standing person at 80 % of the image height.
@@ -96,8 +97,9 @@ class PlayArguments:
     avatar: Annotated[Positional[Path], arg(metavar="AVATAR")]
     """The .iavatar package."""
     poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """Poses: an .npz with global_orient, body_pose, transl (or poses, trans), or a file of AMASS,
-    AIST++ or a tracker (docs/formats.md; default: a turn, a wave, a few steps)."""
+    """Poses: an .npz with global_orient, body_pose, transl (or poses, trans), a motion of a
+    skeleton (.bvh, .glb, .vrma), or a file of AMASS, AIST++ or a tracker (docs/formats.md;
+    default: a turn, a wave, a few steps)."""
     person: Annotated[str | None, arg(metavar="ID", help_behavior_hint="")] = None
     """Person ID in the pose file (default: the longest track)."""
     still: Annotated[int | None, arg(metavar="ROW", help_behavior_hint="")] = None

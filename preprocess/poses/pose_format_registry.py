@@ -12,11 +12,13 @@ from capture.input_error import InputError
 from preprocess.body.body_pose import Motion
 from preprocess.capture_paths import resolve_pose_path
 from preprocess.file_content import explain_damage, read_untrusted_file
-from preprocess.poses import mocap_formats, video_trackers
+from preprocess.poses import mocap_formats, skeleton_files, video_trackers
 from preprocess.poses.instant_avatar import parse_instant_avatar, parse_per_frame
 from preprocess.poses.motion_builder import MAX_GAP_FRAMES, MotionByPerson, fill_gaps
 
 TRACKERS: dict[str, Callable[[Any, bool], MotionByPerson | None]] = {
+    "BVH": skeleton_files.parse_bvh,
+    "glTF": skeleton_files.parse_gltf,
     "PHALP (4D-Humans)": video_trackers.parse_phalp,
     "WHAM": video_trackers.parse_wham,
     "VIBE": video_trackers.parse_vibe,

@@ -17,6 +17,7 @@ from export.package.package_file import read_package
 from export.skinned_mesh import extract_mesh
 from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import body_from_rest, rotation_matrices, world_from_body
+from preprocess.poses.pose_format_registry import read_poses
 from tests.export.test_isosurface import is_closed, volume
 
 TYPES = {5126: "<f4", 5125: "<u4", 5123: "<u2", 5121: "u1"}
@@ -262,3 +263,17 @@ def test_a_texture_is_read_by_another_reader(simple, package, motion):
     assert np.abs(image.astype(float) - simple.texture.image).mean() < 3.0  # a JPEG
     (sampler,) = read.json["samplers"]
     assert sampler["minFilter"] == 9987  # mipmaps
+
+
+def test_the_animation_is_read_back_as_the_motion(file, motion, tmp_path):
+    path = tmp_path / "dance.glb"
+    path.write_bytes(file)
+    again = read_poses(path)
+    for ours, given in zip(again.joint_rotations, motion.joint_rotations, strict=True):
+        np.testing.assert_allclose(rotation_matrices(ours), rotation_matrices(given), atol=1e-4)
+    roots = Rotation.from_rotvec(motion.root_rotations)
+    turned = (roots[0].inv() * roots).as_matrix()
+    np.testing.assert_allclose(rotation_matrices(again.root_rotations), turned, atol=1e-4)
+    way = roots[0].inv().apply(motion.root_translations - motion.root_translations[0])
+    moved = again.root_translations - again.root_translations[0]
+    np.testing.assert_allclose(moved, way, atol=1e-4)

@@ -1,0 +1,262 @@
+"""BVH and glTF as other programs write them move SMPL's joints as the truth does."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from capture.input_error import InputError
+from preprocess.body.kinematics import JOINT_NAMES, PARENTS, body_from_rest, rotation_matrices
+from preprocess.body.parametric_body import load_body_model
+from preprocess.poses.pose_format_registry import read_poses
+
+SIDED = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist")
+AXIS = ("pelvis", "spine1", "spine2", "spine3", "neck", "head")
+
+
+def named(axis: str, limbs: str, pattern: str) -> dict[str, str]:
+    """Another program's names by SMPL's; `pattern` joins a side and a limb."""
+    names = dict(zip(AXIS, axis.split(), strict=True))
+    for side in ("left", "right"):
+        for joint, limb in zip(SIDED, limbs.split(), strict=True):
+            fields = {"side": side, "Side": side.title(), "S": side[0].upper(), "limb": limb}
+            names[f"{side}_{joint}"] = pattern.format(**fields)
+    return names
+
+
+MIXAMO = named(
+    "mixamorig:Hips mixamorig:Spine mixamorig:Spine1 mixamorig:Spine2 mixamorig:Neck "
+    "mixamorig:Head",
+    "UpLeg Leg Foot ToeBase Shoulder Arm ForeArm Hand",
+    "mixamorig:{Side}{limb}",
+)
+BLENDER = named(
+    "hips spine spine.001 chest neck head",
+    "thigh shin foot toe shoulder upper_arm forearm hand",
+    "{limb}.{S}",
+)
+VRM = named(
+    "hips spine chest upperChest neck head",
+    "UpperLeg LowerLeg Foot Toes Shoulder UpperArm LowerArm Hand",
+    "{side}{limb}",
+)
+SMPL = {name: name for name in JOINT_NAMES}
+FRAMES = 12
+DEGREES = 180.0 / np.pi
+
+
+@pytest.fixture(scope="module")
+def truth():
+    """Joint rotations of a person who starts in a T, bends everything and turns; pelvis, metres."""
+    generator = np.random.default_rng(4)
+    share = np.linspace(0.0, 1.0, FRAMES)[:, None, None]
+    rotations = share * generator.normal(0.0, 0.35, (24, 3))
+    rotations[:, 0, 1] += 1.5 * share[:, 0, 0]
+    rotations[:, 22:] = 0.0
+    places = np.array([0.3, 0.9, -0.2]) + share[:, 0] * [0.5, 0.1, 1.0]
+    return rotations, places
+
+
+class Rig:
+    """SMPL's tree under other names, in another unit, up-axis and orientation of joints."""
+
+    def __init__(self, names, *, unit=1.0, up=None, twist=None):
+        rest = load_body_model().joints
+        self.joints = [j for j, name in enumerate(JOINT_NAMES) if name in names]
+        self.names = [names[JOINT_NAMES[j]] for j in self.joints]
+        self.parents = [self.joints.index(PARENTS[j]) if j else -1 for j in self.joints]
+        self.up = np.eye(3) if up is None else up
+        self.unit = unit
+        generator = np.random.default_rng(1)
+        count = len(self.joints)
+        self.axes = (
+            Rotation.from_rotvec(twist * generator.normal(size=(count, 3))).as_matrix()
+            if twist
+            else np.tile(np.eye(3), (count, 1, 1))
+        )  # of each joint in the T, in the world
+        self.offsets = np.zeros((count, 3))
+        for row, (joint, parent) in enumerate(zip(self.joints, self.parents, strict=True)):
+            if parent >= 0:
+                bone = self.up @ (rest[joint] - rest[PARENTS[joint]])
+                self.offsets[row] = unit * self.axes[parent].T @ bone
+
+    def locals(self, rotations):
+        """Rotations of all joints in their parents' axes."""
+        turned = rotation_matrices(rotations)
+        world = [turned[:, 0]]
+        for joint in range(1, 24):
+            world.append(world[PARENTS[joint]] @ turned[:, joint])
+        world = np.stack(world, axis=1)[:, self.joints]
+        world = self.up @ world @ self.up.T @ self.axes
+        local = world.copy()
+        for row, parent in enumerate(self.parents):
+            if parent >= 0:
+                local[:, row] = world[:, parent].swapaxes(-1, -2) @ world[:, row]
+        return local
+
+    def bvh(self, rotations, places, order="ZXY", fps=60.0):
+        def block(row, depth):
+            pad, offset = "\t" * depth, " ".join(f"{x:.6f}" for x in self.offsets[row])
+            kinds = ["Xposition", "Yposition", "Zposition"] if row == 0 else []
+            kinds += [f"{axis}rotation" for axis in order]
+            lines = [f"{pad}{'JOINT' if row else 'ROOT'} {self.names[row]}", f"{pad}{{",
+                     f"{pad}\tOFFSET {offset}",
+                     f"{pad}\tCHANNELS {len(kinds)} {' '.join(kinds)}"]  # fmt: skip
+            rows.append(row)
+            children = [r for r, parent in enumerate(self.parents) if parent == row]
+            for child in children:
+                lines += block(child, depth + 1)
+            if not children:
+                lines += [f"{pad}\tEnd Site", f"{pad}\t{{", f"{pad}\t\tOFFSET 0 1 0", f"{pad}\t}}"]
+            return [*lines, f"{pad}}}"]
+
+        rows: list[int] = []
+        lines = ["HIERARCHY", *block(0, 0), "MOTION", f"Frames: {len(rotations)}",
+                 f"Frame Time: {1.0 / fps:.8f}"]  # fmt: skip
+        local = self.locals(rotations)
+        for frame in range(len(rotations)):
+            numbers = list(self.unit * self.up @ places[frame])
+            for row in rows:
+                numbers += list(
+                    Rotation.from_matrix(local[frame, row]).as_euler(order, degrees=True)
+                )
+            lines.append(" ".join(f"{x:.6f}" for x in numbers))
+        return ("\n".join(lines) + "\n").encode()
+
+    def glb(self, rotations, places, fps=25.0):
+        local, nodes, views, accessors, binary = self.locals(rotations), [], [], [], bytearray()
+
+        def add(array, kind):
+            array = np.ascontiguousarray(array, dtype="<f4")
+            view = {"buffer": 0, "byteOffset": len(binary), "byteLength": array.nbytes}
+            views.append(view)
+            accessors.append({"bufferView": len(views) - 1, "componentType": 5126,
+                              "count": len(array), "type": kind})  # fmt: skip
+            binary.extend(array.tobytes())
+            return len(accessors) - 1
+
+        times = add(np.arange(len(rotations)) / fps, "SCALAR")
+        samplers, channels = [], []
+        for row, name in enumerate(self.names):
+            children = [r for r, parent in enumerate(self.parents) if parent == row]
+            node = {"name": name, "translation": self.offsets[row].tolist()}
+            nodes.append(node | ({"children": children} if children else {}))
+            quaternions = Rotation.from_matrix(local[:, row]).as_quat()
+            for path, values, kind in (
+                ("rotation", quaternions, "VEC4"),
+                ("translation", self.unit * places @ self.up.T, "VEC3"),
+            ):
+                if path == "rotation" or row == 0:
+                    samplers.append({"input": times, "output": add(values, kind)})
+                    channels.append({"sampler": len(samplers) - 1,
+                                     "target": {"node": row, "path": path}})  # fmt: skip
+        text = json.dumps({
+            "asset": {"version": "2.0"}, "nodes": nodes, "bufferViews": views,
+            "accessors": accessors, "buffers": [{"byteLength": len(binary)}],
+            "animations": [{"samplers": samplers, "channels": channels}],
+        }).encode()  # fmt: skip
+        text += b" " * (-len(text) % 4)
+        chunks = struct.pack("<I4s", len(text), b"JSON") + text
+        chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
+        return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+
+
+def errors(motion, truth):
+    """Largest error of a joint's place, metres, and of its rotation, degrees; legs are equal."""
+    rotations, places = truth
+    rest, parents = load_body_model().joints, np.array(PARENTS)
+    joints, off = [], 0.0
+    for turned, place in ((rotations, places),
+                          (np.concatenate([motion.root_rotations[:, None],
+                                           motion.joint_rotations], axis=1),
+                           rest[0] + motion.root_translations)):  # fmt: skip
+        rows = []
+        for frame in range(FRAMES):
+            bones = body_from_rest(rest, parents, turned[frame, 1:])
+            points = np.einsum("jab,jb->ja", bones[:, :3, :3], rest) + bones[:, :3, 3] - rest[0]
+            rows.append(points @ rotation_matrices(turned[frame, 0]).T + place[frame])
+        joints.append(np.array(rows))
+    ours = np.concatenate([motion.root_rotations[:, None], motion.joint_rotations], axis=1)
+    change = rotation_matrices(rotations).swapaxes(-1, -2) @ rotation_matrices(ours)
+    off = Rotation.from_matrix(change[:, :22].reshape(-1, 3, 3)).magnitude().max() * DEGREES
+    return np.abs(joints[0] - joints[1]).max(), off
+
+
+@pytest.mark.parametrize(
+    ("names", "changes"),
+    [
+        (SMPL, {}),
+        (MIXAMO, {"unit": 100.0}),
+        (BLENDER, {"up": Z_UP}),
+        (VRM, {"unit": 39.37, "twist": 1.0}),  # joints of any orientation, as LaFAN's are
+    ],
+    ids=["SMPL", "Mixamo", "Blender, z up", "joints turned"],
+)
+@pytest.mark.parametrize("form", ["bvh", "glb"])
+def test_a_skeleton_of_any_names_units_and_axes_moves_as_the_truth(
+    truth, tmp_path, names, changes, form
+):
+    path = tmp_path / f"walk.{form}"
+    path.write_bytes(getattr(Rig(names, **changes), form)(*truth))
+    motion = read_poses(path)
+    metres, degrees = errors(motion, truth)
+    assert metres < 0.005
+    assert degrees < 0.5
+    rate = {"bvh": 60.0, "glb": 25.0}[form]
+    np.testing.assert_allclose(motion.times_s, np.arange(FRAMES) / rate, atol=1e-5)
+
+
+def test_a_chain_of_five_vertebrae_bends_as_a_whole(truth, tmp_path):
+    """Of more joints than SMPL has, the chest's own rotation is what counts."""
+    rotations = np.zeros_like(truth[0])
+    rotations[:, JOINT_NAMES.index("spine2"), 0] = np.linspace(0.0, 0.8, FRAMES)
+    text = Rig(MIXAMO).bvh(rotations, truth[1]).decode()
+    path = tmp_path / "bow.bvh"
+    path.write_text(text.replace("mixamorig:Spine1", "Vertebra"))
+    np.testing.assert_allclose(read_poses(path).joint_rotations, rotations[:, 1:], atol=0.01)
+
+
+def test_a_skeleton_of_no_person_is_refused_by_the_joints_that_it_lacks(truth, tmp_path):
+    path = tmp_path / "dog.bvh"
+    data = Rig(MIXAMO).bvh(*truth).replace(b"mixamorig:LeftForeArm", b"mixamorig:FrontPaw")
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"dog\.bvh.*left_elbow.*FrontPaw"):
+        read_poses(path)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "reason"),
+    [
+        (lambda data: data[: data.index(b"MOTION")], "the part MOTION is missing"),
+        (lambda data: data.replace(b"Frame Time", b"Zeit"), "Frame Time"),
+        (lambda data: data[: data.index(b"Frame Time")] + b"Frame Time: 0.03\n1 2 3", "no frames"),
+    ],
+)
+def test_a_damaged_file_is_refused_with_its_cause(truth, tmp_path, spoil, reason):
+    path = tmp_path / "broken.bvh"
+    path.write_bytes(spoil(Rig(MIXAMO).bvh(*truth)))
+    with pytest.raises(InputError, match=reason):
+        read_poses(path)
+
+
+def test_a_file_cut_short_gives_the_frames_that_it_has(truth, tmp_path):
+    path = tmp_path / "cut.bvh"
+    lines = Rig(MIXAMO).bvh(*truth).splitlines()
+    path.write_bytes(b"\n".join(lines[:-5]))
+    assert len(read_poses(path)) == FRAMES - 5
+
+
+def test_a_model_without_an_animation_is_named(truth, tmp_path):
+    data = Rig(VRM).glb(*truth)
+    size = struct.unpack_from("<I", data, 12)[0]
+    text = json.loads(data[20 : 20 + size]) | {"animations": []}
+    whole = json.dumps(text).encode().ljust(size)
+    path = tmp_path / "still.vrm"
+    path.write_bytes(data[:20] + whole + data[20 + size :])
+    with pytest.raises(InputError, match="no animation"):
+        read_poses(path)
