@@ -211,7 +211,7 @@ def _gltf_motion(
         at = np.clip(times_s, times[0], times[-1])
         if path == "rotation":
             turns = Rotation.from_quat(values)
-            turned = Slerp(times, turns)(at) if len(times) > 1 else turns[[0] * count]
+            turned = Slerp(times, turns)(at) if len(times) > 1 else turns
             rotations[:, node] = turned.as_matrix()
         else:
             translations[:, node] = np.column_stack(

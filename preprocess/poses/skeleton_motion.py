@@ -72,9 +72,7 @@ class SkeletonMotion:
         """
         target = load_body_model().joints
         source = match_joints(self.names, self.parents)
-        is_smpl = all(source[name] is not None for name in JOINT_NAMES) and {
-            _plain(name) for name in JOINT_NAMES
-        } <= {_plain(name) for name in self.names}
+        is_smpl = {_plain(name) for name in JOINT_NAMES} <= {_plain(name) for name in self.names}
         turned, places = _forward(self.parents, self.rotations, self.translations)
         # the rest pose comes last
         at_rest = np.broadcast_to(np.eye(3), (1, len(self.names), 3, 3))
@@ -83,7 +81,7 @@ class SkeletonMotion:
             np.concatenate([turned, rest_turned]),
             np.concatenate([places, rest_places]),
         )
-        columns = [-1 if source[name] is None else source[name] for name in JOINT_NAMES]
+        columns = [-1 if column is None else column for column in source.values()]
         up = _y_up(places[:-1, columns])
         turned, places = up @ turned, places @ up.T
         points = places[:, columns]
@@ -115,7 +113,7 @@ class SkeletonMotion:
 
 
 def match_joints(names: Sequence[str], parents: Int[np.ndarray, "joints"]) -> dict[str, int | None]:
-    """The joint of a skeleton for each of SMPL's, by name; None for one that is missing.
+    """The joint of a skeleton for each of SMPL's, in their order; None for one that is missing.
 
     Raises:
         ValueError: If a joint that is needed is missing; the message names it.

@@ -18,7 +18,8 @@ AXIS = ("pelvis", "spine1", "spine2", "spine3", "neck", "head")
 
 def named(axis: str, limbs: str, pattern: str) -> dict[str, str]:
     """Another program's names by SMPL's; `pattern` joins a side and a limb."""
-    names = dict(zip(AXIS, axis.split(), strict=True))
+    names: dict[str, str] = {}
+    names.update(zip(AXIS, axis.split(), strict=True))
     for side in ("left", "right"):
         for joint, limb in zip(SIDED, limbs.split(), strict=True):
             fields = {"side": side, "Side": side.title(), "S": side[0].upper(), "limb": limb}
@@ -208,6 +209,7 @@ def test_a_skeleton_of_any_names_units_and_axes_moves_as_the_truth(
     assert metres < 0.005
     assert degrees < 0.5
     rate = {"bvh": 60.0, "glb": 25.0}[form]
+    assert motion.times_s is not None
     np.testing.assert_allclose(motion.times_s, np.arange(FRAMES) / rate, atol=1e-5)
 
 
