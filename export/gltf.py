@@ -1,4 +1,4 @@
-"""A skinned mesh with its skeleton and a motion, as glTF 2.0 in one binary file (.glb)."""
+"""A skinned mesh with its skeleton and a motion, as glTF 2.0 in one binary file (.glb, .vrm)."""
 
 import json
 import struct
@@ -29,6 +29,17 @@ JPEG_QUALITY = 95
 """Quality of the texture's JPEG, of 100."""
 FIRST_JOINT = 2
 """Node of the first joint; 0 is the mesh and 1 the floor."""
+_VRM_AXIS = {"pelvis": "hips", "spine1": "spine", "spine2": "chest", "spine3": "upperChest",
+             "neck": "neck", "head": "head"}  # fmt: skip
+_VRM_LIMBS = {"hip": "UpperLeg", "knee": "LowerLeg", "ankle": "Foot", "foot": "Toes",
+              "collar": "Shoulder", "shoulder": "UpperArm", "elbow": "LowerArm",
+              "wrist": "Hand"}  # fmt: skip
+VRM_BONES = {JOINT_NAMES.index(joint): bone for joint, bone in _VRM_AXIS.items()} | {
+    JOINT_NAMES.index(f"{side}_{joint}"): side + bone
+    for side in ("left", "right")
+    for joint, bone in _VRM_LIMBS.items()
+}
+"""VRM's humanoid bones by joint; the two hands of SMPL beyond the wrists have none."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -86,37 +97,81 @@ def encode_glb(
     for importers without that extension. The canonical pose is the bind pose and the rest pose.
     """
     draft = _GltfBuffer()
-    skin, nodes = _skeleton(draft, mesh, manifest)
+    bends = np.concatenate([np.zeros((1, 3)), manifest.canonical_rotations])
+    skin, nodes = _skeleton(draft, mesh, manifest, bends)
+    return _encode_scene(
+        draft, mesh, manifest, skin, nodes, name, {"animations": [_animation(draft, animation)]}
+    )
+
+
+def encode_vrm(mesh: SkinnedMesh, manifest: Manifest, *, name: str, author: str) -> bytes:
+    """Encode a skinned mesh and its skeleton as a VRM 1.0 file, which rests in a T.
+
+    Expressions are left empty, as no face was told apart. What the licence allows is the least
+    that VRM knows: the author alone may play the avatar, not commercially, unmodified.
+    (vrm.dev, VRMC_vrm-1.0.)
+    """
+    draft = _GltfBuffer()
+    skin, nodes = _skeleton(draft, mesh, manifest, np.zeros((24, 3)))
+    humanoid = {bone: {"node": FIRST_JOINT + joint} for joint, bone in VRM_BONES.items()}
+    meta = {
+        "name": name,
+        "authors": [author],
+        "copyrightInformation": manifest.licence,
+        "licenseUrl": "https://vrm.dev/licenses/1.0/",
+        "avatarPermission": "onlyAuthor",
+        "commercialUsage": "personalNonProfit",
+        "creditNotation": "required",
+        "modification": "prohibited",
+    }
+    vrm = {"specVersion": "1.0", "meta": meta, "humanoid": {"humanBones": humanoid}}
+    return _encode_scene(
+        draft, mesh, manifest, skin, nodes, name, {"extensions": {"VRMC_vrm": vrm}}
+    )
+
+
+def _encode_scene(
+    draft: "_GltfBuffer",
+    mesh: SkinnedMesh,
+    manifest: Manifest,
+    skin: dict[str, Any],
+    nodes: list[dict[str, Any]],
+    name: str,
+    more: dict[str, Any],
+) -> bytes:
+    """Encode the mesh below its skeleton, and more entries of the file."""
     content = {
         "asset": {
             "version": "2.0",
             "generator": "instant-avatar-stream",
             "copyright": manifest.licence,
         },
-        "extensionsUsed": ["KHR_materials_unlit"],
+        "extensionsUsed": ["KHR_materials_unlit", *more.get("extensions", {})],
         "scene": 0,
         "scenes": [{"nodes": [0, 1]}],
         "nodes": [{"name": name, "mesh": 0, "skin": 0}, *nodes],
         "meshes": [{"name": name, "primitives": [_primitive(draft, mesh)]}],
         **_material(draft, mesh),
         "skins": [skin],
-        "animations": [_animation(draft, animation)],
+        **more,
         **draft.describe(),
     }
     return _pack_glb(content, bytes(draft.binary))
 
 
 def _skeleton(
-    draft: "_GltfBuffer", mesh: SkinnedMesh, manifest: Manifest
+    draft: "_GltfBuffer", mesh: SkinnedMesh, manifest: Manifest, bent: Float[np.ndarray, "24 3"]
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Return the skin, and the joints' nodes below one that puts the feet on the floor."""
+    """Return the skin, and the joints' nodes below one that puts the feet on the floor.
+
+    `bent` are the axis-angles in which the joints rest; the mesh is bound in the canonical pose.
+    """
     rest, parents = manifest.rest_joints, manifest.parents
     canonical = body_from_rest(rest, parents, manifest.canonical_rotations)
     canonical_from_joint = canonical.copy()
     canonical_from_joint[:, :3, 3] += np.einsum("jab,jb->ja", canonical[:, :3, :3], rest)
     inverse = np.linalg.inv(canonical_from_joint)
     inverse[:, 3] = [0.0, 0.0, 0.0, 1.0]
-    bent = np.concatenate([np.zeros((1, 3)), manifest.canonical_rotations])
     bends = Rotation.from_rotvec(bent).as_quat()
     nodes: list[dict[str, Any]] = []
     for joint, parent in enumerate(parents):
@@ -126,7 +181,10 @@ def _skeleton(
         nodes.append({**node, "rotation": bends[joint].tolist(), "children": children})
         if not children:
             del nodes[-1]["children"]
-    floor = {"translation": [0.0, -float(mesh.positions[:, 1].min()), 0.0]}
+    at_rest = body_from_rest(rest, parents, bent[1:]) @ np.linalg.inv(canonical)
+    heights = np.einsum("jb,vb->vj", at_rest[:, 1, :3], mesh.positions) + at_rest[:, 1, 3]
+    heights = (np.take_along_axis(heights, mesh.joints.astype(int), 1) * mesh.weights).sum(axis=1)
+    floor = {"translation": [0.0, -float(heights.min()) / 255.0, 0.0]}
     skin = {
         # column-major, as glTF has it
         "inverseBindMatrices": draft.add(inverse.transpose(0, 2, 1).astype(np.float32)),

@@ -15,7 +15,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from capture.atomic_files import atomic_file
 from capture.camera import Camera
 from capture.input_error import InputError
-from export.gltf import SkeletonAnimation, encode_glb
+from export.gltf import SkeletonAnimation, encode_glb, encode_vrm
 from export.package.manifest import Manifest
 from export.package.package_file import read_package
 from export.skinned_mesh import SkinnedMesh, extract_mesh
@@ -63,6 +63,10 @@ class ExportArguments:
 
         ia-export run/avatar.iavatar --to glb --poses dance.npz --out dance.glb
 
+    For programs that animate VRM avatars:
+
+        ia-export run/avatar.iavatar --to vrm --triangles 20000 --out me.vrm
+
     The run continues undisturbed; nothing in its folder is changed unless --out names it. A mesh is
     opaque with a hard silhouette: ia-play renders the avatar in full quality.
 
@@ -71,9 +75,9 @@ class ExportArguments:
 
     run: Annotated[Positional[Path], arg(metavar="RUN|AVATAR")]
     """Folder written by ia-ingest (--out), with checkpoint/; for meshes also a package."""
-    to: Literal["iavatar", "glb", "ply", "obj"] = "iavatar"
-    """Format: package for ia-play; binary glTF 2.0; or a static mesh with vertex colors as PLY or
-    OBJ (canonical pose, no skeleton)."""
+    to: Literal["iavatar", "glb", "vrm", "ply", "obj"] = "iavatar"
+    """Format: package for ia-play; binary glTF 2.0; VRM 1.0 (humanoid bones, resting in a T); or a
+    static mesh with vertex colors as PLY or OBJ (canonical pose, no skeleton)."""
     out: Annotated[Path, arg(metavar="FILE", help_behavior_hint="(required)")]
     """File to write, whole or not at all."""
     poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
@@ -81,8 +85,10 @@ class ExportArguments:
     person: Annotated[str | None, arg(metavar="ID", help_behavior_hint="")] = None
     """Person ID in the pose file (default: the longest track)."""
     triangles: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
-    """Number of triangles of a mesh, for game engines and phones; a .glb then has a texture
+    """Number of triangles of a mesh, for game engines and phones; a .glb or .vrm then has a texture
     (default: some 300,000, with vertex colors). 20,000 are enough for most."""
+    author: Annotated[str, arg(metavar="NAME", help_behavior_hint="")] = "unknown"
+    """Author that --to vrm states; the licence in it allows the author's own use alone."""
     overwrite: Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")] = False
     """Replace the file that --out names, if it exists."""
 
@@ -109,7 +115,7 @@ def export(arguments: ExportArguments, console: Console) -> int:
     if arguments.poses is not None and arguments.to != "glb":
         raise InputError(f"--poses requires --to glb; a .{arguments.to} holds no motion.")
     if arguments.triangles is not None and arguments.to == "iavatar":
-        raise InputError("--triangles requires --to glb, ply or obj; a package has none.")
+        raise InputError("--triangles requires --to glb, vrm, ply or obj; a package has none.")
     if arguments.triangles is not None and arguments.triangles < MIN_TRIANGLES:
         raise InputError(
             f"--triangles is {arguments.triangles}, but must be at least {MIN_TRIANGLES}."
@@ -136,8 +142,8 @@ def _export_mesh(arguments: ExportArguments, package: Path, console: Console) ->
     if arguments.poses is not None:
         joints = held.manifest.rest_joints
         motion = load_driving_motion(arguments.poses, joints, console, person=arguments.person)
-    to_glb, out = arguments.to == "glb", arguments.out
-    textured = to_glb and arguments.triangles is not None
+    out = arguments.out
+    textured = arguments.to in ("glb", "vrm") and arguments.triangles is not None
     if textured and find_spec("xatlas") is None:
         textured = False
         console.info("note: colors of vertices instead of a texture, which needs xatlas.")
@@ -147,8 +153,10 @@ def _export_mesh(arguments: ExportArguments, package: Path, console: Console) ->
             triangles=arguments.triangles,
             textured=textured,
         )
-        if to_glb:
+        if arguments.to == "glb":
             content = _encode_animated(mesh, held.manifest, motion, out.stem)
+        elif arguments.to == "vrm":
+            content = encode_vrm(mesh, held.manifest, name=out.stem, author=arguments.author)
         else:
             content = _encode_static(mesh, arguments.to)
     with atomic_file(out, replace=arguments.overwrite) as part:
@@ -186,7 +194,7 @@ def _export_package(folder: Path, out: Path, console: Console, *, fine_tune: boo
     if folder.is_file():
         raise InputError(
             f"{folder} is a file, but must be a folder written by ia-ingest. A package can be "
-            "converted with --to glb, --to ply and --to obj."
+            "converted with --to glb, vrm, ply and obj."
         )
     run = RunFolder(path=folder)
     if not run.has_checkpoint():

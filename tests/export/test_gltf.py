@@ -12,7 +12,7 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from export.gltf import SkeletonAnimation, encode_glb
+from export.gltf import SkeletonAnimation, encode_glb, encode_vrm
 from export.package.package_file import read_package
 from export.skinned_mesh import extract_mesh
 from preprocess.body.body_pose import Motion
@@ -92,8 +92,8 @@ class Read:
     def skinned(self, key=None):
         """World positions at a key of the animation; without one, as the skeleton rests."""
         nodes = [dict(node) for node in self.json["nodes"]]
-        clip = self.json["animations"][0]
-        for channel in clip["channels"] if key is not None else []:
+        clip = self.json["animations"][0] if key is not None else {"channels": []}
+        for channel in clip["channels"]:
             values = self.array(clip["samplers"][channel["sampler"]]["output"])
             nodes[channel["target"]["node"]][channel["target"]["path"]] = values[key]
         world = {}
@@ -277,3 +277,36 @@ def test_the_animation_is_read_back_as_the_motion(file, motion, tmp_path):
     way = roots[0].inv().apply(motion.root_translations - motion.root_translations[0])
     moved = again.root_translations - again.root_translations[0]
     np.testing.assert_allclose(moved, way, atol=1e-4)
+
+
+VRM_NEEDS = {
+    "hips", "spine", "head",
+    *(side + bone for side in ("left", "right")
+      for bone in ("UpperLeg", "LowerLeg", "Foot", "UpperArm", "LowerArm", "Hand")),
+}  # fmt: skip
+"""Bones that VRM 1.0 requires."""
+
+
+def test_a_vrm_names_its_bones_and_rests_in_a_t_on_the_floor(mesh, package):
+    manifest = package.manifest
+    vrm = Read(encode_vrm(mesh, manifest, name="x", author="Anna"))
+    extension = vrm.json["extensions"]["VRMC_vrm"]
+    assert "VRMC_vrm" in vrm.json["extensionsUsed"]
+    assert extension["meta"]["authors"] == ["Anna"]
+    assert extension["meta"]["avatarPermission"] == "onlyAuthor"
+    bones = {name: bone["node"] for name, bone in extension["humanoid"]["humanBones"].items()}
+    assert bones.keys() >= VRM_NEEDS
+    assert vrm.json["nodes"][bones["leftLowerArm"]]["name"] == "left_elbow"
+    assert "animations" not in vrm.json
+    points = vrm.skinned()
+    assert points[:, 1].min() == pytest.approx(0.0, abs=1e-6)
+    # in a T the wrists are as far apart as the arms are long
+    left, right = (
+        np.take_along_axis(mesh.weights, (mesh.joints == joint).argmax(axis=1)[:, None], 1)[:, 0]
+        * (mesh.joints == joint).any(axis=1)
+        for joint in (20, 21)
+    )
+    hands = [points[weight > 200].mean(axis=0) for weight in (left, right)]
+    rest = manifest.rest_joints
+    assert hands[0][0] - hands[1][0] > rest[20, 0] - rest[21, 0]
+    assert abs(hands[0][1] - hands[1][1]) < 0.05
