@@ -30,10 +30,14 @@ from instant_avatar.run.session_events import (
 )
 from preprocess.body.body_pose import BodyPose
 from preprocess.masks.color_models import DARK_LEVEL
+from preprocess.tracking.blazepose import SEEN_AGO
 from preprocess.tracking.video_tracking import TrackingProblem, touched_borders
 
 LOOKS_TO_SPEAK = 2
 """Tracked frames in a row that must show the same before the page speaks of it."""
+CROWDED_LOOKS = SEEN_AGO + 1
+"""The same for another person, whom the tracker must have seen twice; it looks every few frames."""
+CROWDED = "Two people are in the picture: only one may be."
 MAP_INTERVAL_S = 2.0
 """Interval between two drawings of the body map, seconds."""
 PREVIEW_TIME_SHARE = 0.08
@@ -59,7 +63,7 @@ def framing_advice(seen: Tracked) -> str | None:
     if person is None:
         return "Step into the picture, from head to feet."
     if person.crowded:
-        return "Two people are in the picture: only one may be."
+        return CROWDED
     cut = touched_borders(person, seen.frame.size_px)
     return next((text for problem, text in CUT_SENTENCES.items() if problem in cut), None)
 
@@ -105,7 +109,7 @@ class FilmFeedback:
         self._framing = text
         time_s = round(seen.frame.time_s, 2)
         self._film.tell("seconds", seconds=time_s)
-        if self._repeats >= LOOKS_TO_SPEAK:
+        if self._repeats >= (CROWDED_LOOKS if text == CROWDED else LOOKS_TO_SPEAK):
             coverage = self._started.coverage if self._started is not None else None
             advice = "" if coverage is None else coverage_advice(coverage)
             text = text or advice or "Good. Now turn round slowly."

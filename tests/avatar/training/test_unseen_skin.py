@@ -167,11 +167,11 @@ def test_unseen_skin_becomes_like_its_sources(rig, clip, generator):
         colors, source_colors = torch.sigmoid(raw[:, :3]).chunk(2)
         apart.append([
             float((points - sources).abs().mean()),
-            float((sources[:, None] * (colors - source_colors).abs()).mean()),
+            float((sources * (colors - source_colors).abs().mean(dim=1)).sum() / sources.sum()),
         ])  # fmt: skip
     (opacity_without, color_without), (opacity_with, color_with) = apart
     assert opacity_with < 0.95 * opacity_without  # 0.69 to 0.86 with other random numbers
-    assert color_with < color_without  # 0.90 to 0.97
+    assert color_with < 0.75 * color_without  # 0.45 to 0.50
 
 
 def test_a_checkpoint_keeps_what_was_seen(rig, frame, tmp_path):
