@@ -260,6 +260,7 @@ def test_unreadable_input_is_reported_in_the_json_too(tmp_path, call_check):
     assert found["refused"] in said
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 def test_lost_poses_and_jumps_are_odd(spoilt, call_check, changed):
     folder = spoilt()

@@ -94,6 +94,7 @@ def test_something_was_learnt(report):
     assert report["held_out"]["overlap"] > 0.8
 
 
+@pytest.mark.slow
 def test_a_result_that_is_no_avatar_is_called_that_and_kept(
     capture, call_ingest, without_baking, tmp_path, monkeypatch
 ):

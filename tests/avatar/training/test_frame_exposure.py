@@ -120,6 +120,7 @@ def trainers(rig, clip):
     return trained
 
 
+@pytest.mark.slow
 def test_training_finds_the_exposure_of_each_frame(trainers):
     found = trainers[0].exposures.by_frame
     dark = np.mean([found[i] for i in (1, 3, 5)], axis=0)

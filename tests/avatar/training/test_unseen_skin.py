@@ -145,6 +145,7 @@ def test_the_gradient_is_that_of_cross_entropy_to_a_source_that_stands_still(gen
     assert not found[6:].any()
 
 
+@pytest.mark.slow
 def test_unseen_skin_becomes_like_its_sources(rig, clip, generator):
     """Front views alone: opacity and color of points and sources, with the loss and without."""
     front = [seen for seen in clip.observations if abs(seen.pose.root_rotation[1]) < 0.8]

@@ -163,6 +163,7 @@ def test_what_is_exact_already_stays(tune, renderer, tables):
     assert after.psnr[0] == after.psnr[1] > 60.0
 
 
+@pytest.mark.slow
 def test_bricks_that_became_worse_are_not_kept(tune, renderer, spoilt):
     def lies(pose, camera):
         """True pictures for the judge, which come first; swapped channels for training."""

@@ -90,6 +90,7 @@ def test_without_a_name_a_still_lies_beside_the_package(call_play, package, nove
     (package.parent / "poses-3.png").unlink()
 
 
+@pytest.mark.slow
 def test_without_poses_it_moves_all_the_same(call_play, package):
     outcome = call_play(package, "--size", 32, "--tier", "lite")
     assert outcome.code == 0

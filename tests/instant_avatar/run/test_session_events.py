@@ -104,6 +104,7 @@ def write_twice(avatar, path, *, progress, gain_db=0.0, **options):
         )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_package_as_baked_stays_if_the_fine_tuned_one_is_refused(learn, monkeypatch):
     def refuse_the_second(avatar, path, **options):
         yield next(write_twice(avatar, path, **options))

@@ -14,6 +14,7 @@ from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
 from preprocess.poses.pose_format_registry import read_poses
 
+pytestmark = pytest.mark.slow  # tests/instant_avatar/test_sample.py films one, too
 FRAMES = 24
 PHONE = ShootConfig(frames=FRAMES, size=72, subject=3, like_a_phone=True)
 
