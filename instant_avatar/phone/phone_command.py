@@ -99,7 +99,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def capture(options: CaptureOptions, console: Console) -> int:
     """Serve the page, and learn from one film after the other until Ctrl-C."""
-    require_packages("torch", "numba", "onnx", "aiohttp", "cryptography", "segno")
+    require_packages("aiohttp", "cryptography", "segno", "torch", "numba", "onnx")
     options.validate()
     with exit_on_interrupt(console, PROGRAM), console.status("loading torch"):
         import instant_avatar.report.report_writer
