@@ -66,23 +66,23 @@ def test_a_film_of_the_pages_camera_becomes_an_avatar_in_its_player(camera_film,
         with Browser(tmp_path / "browser", size=(360, 740), flags=flags) as browser:
             browser.emulate(scheme="light", size=(360, 740))
             browser.go(address)
-            until(lambda: "Film an avatar" in browser.text(), 30.0)
+            until(lambda: "Film an avatar" in browser.text(), 300.0)
             assert browser.run("crossOriginIsolated")
             browser.run("document.getElementById('name').value = 'Anna'")
             browser.run("document.getElementById('live').click()")
-            until(lambda: "seen" in browser.text(), 120.0)
+            until(lambda: "seen" in browser.text(), 600.0)
             assert browser.run("document.documentElement.scrollWidth") <= 360
-            until(lambda: browser.run("!document.getElementById('preview').hidden"), 60.0)
+            until(lambda: browser.run("!document.getElementById('preview').hidden"), 600.0)
             browser.click("Stop")
-            until(lambda: browser.run("!document.getElementById('done').hidden"), 180.0)
+            until(lambda: browser.run("!document.getElementById('done').hidden"), 900.0)
             played = "!!document.getElementById('player').contentWindow.player"
-            until(lambda: browser.run(played), 120.0)
+            until(lambda: browser.run(played), 600.0)
             assert browser.run(
                 "document.getElementById('player').contentWindow.crossOriginIsolated"
             )
     finally:
         server.send_signal(signal.SIGINT)
-        assert server.wait(timeout=60.0) in (0, 130)
+        assert server.wait(timeout=600.0) in (0, 130)
         server.stdout.close()
     (film,) = (tmp_path / "out" / "Anna").glob("film.*[!d]")
     assert film.stat().st_size > 10_000
