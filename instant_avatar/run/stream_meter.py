@@ -125,8 +125,8 @@ class StreamMeter:
                 "the frame rate. The others are enough if the person moves slowly; else reduce "
                 "--size."
             )
-        playback = self._source.paced and not self._source.live
-        if playback and not dropped and late.p95 > LATENESS_WARNING_S:
+        is_playback = self._source.paced and self._source.frame_count is not None
+        if is_playback and not dropped and late.p95 > LATENESS_WARNING_S:
             yield (
                 f"Playback lagged by up to {max(self.lateness_s):.1f} s (median {late.p50:.1f} s): "
                 "preprocessing is slower than the frame rate. No frame was dropped. Reduce --size, "

@@ -98,3 +98,14 @@ def test_of_very_many_lost_frames_only_the_number_is_kept():
     assert len(list(meter.count_observations(lost))) == MAX_DROPPED_LISTED + 500
     assert meter.dropped_count == MAX_DROPPED_LISTED + 500
     assert [note.index for note in meter.dropped] == list(range(MAX_DROPPED_LISTED))
+
+
+@pytest.mark.parametrize(
+    ("frame_count", "hints"), [(3, 1), (None, 0)], ids=["--realtime", "a phone's film"]
+)
+def test_only_of_a_played_recording_other_options_are_advised(frame_count, hints):
+    source, now = Recorded(), time.perf_counter()
+    source.paced, source.frame_count = True, frame_count
+    meter = StreamMeter(threading.Event(), source)
+    list(meter.measure_arrival(frames([0.0, 1.0, 2.0], [now - 3.0, now - 2.0, now - 1.0])))
+    assert sum("--frames ::2" in message for message in meter.lateness_warnings()) == hints
