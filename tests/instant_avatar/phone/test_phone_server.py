@@ -79,7 +79,7 @@ def test_pages_of_other_sites_are_refused(phone, origin):
     assert phone.ask("POST", "/films", "{}", origin=origin).status == 403
 
 
-def test_a_film_survives_two_broken_connections(phone, queue):
+def test_a_film_survives_two_broken_connections(phone, queue, caplog):
     film = phone.begin()
     for start, end in ((0, 3000), (3000, 7000)):
         line = http.client.HTTPConnection("127.0.0.1", phone.port, timeout=120.0)
@@ -98,6 +98,7 @@ def test_a_film_survives_two_broken_connections(phone, queue):
     done = phone.ask("PUT", f"/films/{film}?offset=7000", CONTENT[7000:])
     assert json.loads(done.content)["ended"]
     assert next(iter(queue)).file.path.read_bytes() == CONTENT
+    assert caplog.records == []  # a break is no error of the server's
 
 
 @pytest.mark.parametrize(
