@@ -125,7 +125,7 @@ class PhoneServer:
             answer = web.json_response({"message": str(error)}, status=404)
         except (ValueError, KeyError, TypeError) as error:
             answer = web.json_response({"message": f"Malformed: {error}"}, status=400)
-        except ConnectionError as error:  # nobody is there to read the answer
+        except ConnectionError as error:  # the answer reaches no one
             answer = web.json_response({"message": f"The connection broke: {error}"}, status=400)
         if not answer.prepared:
             answer.headers.update(HEADERS)
