@@ -45,6 +45,8 @@ CHECK_VIEWS = 4
 """Synthetic views that validate a package without frames."""
 VIEW_PX = 256
 """Width and height of a synthetic view."""
+UNKNOWN_AUTHOR = "unknown"
+"""Author of a VRM file, which must state one, where none is given."""
 MIN_TRIANGLES = 500
 """Least --triangles; below it a hand is a lump."""
 
@@ -87,8 +89,9 @@ class ExportArguments:
     triangles: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """Number of triangles of a mesh, for game engines and phones; a .glb or .vrm then has a texture
     (default: some 300,000, with vertex colors). 20,000 are enough for most."""
-    author: Annotated[str, arg(metavar="NAME", help_behavior_hint="")] = "unknown"
-    """Author that --to vrm states; the licence in it allows the author's own use alone."""
+    author: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    """Author that --to vrm states (default: unknown); its licence allows the author's own use
+    alone."""
     overwrite: Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")] = False
     """Replace the file that --out names, if it exists."""
 
@@ -114,6 +117,8 @@ def export(arguments: ExportArguments, console: Console) -> int:
     check_output_file(arguments.out, "--out", inputs, overwrite=arguments.overwrite)
     if arguments.poses is not None and arguments.to != "glb":
         raise InputError(f"--poses requires --to glb; a .{arguments.to} holds no motion.")
+    if arguments.author is not None and arguments.to != "vrm":
+        raise InputError(f"--author requires --to vrm; a .{arguments.to} states none.")
     if arguments.triangles is not None and arguments.to == "iavatar":
         raise InputError("--triangles requires --to glb, vrm, ply or obj; a package has none.")
     if arguments.triangles is not None and arguments.triangles < MIN_TRIANGLES:
@@ -156,7 +161,9 @@ def _export_mesh(arguments: ExportArguments, package: Path, console: Console) ->
         if arguments.to == "glb":
             content = _encode_animated(mesh, held.manifest, motion, out.stem)
         elif arguments.to == "vrm":
-            content = encode_vrm(mesh, held.manifest, name=out.stem, author=arguments.author)
+            content = encode_vrm(
+                mesh, held.manifest, name=out.stem, author=arguments.author or UNKNOWN_AUTHOR
+            )
         else:
             content = _encode_static(mesh, arguments.to)
     with atomic_file(out, replace=arguments.overwrite) as part:

@@ -10,6 +10,8 @@ import tempfile
 from pathlib import Path
 from typing import final
 
+from capture.input_error import InputError
+
 CERTIFICATE_DAYS = 7
 """Days for which a certificate is valid."""
 
@@ -48,7 +50,7 @@ def local_address() -> str:
 
 
 def made_certificate(address: str) -> ssl.SSLContext:
-    """Make a certificate for an address, which no authority has signed."""
+    """Make a certificate for an address or a name, which no authority has signed."""
     from cryptography import x509
     from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import ec
@@ -57,8 +59,11 @@ def made_certificate(address: str) -> ssl.SSLContext:
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "ia-capture")])
     now = datetime.datetime.now(datetime.UTC)
-    places = {ipaddress.ip_address(address), ipaddress.ip_address("127.0.0.1")}
-    names = [x509.DNSName("localhost"), *(x509.IPAddress(place) for place in places)]
+    names = {x509.DNSName("localhost"), x509.IPAddress(ipaddress.ip_address("127.0.0.1"))}
+    try:
+        names.add(x509.IPAddress(ipaddress.ip_address(address)))
+    except ValueError:
+        names.add(x509.DNSName(address))
     certificate = (
         x509.CertificateBuilder()
         .subject_name(name)
@@ -85,7 +90,13 @@ def made_certificate(address: str) -> ssl.SSLContext:
 
 
 def load_certificate(certificate: Path, key: Path) -> ssl.SSLContext:
-    """Load a certificate and its key."""
+    """Load a certificate and its key; an InputError if they are none, or do not belong together."""
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
-    context.load_cert_chain(certificate, key)
+    try:
+        context.load_cert_chain(certificate, key)
+    except ssl.SSLError as error:
+        raise InputError(
+            f"--cert {certificate} and --key {key} cannot be used: {error.reason or error}. "
+            "Both must be PEM files, and the key that of the certificate."
+        ) from None
     return context

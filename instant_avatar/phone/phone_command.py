@@ -2,6 +2,7 @@
 
 import errno
 import sys
+import threading
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -52,8 +53,8 @@ class CaptureOptions:
     Films and avatars are kept in --out, one folder a person. Each printed address opens the page
     once, in one browser; nothing leaves your network. Ctrl-C closes the page.
 
-    Exit codes: 0 closed by Ctrl-C while no film was learnt from; 2 bad input; 3 disk full or port
-    in use; 130 Ctrl-C during a film, after its avatar was written.
+    Exit codes: 0 closed by Ctrl-C while no film was learnt from; 2 bad input or port in use; 3 disk
+    full; 130 Ctrl-C during a film, after its avatar was written.
     """
 
     out: Annotated[Path, arg(metavar="DIR")] = Path("avatars")
@@ -131,11 +132,13 @@ def capture(options: CaptureOptions, console: Console) -> int:
     try:
         server.start(options.host or "0.0.0.0", sites)
     except OSError as error:
-        if error.errno != errno.EADDRINUSE:
-            raise
-        raise InputError(
-            f"Port {options.port} or the next is in use. Pass another --port."
-        ) from None
+        if error.errno == errno.EADDRINUSE:
+            cause = f"Port {options.port} or the next is in use. Pass another --port."
+        else:
+            cause = (
+                f"The page cannot be served at {address}: {error.strerror}. Check --host, --port."
+            )
+        raise InputError(cause) from None
     print_address()
     try:
         return _serve(options, queue, console)
@@ -168,8 +171,6 @@ def _print_address(address: str, console: Console) -> None:
 
 
 def _serve(options: CaptureOptions, queue: "FilmQueue", console: Console) -> int:
-    import threading
-
     closed = threading.Event()
 
     def watch() -> None:

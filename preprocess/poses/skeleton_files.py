@@ -70,6 +70,7 @@ def parse_bvh(content: Any, prefer_world: bool = False) -> MotionByPerson | None
         names=names,
         parents=np.array(parents),
         offsets=np.array(offsets),
+        rest_rotations=np.tile(np.eye(3), (len(names), 1, 1)),
         rotations=rotations,
         translations=translations,
         times_s=np.arange(count) * frame_time,
@@ -186,7 +187,8 @@ def _gltf_motion(
         parents[node.get("children", [])] = number
     order = _parents_first(parents)
     offsets = np.array([node.get("translation", [0.0] * 3) for node in nodes], dtype=np.float64)
-    rest = np.array([node.get("rotation", [0.0, 0.0, 0.0, 1.0]) for node in nodes])
+    quaternions = [node.get("rotation", [0.0, 0.0, 0.0, 1.0]) for node in nodes]
+    rest = Rotation.from_quat(quaternions).as_matrix()
     keyed = []
     for channel in animation["channels"]:
         node, path = channel["target"].get("node"), channel["target"]["path"]
@@ -205,7 +207,7 @@ def _gltf_motion(
     step = step if MIN_FRAME_TIME_S < step <= MAX_KEY_STEP_S else 1.0 / GLTF_FPS
     count = min(round((end - begin) / step) + 1, MAX_POSES)
     times_s = begin + np.arange(count) * step
-    rotations = np.tile(Rotation.from_quat(rest).as_matrix(), (count, 1, 1, 1))
+    rotations = np.tile(rest, (count, 1, 1, 1))
     translations = np.tile(offsets, (count, 1, 1))
     for node, path, times, values in keyed:
         at = np.clip(times_s, times[0], times[-1])
@@ -223,6 +225,7 @@ def _gltf_motion(
         names=[names[node] for node in order],
         parents=place[parents[order]],
         offsets=offsets[order],
+        rest_rotations=rest[order],
         rotations=rotations[:, order],
         translations=translations[:, order],
         times_s=times_s - begin,
@@ -237,4 +240,6 @@ def _parents_first(parents: np.ndarray) -> list[int]:
         node = waiting.pop()
         order.append(node)
         waiting += np.flatnonzero(parents == node).tolist()
+    if len(order) < len(parents):
+        raise ValueError("its nodes are their own ancestors")
     return order

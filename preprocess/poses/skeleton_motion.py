@@ -52,6 +52,7 @@ class SkeletonMotion:
         names: Of the joints, each after its parent.
         parents: -1 for a root.
         offsets: Place of each joint in its parent's axes at rest, in the file's unit.
+        rest_rotations: Of each joint in its parent's axes at rest.
         rotations: Of each joint in its parent's axes.
         translations: Place of each joint in its parent's axes, in the file's unit.
         times_s: Time of each pose, seconds.
@@ -60,6 +61,7 @@ class SkeletonMotion:
     names: Sequence[str]
     parents: Int[np.ndarray, "joints"]
     offsets: Float[np.ndarray, "joints 3"]
+    rest_rotations: Float[np.ndarray, "joints 3 3"]
     rotations: Float[np.ndarray, "poses joints 3 3"]
     translations: Float[np.ndarray, "poses joints 3"]
     times_s: Float[np.ndarray, "poses"]
@@ -74,9 +76,10 @@ class SkeletonMotion:
         source = match_joints(self.names, self.parents)
         is_smpl = {_plain(name) for name in JOINT_NAMES} <= {_plain(name) for name in self.names}
         turned, places = _forward(self.parents, self.rotations, self.translations)
-        # the rest pose comes last
-        at_rest = np.broadcast_to(np.eye(3), (1, len(self.names), 3, 3))
-        rest_turned, rest_places = _forward(self.parents, at_rest, self.offsets[None])
+        # the rest pose comes last; SMPL's own is the T in which no joint is turned
+        at_rest = np.broadcast_to(np.eye(3), (len(self.names), 3, 3))
+        at_rest = at_rest if is_smpl else self.rest_rotations
+        rest_turned, rest_places = _forward(self.parents, at_rest[None], self.offsets[None])
         turned, places = (
             np.concatenate([turned, rest_turned]),
             np.concatenate([places, rest_places]),
@@ -133,8 +136,7 @@ def match_joints(names: Sequence[str], parents: Int[np.ndarray, "joints"]) -> di
         for joint, known in END_NAMES.items():
             matched[f"{side}_{joint}"] = find([side + name for name in known], taken)
         matched[f"{side}_collar"] = find([side + name for name in COLLAR_NAMES], taken)
-        hand = find([f"{side}hand"], taken)
-        matched[f"{side}_hand"] = hand
+        matched[f"{side}_hand"] = find([f"{side}hand"], taken)
     needed = ["pelvis", "head", *(f"{s}_{j}" for s in ("left", "right") for j in LIMB_NAMES)]
     missing = [name for name in needed if matched[name] is None]
     if missing:
@@ -149,8 +151,9 @@ def match_joints(names: Sequence[str], parents: Int[np.ndarray, "joints"]) -> di
 def _match_axis(matched: dict[str, int | None], parents: Int[np.ndarray, "joints"]) -> None:
     """Give SMPL's three spine joints and its neck the joints between pelvis, chest and head."""
     arm, head = _chain(matched["left_shoulder"], parents), _chain(matched["head"], parents)
-    shared = [joint for joint in head if joint in arm]
-    chest = shared[0]  # the nearest one to both
+    chest = next((joint for joint in head if joint in arm), None)  # the nearest one to both
+    if chest is None:
+        raise ValueError("its head and its arms hang on different roots")
     torso = [joint for joint in _chain(chest, parents)[::-1] if joint not in
              _chain(matched["pelvis"], parents)]  # fmt: skip
     if torso:

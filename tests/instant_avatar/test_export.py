@@ -134,6 +134,7 @@ def test_a_package_becomes_a_still_mesh_in_color(run, call_export, tmp_path, nam
         (["--to", "ply", "--out", "a.ply", "--poses", "poses.npz"], "--poses"),
         (["--to", "glb", "--out", "a.glb", "--poses", "nowhere.npz"], "nowhere.npz"),
         (["--to", "glb", "--out", "a.glb", "--triangles", "10"], "at least 500"),
+        (["--to", "glb", "--out", "a.glb", "--author", "Anna"], "--author requires --to vrm"),
         (["--out", "a.iavatar", "--triangles", "1000"], "--to glb, vrm, ply or obj"),
     ],
 )

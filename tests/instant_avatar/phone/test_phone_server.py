@@ -9,8 +9,13 @@ import pytest
 
 pytest.importorskip("aiohttp")
 
+from capture.input_error import InputError
 from instant_avatar.phone import film_queue, phone_server
-from instant_avatar.phone.access_control import AccessControl
+from instant_avatar.phone.access_control import (
+    AccessControl,
+    load_certificate,
+    made_certificate,
+)
 from instant_avatar.phone.film_queue import FilmQueue
 from instant_avatar.phone.phone_server import PhoneServer
 
@@ -188,3 +193,15 @@ def test_films_wait_for_those_before_them_by_name(phone, queue):
 def test_too_many_requests_must_wait(phone, monkeypatch):
     monkeypatch.setattr(phone_server, "MAX_REQUESTS_PER_S", 1)
     assert 429 in [phone.ask("GET", "/avatars").status for _ in range(8)]
+
+
+@pytest.mark.parametrize("address", ["192.168.0.7", "localhost", "studio.local"])
+def test_a_certificate_is_made_for_an_address_or_a_name(address):
+    assert made_certificate(address).cert_store_stats() is not None
+
+
+def test_what_is_no_certificate_is_bad_input(tmp_path):
+    path = tmp_path / "notes.pem"
+    path.write_text("notes")
+    with pytest.raises(InputError, match=r"--cert .*notes\.pem.*PEM files"):
+        load_certificate(path, path)

@@ -139,10 +139,13 @@ class Rig:
             return len(accessors) - 1
 
         times = add(np.arange(len(rotations)) / fps, "SCALAR")
+        rest = self.locals(np.zeros((1, 24, 3)))[0]
         samplers, channels = [], []
         for row, name in enumerate(self.names):
             children = [r for r, parent in enumerate(self.parents) if parent == row]
-            node = {"name": name, "translation": self.offsets[row].tolist()}
+            at_rest = Rotation.from_matrix(rest[row]).as_quat()
+            node = {"name": name, "translation": self.offsets[row].tolist(),
+                    "rotation": at_rest.tolist()}  # fmt: skip
             nodes.append(node | ({"children": children} if children else {}))
             quaternions = Rotation.from_matrix(local[:, row]).as_quat()
             for path, values, kind in (
@@ -177,7 +180,7 @@ def errors(motion, truth):
                                            motion.joint_rotations], axis=1),
                            rest[0] + motion.root_translations)):  # fmt: skip
         rows = []
-        for frame in range(FRAMES):
+        for frame in range(len(turned)):
             bones = body_from_rest(rest, parents, turned[frame, 1:])
             points = np.einsum("jab,jb->ja", bones[:, :3, :3], rest) + bones[:, :3, 3] - rest[0]
             rows.append(points @ rotation_matrices(turned[frame, 0]).T + place[frame])
@@ -211,6 +214,16 @@ def test_a_skeleton_of_any_names_units_and_axes_moves_as_the_truth(
     rate = {"bvh": 60.0, "glb": 25.0}[form]
     assert motion.times_s is not None
     np.testing.assert_allclose(motion.times_s, np.arange(FRAMES) / rate, atol=1e-5)
+
+
+def test_a_gltf_whose_motion_holds_no_t_is_read_by_its_rest_pose(truth, tmp_path):
+    """Joints of any orientation, and only the poses that are bent most."""
+    rotations, places = (each[FRAMES // 2 :] for each in truth)
+    path = tmp_path / "bent.glb"
+    path.write_bytes(Rig(VRM, unit=39.37, twist=1.0).glb(rotations, places))
+    metres, degrees = errors(read_poses(path), (rotations, places))
+    assert metres < 0.005
+    assert degrees < 0.5
 
 
 def test_a_chain_of_five_vertebrae_bends_as_a_whole(truth, tmp_path):
@@ -261,4 +274,18 @@ def test_a_model_without_an_animation_is_named(truth, tmp_path):
     path = tmp_path / "still.vrm"
     path.write_bytes(data[:20] + whole + data[20 + size :])
     with pytest.raises(InputError, match="no animation"):
+        read_poses(path)
+
+
+def test_nodes_that_are_their_own_ancestors_are_refused(truth, tmp_path):
+    data = Rig(VRM).glb(*truth)
+    size = struct.unpack_from("<I", data, 12)[0]
+    text = json.loads(data[20 : 20 + size])
+    text["nodes"][-1]["children"] = [0]
+    whole = json.dumps(text, separators=(",", ":")).encode()
+    path = tmp_path / "circle.glb"
+    path.write_bytes(
+        data[:12] + struct.pack("<I4s", len(whole), b"JSON") + whole + data[20 + size :]
+    )
+    with pytest.raises(InputError, match="their own ancestors"):
         read_poses(path)
