@@ -66,7 +66,8 @@ def test_a_film_of_the_pages_camera_becomes_an_avatar_in_its_player(camera_film,
         with Browser(tmp_path / "browser", size=(360, 740), flags=flags) as browser:
             browser.emulate(scheme="light", size=(360, 740))
             browser.go(address)
-            until(lambda: "Film an avatar" in browser.text(), 300.0)
+            until(lambda: browser.run("!!document.getElementById('live')?.onclick"), 300.0)
+            assert "Film an avatar" in browser.text()
             assert browser.run("crossOriginIsolated")
             browser.run("document.getElementById('name').value = 'Anna'")
             browser.run("document.getElementById('live').click()")
