@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, final
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from capture.camera import Camera
 from preprocess.body.kinematics import descendant_matrix
@@ -158,17 +158,87 @@ class KeypointRows(NamedTuple):
     focal_jacobian: Float[np.ndarray, "frames rows"]
 
 
+class PlacedPoints(NamedTuple):
+    """Places of points on the body in camera axes, metres, and their derivatives."""
+
+    places: Float[np.ndarray, "frames points 3"]
+    pose_jacobian: Float[np.ndarray, "frames points 3 75"]
+    shape_jacobian: Float[np.ndarray, "frames points 3 coefficients"]
+
+
+@final
+class AttachedPoints:
+    """Points that are fixed in the frames of a person's joints."""
+
+    def __init__(
+        self,
+        space: ProportionSpace,
+        joints: Int[np.ndarray, "points"],
+        offsets_m: Float[np.ndarray, "points 3"],
+    ) -> None:
+        """Takes the joint of each point, and its place from there in the rest pose, metres."""
+        self._space, self._joints, self._offsets = space, joints, offsets_m
+        self._parents = space.shaped.body.parents
+        self._below = descendant_matrix(self._parents)[:, joints].T.copy()
+
+    def place(
+        self,
+        poses: ClipPoses,
+        rest_joints: Float[np.ndarray, "24 3"],
+        rotations: Float[np.ndarray, "frames 3 3"],
+        translations: Float[np.ndarray, "frames 3"],
+    ) -> PlacedPoints:
+        """Places in poses, for the rest joints of the present proportions and camera from world."""
+        joints, rotation = poses.joints(rest_joints, self._parents), rotations[:, None]
+        turns = rotation @ joints.turns
+        places = _apply(rotation, joints.places) + translations[:, None]
+        points = places[:, self._joints] + _apply(turns[:, self._joints], self._offsets)
+        by_shape = rotation @ self._joints_by_shape(joints)
+        return PlacedPoints(
+            points, self._by_pose(points, turns, places), by_shape[:, self._joints]
+        )
+
+    def _by_pose(
+        self,
+        points: Float[np.ndarray, "frames points 3"],
+        turns: Float[np.ndarray, "frames 24 3 3"],
+        places: Float[np.ndarray, "frames 24 3"],
+    ) -> Float[np.ndarray, "frames points 3 75"]:
+        """Derivatives of the points by joint rotations and the root's place, in camera axes."""
+        lever = points[:, :, None] - places[:, None]
+        lever *= self._below[..., None]
+        x, y, z = (lever[..., axis, None] for axis in range(3))
+        a, b, c = (turns[:, None, :, axis] for axis in range(3))
+        moved = np.empty((*points.shape[:2], 3, 75))
+        for axis, part in enumerate((b * z - c * y, c * x - a * z, a * y - b * x)):  # ω × lever
+            moved[:, :, axis, :72] = part.reshape(*points.shape[:2], 72)
+        moved[..., 72:] = np.eye(3)
+        return moved
+
+    def _joints_by_shape(
+        self, joints: PosedJoints
+    ) -> Float[np.ndarray, "frames 24 3 coefficients"]:
+        """Derivatives of the joints' places by the proportions, in world axes."""
+        moved = self._space.joint_directions
+        placed = np.empty((len(joints.turns), *moved.shape))
+        for joint, parent in enumerate(self._parents):
+            if parent < 0:
+                placed[:, joint] = moved[joint]
+            else:
+                bone = moved[joint] - moved[parent]
+                placed[:, joint] = placed[:, parent] + joints.turns[:, parent] @ bone
+        return placed
+
+
 @final
 class KeypointModel:
     """A person whose key points are compared with those of a clip."""
 
     def __init__(self, space: ProportionSpace) -> None:
         """Takes the shape at the space's origin."""
-        self._space = space
-        self._parents = space.shaped.body.parents
-        self._below = descendant_matrix(self._parents)[:, KEYPOINT_JOINTS].T.copy()
         size = float(np.ptp(space.shaped.vertices[:, 1])) / 1.7
         self.offsets_m = size * KEYPOINT_OFFSETS_M
+        self._attached = AttachedPoints(space, KEYPOINT_JOINTS, self.offsets_m)
 
     def compare(
         self,
@@ -182,15 +252,9 @@ class KeypointModel:
 
         `factors` multiply the precision of each frame's key points in the image.
         """
-        joints = poses.joints(rest_joints, self._parents)
-        rotation = cameras.rotations[:, None]
-        turns = rotation @ joints.turns
-        places = _apply(rotation, joints.places) + cameras.translations[:, None]
-        points = places[:, KEYPOINT_JOINTS] + _apply(turns[:, KEYPOINT_JOINTS], self.offsets_m)
-        by_pose = self._by_pose(points, turns, places)
-        by_shape = (rotation @ self._joints_by_shape(joints))[
-            :, KEYPOINT_JOINTS
-        ]  # frames, points, 3, coefficients
+        points, by_pose, by_shape = self._attached.place(
+            poses, rest_joints, cameras.rotations, cameras.translations
+        )
         depth = points[..., 2:]
         plane = points[..., :2] / depth
         scale = cameras.focal_px[:, None] / depth
@@ -225,37 +289,6 @@ class KeypointModel:
                 [(pixels - cameras.center_px[:, None]).reshape(frames, -1), 0.0 * farther], axis=1
             ),
         )
-
-    def _by_pose(
-        self,
-        points: Float[np.ndarray, "frames 33 3"],
-        turns: Float[np.ndarray, "frames 24 3 3"],
-        places: Float[np.ndarray, "frames 24 3"],
-    ) -> Float[np.ndarray, "frames 33 3 75"]:
-        """Derivatives of the points by joint rotations and the root's place, in camera axes."""
-        lever = points[:, :, None] - places[:, None]
-        lever *= self._below[..., None]
-        x, y, z = (lever[..., axis, None] for axis in range(3))
-        a, b, c = (turns[:, None, :, axis] for axis in range(3))
-        moved = np.empty((*points.shape[:2], 3, 75))
-        for axis, part in enumerate((b * z - c * y, c * x - a * z, a * y - b * x)):  # ω × lever
-            moved[:, :, axis, :72] = part.reshape(*points.shape[:2], 72)
-        moved[..., 72:] = np.eye(3)
-        return moved
-
-    def _joints_by_shape(
-        self, joints: PosedJoints
-    ) -> Float[np.ndarray, "frames 24 3 coefficients"]:
-        """Derivatives of the joints' places by the proportions, in world axes."""
-        moved = self._space.joint_directions
-        placed = np.empty((len(joints.turns), *moved.shape))
-        for joint, parent in enumerate(self._parents):
-            if parent < 0:
-                placed[:, joint] = moved[joint]
-            else:
-                bone = moved[joint] - moved[parent]
-                placed[:, joint] = placed[:, parent] + joints.turns[:, parent] @ bone
-        return placed
 
 
 _NEARER_M = np.zeros(33)

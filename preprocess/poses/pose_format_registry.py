@@ -12,7 +12,7 @@ from capture.input_error import InputError
 from preprocess.body.body_pose import Motion
 from preprocess.capture_paths import resolve_pose_path
 from preprocess.file_content import explain_damage, read_untrusted_file
-from preprocess.poses import mocap_formats, skeleton_files, video_trackers
+from preprocess.poses import body_joints, mocap_formats, skeleton_files, video_trackers
 from preprocess.poses.instant_avatar import parse_instant_avatar, parse_per_frame
 from preprocess.poses.motion_builder import MAX_GAP_FRAMES, MotionByPerson, fill_gaps
 
@@ -29,6 +29,7 @@ TRACKERS: dict[str, Callable[[Any, bool], MotionByPerson | None]] = {
     "EasyMocap": mocap_formats.parse_easymocap,
     "SLAHMR or 3DPW": mocap_formats.parse_slahmr,
     "AMASS or AIST++": mocap_formats.parse_amass,
+    "SAM 3D Body, GEM-X or joints": body_joints.parse_joints,
 }
 """Trackers by name, in the order in which they try to read a file."""
 

@@ -85,7 +85,7 @@ class SkeletonMotion:
             np.concatenate([places, rest_places]),
         )
         columns = [-1 if column is None else column for column in source.values()]
-        up = _y_up(places[:-1, columns])
+        up = find_upright(places[:-1, columns])
         turned, places = up @ turned, places @ up.T
         points = places[:, columns]
         if is_smpl:
@@ -205,10 +205,13 @@ def _forward(
     return turned, places
 
 
-def _y_up(points: Float[np.ndarray, "poses 24 3"]) -> Float[np.ndarray, "3 3"]:
-    """The rotation that turns the axis from feet to head to y, by the median over the motion."""
-    feet = points[:, [JOINT_NAMES.index("left_ankle"), JOINT_NAMES.index("right_ankle")]]
-    height = np.median(points[:, JOINT_NAMES.index("head")] - feet.mean(axis=1), axis=0)
+def find_upright(points: Float[np.ndarray, "poses 24 3"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation that turns the axis from feet to shoulders to y, by the median over a motion."""
+    feet, shoulders = (
+        points[:, [JOINT_NAMES.index(f"{side}_{joint}") for side in ("left", "right")]].mean(axis=1)
+        for joint in ("ankle", "shoulder")
+    )
+    height = np.nanmedian(shoulders - feet, axis=0)
     axis = int(np.abs(height).argmax())
     up = np.sign(height[axis]) * np.eye(3)[axis]
     return _shortest_turn(up, np.array([0.0, 1.0, 0.0]))

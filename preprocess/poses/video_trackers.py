@@ -298,7 +298,7 @@ def _link_people(frames: list[dict[str, Any]], numbers: Any) -> MotionByPerson:
             if names is not None:
                 name = str(int(np.asarray(names).reshape(-1)[row]))
             else:
-                name = _nearest_person(place, last, taken) or str(len(people))
+                name = nearest_person(place, last, taken) or str(len(people))
             taken.add(name)
             person = people.setdefault(name, {"frame_id": []})
             person["frame_id"].append(number)
@@ -309,7 +309,7 @@ def _link_people(frames: list[dict[str, Any]], numbers: Any) -> MotionByPerson:
     return {name: _romp_person(rows, rows["frame_id"]) for name, rows in people.items()}
 
 
-def _nearest_person(
+def nearest_person(
     place: Float[np.ndarray, "3"], last: dict[str, Float[np.ndarray, "3"]], taken: set[str]
 ) -> str | None:
     """The nearest person of the frames before; depth counts a third: it is the least certain."""

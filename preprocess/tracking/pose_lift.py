@@ -114,6 +114,14 @@ def _lift(
     shaped: ShapedBody,
     camera: Camera,
 ) -> BodyPose:
+    pose = lift_pose(world_m, shaped)
+    joints = shaped.with_pose(pose).joints()[list(PLACED_JOINTS)]
+    place = place_by_pixels(joints, image_px[list(PLACED_POINTS)], camera)
+    return replace(pose, root_translation=place)
+
+
+def lift_pose(world_m: Float[np.ndarray, "33 3"], shaped: ShapedBody) -> BodyPose:
+    """First guess of a pose by the shoulders, hips and limbs among the key points, unplaced."""
     rest, local = shaped.joints, np.tile(np.eye(3), (24, 1, 1))
     local[0] = _trunk_turn(rest[list(TRUNK_JOINTS)], world_m[list(TRUNK_POINTS)])
     for upper, middle, lower, *points, hinge in LIMBS:
@@ -124,12 +132,9 @@ def _lift(
         bent = turned.T @ second
         local[middle] = _swing(rest[lower] - rest[middle], bent)
     vectors = axis_angles_from_matrices(local)
-    pose = BodyPose(
+    return BodyPose(
         root_rotation=vectors[0], root_translation=np.zeros(3), joint_rotations=vectors[1:]
     )
-    joints = shaped.with_pose(pose).joints()[list(PLACED_JOINTS)]
-    place = place_by_pixels(joints, image_px[list(PLACED_POINTS)], camera)
-    return replace(pose, root_translation=place)
 
 
 def _trunk_turn(
