@@ -182,7 +182,7 @@ def align_capture(
         "poses",
         imported.paths.poses.name,
         (motion.note, *lost_pose_warnings(motion), *warnings),
-        uncertainty=0.0 if motion.proportions is None else 1.0,
+        uncertainty=1.0 if motion.is_fitted else 0.0,
     )
     cameras = Provenance("cameras", capture.cameras.source, (capture.cameras.note,))
     masks = _mask_provenance(capture.masks, imported.segmenter)

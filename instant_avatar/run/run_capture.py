@@ -85,7 +85,7 @@ def open_observations(
     if inputs.cameras == "solve":
         capture = _solve_cameras(arguments, capture, console)
     fitted = capture
-    if arguments.refine_poses and capture.motion.proportions is None:
+    if arguments.refine_poses and not capture.motion.is_fitted:
         fitted = _fit_to_masks(capture, fit, inputs, console, fit_body=not resumes)
     return RecordedObservations(fitted, realtime=inputs.realtime), capture
 

@@ -111,6 +111,11 @@ class Motion:
         """Number of rows, valid or not."""
         return len(self.root_rotations)
 
+    @property
+    def is_fitted(self) -> bool:
+        """Whether the poses were tracked here, and fitted to the film together with proportions."""
+        return self.proportions is not None and self.keypoints is not None
+
     def __getitem__(self, row: int) -> BodyPose:
         """The pose in one row."""
         return BodyPose(

@@ -98,11 +98,11 @@ def fit_capture(capture: Capture, *, fit_body: bool = True) -> CaptureFit | None
     Poses with key points are a first guess made of these alone, and are always changed. Without
     `fit_body` proportions stay, as those of an avatar's person.
 
-    Returns None if there are no masks that could be fitted, or if the poses' file holds
-    proportions: then they were fitted before.
+    Returns None if there are no masks that could be fitted, or if the poses were tracked here:
+    then they were fitted before.
     """
     tracked = capture.motion.keypoints is not None
-    if fit_body and capture.motion.proportions is not None:
+    if fit_body and capture.motion.is_fitted:
         return None
     fitter = make_fitter(capture)
     if fitter is None:

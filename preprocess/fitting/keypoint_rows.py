@@ -194,9 +194,7 @@ class AttachedPoints:
         places = _apply(rotation, joints.places) + translations[:, None]
         points = places[:, self._joints] + _apply(turns[:, self._joints], self._offsets)
         by_shape = rotation @ self._joints_by_shape(joints)
-        return PlacedPoints(
-            points, self._by_pose(points, turns, places), by_shape[:, self._joints]
-        )
+        return PlacedPoints(points, self._by_pose(points, turns, places), by_shape[:, self._joints])
 
     def _by_pose(
         self,

@@ -14,7 +14,12 @@ from jaxtyping import Float
 
 from preprocess.body.body_pose import Motion, PoseSpace, RelativeFocalLength
 from preprocess.body.kinematics import JOINT_NAMES, axis_angles_from_matrices, rotation_matrices
-from preprocess.fitting.joint_fitting import COMPARED_JOINTS, POINT_NAMES, fit_joints
+from preprocess.fitting.joint_fitting import (
+    COMPARED_JOINTS,
+    POINT_NAMES,
+    fit_joints,
+    rows_with_limbs,
+)
 from preprocess.frame_association import frame_numbers_from_names
 from preprocess.poses.motion_builder import MotionByPerson, build_motion
 from preprocess.poses.skeleton_motion import find_upright
@@ -51,7 +56,7 @@ COUNTS = {
     22: "SMPL-H", 24: "SMPL-H", 52: "SMPL-H", 55: "SMPL-X", 70: "MHR's key points", 73: "SMPL-H",
     77: "SOMA", 127: "SMPL-X", 144: "SMPL-X",
 }  # fmt: skip
-"""The body by its number of joints, where a file names none (127 under MHR's own keys are MHR's)."""
+"""The body by its number of joints, where a file names none (127 under MHR's own keys: MHR)."""
 SOMA_JOINTS = (
     "Hips", "Spine1", "Spine2", "Chest", "Neck1", "Neck2", "Head", "HeadEnd", "Jaw", "LeftEye",
     "RightEye",
@@ -122,6 +127,7 @@ class JointTrack:
         places: Of `POINT_NAMES`, in the file's unit; NaN where unknown.
         frames: Numbers of the frames; None if the file says nothing of them.
         fps: Rows a second, if the file says so.
+        turns: World rotations of our joints since SMPL's T-pose, if the file says so.
         lens: As in `build_motion`.
     """
 
@@ -130,6 +136,7 @@ class JointTrack:
     frames: list[int] | None = None
     fps: float | None = None
     space: PoseSpace = "world"
+    turns: Float[np.ndarray, "rows 24 3 3"] | None = None
     lens: Any = None
 
     def fitted(self) -> Motion:
@@ -138,14 +145,19 @@ class JointTrack:
         Raises:
             ValueError: If the joints are not those of a person.
         """
-        places = self.places * _unit_m(self.places)
+        rows = rows_with_limbs(self.places)
+        places, turns = self.places[rows], None if self.turns is None else self.turns[rows]
+        places = places * _unit_m(places)
         if self.space == "world":
-            places = places @ find_upright(places[:, :24]).T
-        numbers = np.arange(len(places)) if self.frames is None else np.array(self.frames)
-        found = fit_joints(places, numbers / (self.fps or 30.0))
-        apart = np.nanmean(found.distances_m, axis=0)
-        mean, worst = float(np.nanmean(apart)), int(np.nanargmax(apart))
-        name = JOINT_NAMES[COMPARED_JOINTS[worst]].replace("_", " ")
+            upright = find_upright(places[:, :24])
+            places, turns = places @ upright.T, None if turns is None else upright @ turns
+        numbers = np.array(self.frames or range(len(self.places)))[rows]
+        found = fit_joints(places, numbers / (self.fps or 30.0), turns)
+        known = np.isfinite(found.distances_m).all(axis=0)
+        apart = found.distances_m[:, known].mean(axis=0)
+        compared = np.array(COMPARED_JOINTS)[known]
+        mean, worst = float(apart.mean()), int(apart.argmax())
+        name = JOINT_NAMES[compared[worst]].replace("_", " ")
         said = (
             f"{1000.0 * mean:.0f} mm from it on average, the {name} {1000.0 * apart[worst]:.0f} mm"
         )
@@ -154,8 +166,8 @@ class JointTrack:
         rotations = axis_angles_from_matrices(found.poses.rotations)
         motion = build_motion(
             [rotations.reshape(len(rotations), 72)], found.poses.translations,
-            frames=None if self.frames is None else numbers[found.rows],
-            times_s=found.rows / self.fps if self.fps else None,
+            frames=numbers if self.frames or len(rows) < len(self.places) else None,
+            times_s=(numbers - numbers[0]) / self.fps if self.fps else None,
             body_model="body24", space=self.space, lens=self.lens,
         )  # fmt: skip
         note = f"The body was fitted to the joints of {self.body}: its joints are {said}."
@@ -181,11 +193,11 @@ def parse_joints(content: Any, prefer_world: bool = False) -> MotionByPerson | N
         return None
     fps = content.get("fps") if isinstance(content, dict) else None
     people: dict[str, list[_Item]] = {}
-    last: dict[str, Float[np.ndarray, "3"]] = {}
+    last: dict[str, Float[np.ndarray, 3]] = {}
     for _, group in groupby(items, key=lambda item: item.frame):
         taken: set[str] = set()
         for item in group:
-            place = np.nanmean(item.places[0], axis=0)
+            place = item.places[0, 1:3].mean(axis=0)  # of the hips
             name = item.person or nearest_person(place, last, taken) or str(len(people))
             taken.add(name)
             last[name] = place
@@ -215,12 +227,12 @@ def _find_people(node: Any, frame: int | None = None, person: str | None = None)
             return
         parts = {str(key): part for key, part in node.items() if _holds_more(part)}
         if len(parts) == 1:  # such as {"fps": 30, "frames": […]}
-            yield from _find_people(*parts.values(), frame, person)
+            yield from _find_people(next(iter(parts.values())), frame, person)
             return
         numbers = frame_numbers_from_names(parts)
         for number, (key, part) in zip(numbers, parts.items(), strict=True):
             named = (number, person) if frame is None else (frame, key)
-            yield from _find_people(part, *named)
+            yield from _find_people(part, named[0], named[1])
     elif _holds_more(node):
         for number, part in enumerate(node):
             yield from _find_people(part, number if frame is None else frame, person)
@@ -273,7 +285,8 @@ def _known_body(key: str, count: int, names: Any) -> str:
     if count not in COUNTS:
         raise ValueError(
             f"`{key}` holds {count} joints; expected the {', '.join(map(str, COUNTS))} of a body "
-            f"that is known ({', '.join(BODIES)}), or joint_names with {', '.join(JOINT_NAMES[:6])} …"
+            f"that is known ({', '.join(BODIES)}), or joint_names with "
+            f"{', '.join(JOINT_NAMES[:6])} …"
         )
     return COUNTS[count]
 
@@ -354,10 +367,15 @@ def _read_soma(content: Any, prefer_world: bool) -> JointTrack | None:
         bone = size * (rest - _soma_rest()[parent][1]) if parent else np.zeros(3)
         placed[name] = placed[parent] + (turned[parent] @ bone if parent else 0.0)
     places = np.full((len(root), len(POINT_NAMES), 3), np.nan)
-    for point, column in _columns("SOMA", None).items():
+    turns = np.empty((len(root), 24, 3, 3))
+    columns = _columns("SOMA", None)
+    for point, column in columns.items():
         places[:, POINT_NAMES.index(point)] = placed[SOMA_JOINTS[column]]
+    for joint, point in enumerate(JOINT_NAMES):
+        name = SOMA_JOINTS[columns[point.replace("hand", "wrist")]]
+        turns[:, joint] = turned[name]
     return JointTrack(
-        body="SOMA", places=places, space="camera" if in_camera else "world",
+        body="SOMA", places=places, turns=turns, space="camera" if in_camera else "world",
         lens=content.get("K_fullimg") if in_camera else None,
     )  # fmt: skip
 
@@ -378,5 +396,5 @@ def _unit_m(places: Float[np.ndarray, "rows points 3"]) -> float:
     """The unit of places, metres, by the length of the legs."""
     legs = np.diff(places[:, [POINT_NAMES.index(f"left_{n}") for n in ("hip", "knee", "ankle")]],
                    axis=1)  # fmt: skip
-    length = float(np.nanmedian(np.linalg.norm(legs, axis=-1).sum(axis=1)))
+    length = float(np.median(np.linalg.norm(legs, axis=-1).sum(axis=1)))
     return min(UNITS_M, key=lambda unit: abs(np.log(max(unit * length, 1e-9) / USUAL_LEG_M)))

@@ -25,10 +25,10 @@ from preprocess.poses.motion_builder import build_motion
 
 LIMB_NAMES = {
     "hip": ("upleg", "upperleg", "thigh", "hip"),
-    "knee": ("leg", "lowerleg", "shin", "calf", "knee"),
+    "knee": ("leg", "lowerleg", "lowleg", "shin", "calf", "knee"),
     "ankle": ("ankle", "foot"),
-    "shoulder": ("arm", "upperarm", "shldr", "shoulder"),
-    "elbow": ("forearm", "lowerarm", "elbow"),
+    "shoulder": ("arm", "upperarm", "uparm", "shldr", "shoulder"),
+    "elbow": ("forearm", "lowerarm", "lowarm", "elbow"),
     "wrist": ("wrist", "hand"),
 }
 """Names of joints that are needed on either side, without the side, the usual ones first."""
@@ -36,7 +36,7 @@ END_NAMES = {"foot": ("toebase", "toe", "toes", "ball", "foot")}
 """Names of joints that may be missing."""
 COLLAR_NAMES = ("collar", "clavicle", "shoulder")
 """Names of the joint between chest and upper arm, which may be missing."""
-ROOT_NAMES, HEAD_NAMES = ("hips", "pelvis", "hip", "root"), ("head", "neck1", "neck")
+ROOT_NAMES, HEAD_NAMES = ("hips", "pelvis", "hip", "root"), ("head", "chead", "neck1", "neck")
 """Names of the joints on the body's axis; those between them are taken by their order."""
 MAX_CANDIDATES = 200
 """Most poses of a motion that are compared with SMPL's rest pose."""

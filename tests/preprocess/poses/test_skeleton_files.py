@@ -23,6 +23,7 @@ def named(axis: str, limbs: str, pattern: str) -> dict[str, str]:
     for side in ("left", "right"):
         for joint, limb in zip(SIDED, limbs.split(), strict=True):
             fields = {"side": side, "Side": side.title(), "S": side[0].upper(), "limb": limb}
+            fields["s"] = side[0]
             names[f"{side}_{joint}"] = pattern.format(**fields)
     return names
 
@@ -42,6 +43,11 @@ VRM = named(
     "hips spine chest upperChest neck head",
     "UpperLeg LowerLeg Foot Toes Shoulder UpperArm LowerArm Hand",
     "{side}{limb}",
+)
+MHR = named(
+    "root c_spine0 c_spine1 c_spine3 c_neck c_head",
+    "upleg lowleg foot ball clavicle uparm lowarm wrist",
+    "{s}_{limb}",
 )
 SMPL = {name: name for name in JOINT_NAMES}
 FRAMES = 12
@@ -197,9 +203,10 @@ def errors(motion, truth):
         (SMPL, {}),
         (MIXAMO, {"unit": 100.0}),
         (BLENDER, {"up": Z_UP}),
+        (MHR, {"unit": 100.0, "twist": 0.4}),
         (VRM, {"unit": 39.37, "twist": 1.0}),  # joints of any orientation, as LaFAN's are
     ],
-    ids=["SMPL", "Mixamo", "Blender, z up", "joints turned"],
+    ids=["SMPL", "Mixamo", "Blender, z up", "MHR", "joints turned"],
 )
 @pytest.mark.parametrize("form", ["bvh", "glb"])
 def test_a_skeleton_of_any_names_units_and_axes_moves_as_the_truth(

@@ -1,0 +1,249 @@
+"""Joints of other bodies, as their programs write them, move our body to the same places."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from capture.input_error import InputError
+from preprocess.body.kinematics import JOINT_NAMES, rotation_matrices
+from preprocess.body.kinematics import PARENTS as TREE
+from preprocess.body.parametric_body import load_body_model
+from preprocess.body.proportion_space import shape_for_motion
+from preprocess.fitting.clip_poses import ClipPoses
+from preprocess.fitting.joint_fitting import COMPARED_JOINTS, LANDMARKS, POINT_NAMES
+from preprocess.fitting.keypoint_rows import KEYPOINT_JOINTS, KEYPOINT_OFFSETS_M
+from preprocess.poses.body_joints import (
+    BODIES,
+    MIDDLE_JOINTS,
+    SIDE_JOINTS,
+    SOMA_JOINTS,
+    SOMA_REST_CM,
+)
+from preprocess.poses.pose_file import write_motion
+from preprocess.poses.pose_format_registry import read_poses
+
+FRAMES = 6
+PARENTS = np.array(TREE)
+MHR_COUNT, KEY_POINT_COUNT = 127, 70
+FOCAL_PX, CENTER_PX = 900.0, np.array([640.0, 360.0])
+
+
+@pytest.fixture(scope="module")
+def poses() -> ClipPoses:
+    """A person who turns and bends a little, 4 m before a camera, y down."""
+    rng = np.random.default_rng(5)
+    share = np.linspace(0.0, 1.0, FRAMES)[:, None, None]
+    vectors = rng.normal(0.0, 0.15, (24, 3)) * (0.5 + share)
+    vectors[:, 22:] = 0.0
+    vectors[:, 0] = 0.0
+    rotations = rotation_matrices(vectors)
+    yaw = rotation_matrices(share[:, 0] * [0.0, 1.0, 0.0])
+    rotations[:, 0] = np.diag([1.0, -1.0, -1.0]) @ yaw
+    return ClipPoses(rotations=rotations, translations=share[:, 0] * [0.3, 0.0, 0.2] + [0, 0, 4.0])
+
+
+@pytest.fixture(scope="module")
+def places(poses):
+    """Places of our joints and landmarks in the camera."""
+    joints = poses.joints(load_body_model().with_shape().joints, PARENTS)
+    points = [joints.places]
+    for number in LANDMARKS.values():
+        joint = KEYPOINT_JOINTS[number]
+        offset = joints.turns[:, joint] @ KEYPOINT_OFFSETS_M[number]
+        points.append((joints.places[:, joint] + offset)[:, None])
+    return np.concatenate(points, axis=1)
+
+
+def columns(body: str) -> dict:
+    """Each of our points, and its number or name in a body."""
+    column, sides = BODIES.index(body), ("left", "right")
+    found = {point: known[column] for point, known in MIDDLE_JOINTS.items()}
+    for point, known in SIDE_JOINTS.items():
+        for place, side in enumerate(sides):
+            one = known[column]
+            if body == "SOMA" and one:
+                one = side.title() + one
+            elif isinstance(one, str):
+                one = f"{one}.{side[0].upper()}"
+            elif one:
+                one = one[place]
+            found[f"{side}_{point}"] = one
+    return {point: one for point, one in found.items() if one is not None}
+
+
+def arranged(places, body: str, count: int):
+    """The places of a body's joints by their numbers."""
+    joints = np.zeros((len(places), count, 3))
+    for point, number in columns(body).items():
+        joints[:, number] = places[:, POINT_NAMES.index(point)]
+    return joints
+
+
+def person(places, root, *, keypoints_only=False) -> dict:
+    """One person in one frame, as SAM 3D Body returns it."""
+    relative = (places - root)[None]
+    points = arranged(relative, "MHR's key points", KEY_POINT_COUNT)[0]
+    seen = points + root
+    held = {
+        "pred_keypoints_3d": points.tolist(),
+        "pred_keypoints_2d": (FOCAL_PX * seen[:, :2] / seen[:, 2:] + CENTER_PX).tolist(),
+        "pred_cam_t": root.tolist(),
+        "focal_length": FOCAL_PX,
+        "body_pose_params": [0.0] * 133,
+    }
+    if not keypoints_only:
+        held["pred_joint_coords"] = arranged(relative, "MHR", MHR_COUNT)[0].tolist()
+    return held
+
+
+def joints_of(motion):
+    person = shape_for_motion(load_body_model(), motion)
+    return ClipPoses.of(motion, range(len(motion))).joints(person.joints, PARENTS).places
+
+
+def worst_m(motion, places):
+    compared = list(COMPARED_JOINTS)
+    return np.linalg.norm(joints_of(motion) - places[:, :24], axis=-1)[:, compared].mean()
+
+
+ROOT, ASIDE = np.array([0.05, 0.9, 4.1]), np.array([2.0, 0.0, 0.5])
+Z_UP = [1.0, 1.0, -1.0]  # of (x, z, y), y down: turned about x
+
+
+def test_sam_3d_bodys_people_are_told_apart_and_seen_by_its_camera(tmp_path, places):
+    away = places + ASIDE
+    frames = [
+        {"frame_index": 10 + row, "people": [person(a, ROOT), person(b, ROOT + ASIDE)]}
+        for row, (a, b) in enumerate(zip(places, away, strict=True))
+    ]
+    frames[3]["people"].reverse()
+    path = tmp_path / "sam.json"
+    path.write_text(json.dumps({"fps": 25, "frames": frames}))
+    for name, true in (("0", places), ("1", away)):
+        motion = read_poses(path, person=name)
+        assert motion.space == "camera"
+        np.testing.assert_array_equal(motion.frames, 10 + np.arange(FRAMES))
+        np.testing.assert_allclose(np.diff(motion.times_s), 0.04)
+        np.testing.assert_allclose(motion.intrinsic[:2, 2], CENTER_PX, atol=0.01)
+        np.testing.assert_allclose(motion.intrinsic[[0, 1], [0, 1]], FOCAL_PX, rtol=1e-4)
+        assert worst_m(motion, true) < 0.005
+        assert "joints of MHR" in motion.note
+
+
+def test_a_folder_of_sam_3d_bodys_files_is_a_frame_each(tmp_path, places):
+    for row in (0, 2, 3):
+        np.savez(tmp_path / f"image_{row:04d}.npz", **person(places[row], ROOT))
+    motion = read_poses(tmp_path)
+    np.testing.assert_array_equal(motion.frames, [0, 1, 2, 3])  # the gap is filled
+    assert worst_m(motion.select_rows(np.array([0, 2, 3])), places[[0, 2, 3]]) < 0.005
+
+
+def test_key_points_alone_are_enough(tmp_path, places):
+    path = tmp_path / "sam.json"
+    path.write_text(json.dumps([[person(row, ROOT, keypoints_only=True)] for row in places]))
+    motion = read_poses(path)
+    limbs = [1, 2, 4, 5, 7, 8, 16, 17, 18, 19, 20, 21]
+    apart = np.linalg.norm(joints_of(motion) - places[:, :24], axis=-1)[:, limbs]
+    assert apart.mean() < 0.005
+
+
+@pytest.mark.parametrize(
+    ("body", "count"), [("SMPL-H", 52), ("SMPL-X", 55), ("SMPL-X", 127), ("SOMA", 77)]
+)
+def test_joints_are_known_by_their_number_in_any_unit_and_axes(tmp_path, places, body, count):
+    z_up = places[..., [0, 2, 1]] * Z_UP
+    if body == "SOMA":
+        numbers = {point: SOMA_JOINTS.index(name) for point, name in columns(body).items()}
+        joints = np.zeros((FRAMES, count, 3))
+        for point, number in numbers.items():
+            joints[:, number] = z_up[:, POINT_NAMES.index(point)]
+    else:
+        joints = arranged(z_up, body, count)
+    np.savez(tmp_path / "joints.npz", joints=100.0 * joints, fps=50.0)
+    motion = read_poses(tmp_path / "joints.npz", prefer_world=True)
+    y_up = places * [1.0, -1.0, -1.0]
+    assert worst_m(motion, y_up) < 0.006
+    np.testing.assert_allclose(np.diff(motion.times_s), 0.02)
+    assert f"joints of {body}:" in motion.note
+
+
+def test_annys_bones_are_known_by_their_names(tmp_path, places):
+    names = columns("Anny")
+    heads = np.tile(np.eye(4), (FRAMES, len(names), 1, 1))
+    for number, point in enumerate(names):
+        heads[:, number, :3, 3] = places[:, POINT_NAMES.index(point)][:, [0, 2, 1]] * Z_UP
+    np.savez(tmp_path / "anny.npz", bone_poses=heads, bone_labels=np.array(list(names.values())))
+    motion = read_poses(tmp_path / "anny.npz")
+    assert worst_m(motion, places * [1.0, -1.0, -1.0]) < 0.006
+    assert "joints of Anny" in motion.note
+
+
+def test_gem_xs_rotations_move_its_skeleton(tmp_path, poses):
+    names = {point: name for point, name in columns("SOMA").items() if point in JOINT_NAMES}
+    names["neck"] = "Neck1"
+    turned = np.zeros((FRAMES, 77, 3))
+    vectors = [poses[row] for row in range(FRAMES)]
+    for point, name in names.items():
+        joint = JOINT_NAMES.index(point)
+        for row, pose in enumerate(vectors):
+            turn = pose.root_rotation if joint == 0 else pose.joint_rotations[joint - 1]
+            turned[row, SOMA_JOINTS.index(name)] = turn
+
+    def view(root, places):
+        return {
+            "global_orient": torch.tensor(root),
+            "body_pose": torch.tensor(turned[:, 1:].reshape(FRAMES, 228)),
+            "transl": torch.tensor(places),
+            "identity_coeffs": torch.zeros(FRAMES, 45),
+            "scale_params": torch.full((FRAMES, 69), 1.1),
+        }
+
+    camera = np.tile([[FOCAL_PX, 0, 640.0], [0, FOCAL_PX, 360.0], [0, 0, 1.0]], (FRAMES, 1, 1))
+    content = {
+        "body_params_incam": view(turned[:, 0], poses.translations),
+        "body_params_global": view(0.0 * turned[:, 0], poses.translations),
+        "K_fullimg": torch.tensor(camera),
+    }
+    path = tmp_path / "hpe_results.pt"
+    torch.save(content, path)
+    seen, driven = read_poses(path), read_poses(path, prefer_world=True)
+    assert (seen.space, driven.space) == ("camera", "world")
+    np.testing.assert_allclose(seen.intrinsic[0, 0], FOCAL_PX)
+    turns = rotation_matrices(seen.root_rotations).swapaxes(-1, -2) @ poses.rotations[:, 0]
+    assert (np.trace(turns, axis1=1, axis2=2) > 1.0 + 2.0 * np.cos(0.1)).all()
+    assert np.abs(driven.root_rotations).max() < 0.1
+    thigh = 1.1 * (SOMA_REST_CM["LeftLeg"][2] - SOMA_REST_CM["LeftShin"][2]) / 100.0
+    knee = joints_of(seen)[:, 4] - joints_of(seen)[:, 1]
+    np.testing.assert_allclose(np.linalg.norm(knee, axis=1), thigh, atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"joints": np.zeros((2, 33, 3))}, "33 joints; expected the 22"),
+        ({"joints": np.zeros((2, 24, 2))}, "shape"),
+        ({"joints": np.full((2, 24, 3), np.nan)}, "no frame has all shoulders"),
+        (
+            {"joints": np.zeros((2, 30, 3)), "joint_names": [f"Joint_{n:03d}" for n in range(30)]},
+            "30 joints; expected",
+        ),
+        (
+            {"joints": np.random.default_rng(0).normal(size=(2, 24, 3))},
+            "its joints are not SMPL-H's",
+        ),
+    ],
+)
+def test_what_is_no_person_is_named(tmp_path, arrays, message):
+    np.savez(tmp_path / "joints.npz", **arrays)
+    with pytest.raises(InputError, match=message):
+        read_poses(tmp_path / "joints.npz")
+
+
+def test_rotations_count_more_than_the_joints_beside_them(tmp_path, motion):
+    path = tmp_path / "poses.npz"
+    write_motion(path, motion)
+    with np.load(path) as held:
+        np.savez(path, **held, joints=np.zeros((len(motion), 24, 3)))
+    np.testing.assert_array_equal(read_poses(path).joint_rotations, motion.joint_rotations)
