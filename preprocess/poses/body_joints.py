@@ -111,7 +111,7 @@ FRAME_KEYS, PERSON_KEYS = ("frame_index", "frame_idx", "frame"), ("person_id", "
 UNITS_M = (1.0, 0.01, 0.001)
 """Units that places may have."""
 USUAL_LEG_M = 0.75
-"""Length of a leg; the unit with which a body's is nearest to it is taken."""
+"""Length of a leg, metres: of units the one is taken that brings a body's nearest to it."""
 MAX_DISTANCE_M = 0.1
 """Mean distance between our joints and a file's from which they are not those of a person."""
 SAM_FOCAL = RelativeFocalLength(ratio=1.0, reference="diagonal")

@@ -112,7 +112,7 @@ ROOT, ASIDE = np.array([0.05, 0.9, 4.1]), np.array([2.0, 0.0, 0.5])
 Z_UP = [1.0, 1.0, -1.0]  # of (x, z, y), y down: turned about x
 
 
-def test_sam_3d_bodys_people_are_told_apart_and_seen_by_its_camera(tmp_path, places):
+def test_sam_3d_bodys_people_are_kept_apart_and_seen_by_its_camera(tmp_path, places):
     away = places + ASIDE
     frames = [
         {"frame_index": 10 + row, "people": [person(a, ROOT), person(b, ROOT + ASIDE)]}
