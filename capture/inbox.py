@@ -4,10 +4,12 @@ import math
 import queue
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Generic, TypeVar, final
 
 Item = TypeVar("Item")
+POLL_S = 0.1
+"""Interval at which one who waits for items looks whether any will come, seconds."""
 
 
 @final
@@ -33,10 +35,14 @@ class Inbox(Generic[Item]):
         paced: bool = False,
         live: bool = False,
         ends_run: bool = False,
+        on_drop: Callable[[Item], object] = lambda item: None,
     ) -> None:
-        """Start the producer; at most `capacity` items wait."""
+        """Start the producer; at most `capacity` items wait.
+
+        `on_drop` receives each item that is dropped, on the producer's thread.
+        """
         self.paced, self.live, self.ends_run = paced, live, ends_run
-        self.dropped = 0
+        self.dropped, self._on_drop = 0, on_drop
         self._queue: queue.Queue[Item] = queue.Queue(maxsize=capacity)
         self._error: BaseException | None = None
         self._stop = threading.Event()
@@ -70,6 +76,11 @@ class Inbox(Generic[Item]):
             raise error
         return taken
 
+    def items(self, *, max_items: int | None = None) -> Iterator[Item]:
+        """Yield items as they come, taken as `take` does, until nothing more will come."""
+        while not self.finished:
+            yield from self.take(timeout_s=POLL_S, max_items=max_items)
+
     def close(self, *, timeout_s: float = math.inf) -> None:
         """Tell the producer to stop and wait until it has, but no longer than this."""
         self._stop.set()
@@ -91,10 +102,11 @@ class Inbox(Generic[Item]):
         if not self.live:
             return
         try:
-            self._queue.get_nowait()
-            self.dropped += 1
+            oldest = self._queue.get_nowait()
         except queue.Empty:  # the consumer has just taken everything
             return
+        self.dropped += 1
+        self._on_drop(oldest)
 
     def _fill(self, items: Iterable[Item]) -> None:
         try:

@@ -61,7 +61,7 @@ def camera_address(path: Path) -> str | None:
 class CameraDevice(FrameSource):
     """A camera by its number, a device, the address of a stream, or a file that plays like one."""
 
-    live = paced = True
+    live = paced = skippable = True
 
     def __init__(self, address: str, selection: FrameSelection, pace: PacingClock) -> None:
         """Open it and wait for its first image.

@@ -208,6 +208,7 @@ class ReceivedVideo(FrameSource):
         """
         super().__init__(path, selection)
         self._pace, self._reader = pace, _GrowingReader(path, pace, idle_s)
+        self.skippable = not self._reader.is_whole_known
         options = {} if self._reader.is_whole_known else STREAM_OPTIONS
         try:
             self._container: Any = av.open(self._reader, options=options)

@@ -108,6 +108,8 @@ class FrameSource:
         is_hdr: Whether frames are tone mapped from HDR.
         live: Whether frames that are not taken in time are lost.
         paced: Whether frames come at times of their own, however fast they are taken.
+        skippable: Whether a newer frame may replace one that was not taken in time, as both are
+            filmed at this moment.
         started_at: Time when the first frame of a live source was filmed, seconds since 1970.
         warnings: Problems so far; grows while `frames()` is read.
     """
@@ -120,6 +122,7 @@ class FrameSource:
     is_hdr: bool = False
     live: bool = False
     paced: bool = False
+    skippable: bool = False
     rotate: int = 0
     started_at: float = 0.0
 
@@ -274,10 +277,11 @@ class RealtimePlayback(WrappedSource):
     the video plays on from there at its own speed.
     """
 
-    def __init__(self, source: FrameSource, pace: PacingClock) -> None:
+    def __init__(self, source: FrameSource, pace: PacingClock, *, skippable: bool = False) -> None:
         """Wrap a recording; stopping the clock ends the playback, also in the middle of a wait."""
         super().__init__(source)
         self._pace, self.paced, self.catch_up = pace, True, False
+        self.skippable = skippable
 
     @property
     def waited_s(self) -> float:

@@ -165,7 +165,9 @@ def export_field(
         baked = FineTuningResult(tables=baking.result(), settings=settings, psnr=None)
         first: ExportReport | None = None
         if baked_first or not config.fine_tuning_pictures:
-            first = draft.write(baked, seconds=time.perf_counter() - started)
+            first = draft.write(
+                baked, seconds=time.perf_counter() - started, level=1 if baked_first else 6
+            )
             yield first
             started = time.perf_counter()
         if not config.fine_tuning_pictures:
@@ -212,14 +214,15 @@ class _PackageDraft:
         *,
         seconds: float,
         difference: float | None = None,
+        level: int = 6,
     ) -> ExportReport:
-        """Check and write a package, which took `seconds` so far.
+        """Check and write a package, which took `seconds` so far; `level` is zlib's.
 
         `difference` is that of its graphs from their references, where an earlier package of the
         same graphs was checked: only the tables differ.
         """
         started = time.perf_counter()
-        with PackageWriter(self.path) as writer:
+        with PackageWriter(self.path, level=level) as writer:
             compressed = self.executor.submit(writer.add_tables, tuned.tables)
             try:
                 package = _checked_package(

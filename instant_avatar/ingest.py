@@ -73,7 +73,7 @@ def ingest(
             copy=None if arguments.json is None else (arguments.json, arguments.may_replace_json),
         )  # fmt: skip
         run_session(
-            arguments, observations, run, console, [report, *readers],
+            arguments, observations, run, console, [*readers, report],  # its page takes seconds
             on_start=lambda: write_solved_cameras(before_fit, run, console),
         )  # fmt: skip
         return report.exit_code()

@@ -382,4 +382,4 @@ def _open_stream_source(inputs: CaptureInputs) -> FrameSource:
             idle_s=inputs.idle_s, watch_s=inputs.watch_s, rotate=inputs.rotate,
         )  # fmt: skip
     source = open_source(inputs.video, frames=inputs.frames, rotate=inputs.rotate)
-    return RealtimePlayback(source, pace)
+    return RealtimePlayback(source, pace, skippable=True)

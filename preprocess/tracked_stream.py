@@ -1,11 +1,14 @@
 """A stream whose person is tracked while its frames come: a source, and poses and masks for it.
 
-The first frames settle the person's proportions and the focal length. Each later frame is tracked
-when it arrives, and its pose fitted to its key points and its mask together with those of the
-frames around it; once more when more frames have come after it. Frames that come while another is
-being tracked are left out, so that tracking does not fall behind.
+Decoding, tracking and fitting run on threads of their own. The tracker takes the newest frame that
+has been decoded, whenever it is free: what it finds is about now, and the frames that came
+meanwhile are skipped. The first frames settle the person's proportions and the focal length. Each
+later pose is fitted to its key points and its mask together with those of the frames around it;
+once more when more frames have come after it.
 """
 
+import bisect
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -17,6 +20,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from capture.camera import Camera
+from capture.inbox import Inbox
 from capture.input_error import InputError
 from capture.source import Frame, FrameSource, WrappedSource
 from preprocess.body.body_pose import BodyPose, Motion
@@ -46,72 +50,185 @@ from preprocess.tracking.video_tracking import NOT_FOUND, MaskRefinement
 
 START_FRAMES = 8
 """Frames with the person from which proportions and focal length are fitted."""
-MAX_LATENESS_S = 0.04
-"""Time after it was due at which a frame is left out: another was being tracked."""
 MIN_INTERVAL_S = 0.06
-"""Time between two frames that are taken: more of them teach no more, and their poses would jitter,
-for the frames around a frame would span too short a time."""
-MAX_SKIPPED = 5
-"""Most frames in a row that are left out; a machine that is too busy to decode a recording at its
-own speed falls behind instead."""
+"""Time between two frames that are tracked: more of them teach no more, and their poses would
+jitter, for the frames around a frame would span too short a time."""
+QUEUED_FRAMES = 8
+"""Most tracked frames that wait for the fit of their poses; what is tracked meanwhile is only
+looked at, so that advice goes on while a trainer is being prepared."""
+LOOK_INTERVAL_S = 0.3
+"""Interval at which the tracker looks while as many frames wait, seconds."""
+POLL_S = 0.01
+"""Interval at which it looks for room, seconds."""
+KEPT_BYTES = 160 << 20
+"""Memory for skipped frames."""
+LATER_S = 0.8
+"""Time after the last frame in which skipped ones are tracked, seconds: somebody waits."""
+LEAST_FRAMES = 40
+"""Frames that are tracked in all before nothing more is, if there are as many."""
+FoundPerson = tuple[Frame, PersonKeypoints | None]
+"""A frame and the person in it."""
+
+
+@final
+class SkippedFrames:
+    """Frames that were not tracked in time; of too many those stay that fill the largest gaps."""
+
+    def __init__(self) -> None:
+        """Keep nothing yet."""
+        self._kept: dict[float, Frame] = {}
+        self._times_s: list[float] = []  # of tracked frames and those that are kept, sorted
+        self._lock = threading.Lock()
+
+    def add(self, frame: Frame) -> None:
+        """Keep a frame, and let go of another one if memory is used up."""
+        self.mark(frame.time_s)
+        with self._lock:
+            self._kept[frame.time_s] = frame
+            if len(self._kept) * frame.rgb.nbytes > KEPT_BYTES:
+                self._take(min(self._kept, key=self._gap_s))
+
+    def mark(self, time_s: float) -> None:
+        """Take note of a tracked frame's time."""
+        with self._lock:
+            bisect.insort(self._times_s, time_s)
+
+    def take(self, count: int) -> list[Frame]:
+        """Take the frames that leave the smallest gaps, in order; none near a tracked one."""
+        with self._lock:
+            while self._kept:
+                densest = min(self._kept, key=self._gap_s)
+                if len(self._kept) <= count and self._gap_s(densest) >= 2.0 * MIN_INTERVAL_S:
+                    break
+                self._take(densest)
+            kept, self._kept = self._kept, {}
+        return [kept[time_s] for time_s in sorted(kept)]
+
+    def _gap_s(self, time_s: float) -> float:
+        """Time between the neighbors of a frame that is kept, seconds."""
+        place = bisect.bisect_left(self._times_s, time_s)
+        before = self._times_s[place - 1] if place else -np.inf
+        after = self._times_s[place + 1] if place + 1 < len(self._times_s) else np.inf
+        return after - before
+
+    def _take(self, time_s: float) -> None:
+        del self._kept[time_s]
+        self._times_s.remove(time_s)
 
 
 @final
 class TrackedStream(WrappedSource):
-    """A source of frames at their own times, of which only those are taken that can be tracked.
+    """A source of frames of which the tracker takes the newest one whenever it is free.
 
-    Frames are handed over `LAG_FRAMES` after they came, so that their poses are fitted together
-    with those of later frames. `on_frame` is called with each frame as soon as it is taken,
-    `on_end` when the last frame has been used.
+    Where frames are not `skippable`, they wait instead. Frames are handed over `LAG_FRAMES` after
+    they came, so that their poses are fitted together with those of later frames. After the last
+    one some that were skipped follow, from the first on again.
+
+    Attributes:
+        count: Number of frames that came.
+        tracked_later: Number of tracked frames that had been skipped.
+        search: Finds the person in a frame, on a thread of its own; the second argument tells
+            whether the frame has just come.
+        on_frame: Called with each frame and what was found, in order.
+        on_end: Called when the last frame has been used, and before frames come from the first on
+            again.
     """
 
     def __init__(self, source: FrameSource) -> None:
         """Wrap a source whose frames come at their own times, or as fast as they are taken."""
         super().__init__(source)
-        self._frames: Iterator[Frame] | None = None
-        self._waiting: deque[Frame] = deque()
-        self._skipped = 0
-        self.on_frame: Callable[[Frame], None] = lambda frame: None
+        self._decoded: Inbox[Frame] | None = None
+        self._tracked: Inbox[FoundPerson] | None = None
+        self._waiting, self._skipped = deque[Frame](), SkippedFrames()
+        self._last_s, self._taken, self._began, self._waited_s = -np.inf, 0, 0.0, 0.0
+        self.count = self.tracked_later = 0
+        self.search: Callable[[Frame, bool], PersonKeypoints | None] = lambda frame, is_new: None
+        self.on_frame: Callable[[Frame, PersonKeypoints | None], None] = lambda frame, found: None
         self.on_end: Callable[[], None] = lambda: None
 
     @property
-    def dropped(self) -> int:
-        """Number of frames that were lost, most of them while another was being tracked."""
-        return self._source.dropped + self._skipped
+    def waited_s(self) -> float:
+        """Seconds of waiting for tracked frames so far."""
+        return self._waited_s
 
     def take_next(self) -> bool:
         """Take and look at the next frame; return whether there was one."""
-        if self._frames is None:
-            self._frames = self._taken()
-        frame = next(self._frames, None)
-        if frame is not None:
-            self._waiting.append(frame)
-            self.on_frame(frame)
-        return frame is not None
+        found = self._next_found()
+        if found is not None:
+            self._look(found)
+        return found is not None
 
     def frames(self) -> Iterator[Frame]:
-        """The frames that are taken, once; those that `take_next` took already come first."""
-        going = True
-        while going:
+        """The frames that are tracked, once; those that `take_next` took already come first."""
+        while True:
             while len(self._waiting) > LAG_FRAMES:
                 yield self._waiting.popleft()
-            going = self.take_next()
-        while self._waiting:
-            yield self._waiting.popleft()
-        self.on_end()
+            found = self._next_found()
+            if found is None or found[0].time_s < self._last_s:
+                while self._waiting:
+                    yield self._waiting.popleft()
+                self.on_end()
+                self._last_s = -np.inf
+            if found is None:
+                return
+            self._look(found)
 
-    def _taken(self) -> Iterator[Frame]:
-        skipped, last_s = 0, -np.inf  # since the last frame that was taken; its time
-        for frame in self._source.frames():
+    def _next_found(self) -> FoundPerson | None:
+        if self._tracked is None:
+            self._tracked, self._began = (
+                Inbox(self._found(), capacity=QUEUED_FRAMES),
+                time.perf_counter(),
+            )
+        began = time.perf_counter()
+        found = next(self._tracked.items(max_items=1), None)
+        self._waited_s += time.perf_counter() - began
+        return found
+
+    def _look(self, found: FoundPerson) -> None:
+        self._last_s, self._taken = max(self._last_s, found[0].time_s), self._taken + 1
+        self._waiting.append(found[0])
+        self.on_frame(*found)
+
+    def close(self) -> None:
+        """End the source and the threads that read it."""
+        super().close()
+        for inbox in (self._decoded, self._tracked):
+            if inbox is not None:
+                inbox.close()
+
+    def _found(self) -> Iterator[FoundPerson]:
+        """Track the newest frame again and again, then skipped ones; on the tracker's thread."""
+        self._decoded = Inbox(
+            self._counted(), capacity=1, live=self.skippable, on_drop=self._skipped.add
+        )
+        last_s = -np.inf
+        for frame in self._decoded.items(max_items=1):
             if frame.due_s is not None and frame.time_s - last_s < MIN_INTERVAL_S:
                 continue
-            late = frame.due_s is not None and time.perf_counter() - frame.due_s > MAX_LATENESS_S
-            if late and skipped < MAX_SKIPPED:
-                skipped += 1
-                self._skipped += 1
+            last_s, found = frame.time_s, self.search(frame, True)
+            if self.skippable and not self._has_room():
+                self._skipped.add(frame)
             else:
-                skipped, last_s = 0, frame.time_s
-                yield frame
+                self._skipped.mark(frame.time_s)
+                yield frame, found
+        in_time = LATER_S * self._taken / (time.perf_counter() - self._began)
+        for frame in self._skipped.take(max(int(in_time), LEAST_FRAMES - self._taken)):
+            self.tracked_later += 1
+            yield replace(frame, due_s=None), self.search(frame, False)
+
+    def _counted(self) -> Iterator[Frame]:
+        for frame in self._source.frames():
+            self.count += 1
+            yield frame
+
+    def _has_room(self) -> bool:
+        """Wait for room for a tracked frame, but not long."""
+        deadline = time.perf_counter() + LOOK_INTERVAL_S
+        while self._tracked is not None and self._tracked.pending >= QUEUED_FRAMES:
+            if time.perf_counter() > deadline:
+                return False
+            time.sleep(POLL_S)
+        return True
 
 
 @final
@@ -134,7 +251,8 @@ class LiveTracking:
     ) -> None:
         """Connect a stream with its tracker; nothing is read yet.
 
-        `on_tracked` receives each frame that was searched, and the person in it.
+        `on_tracked` receives each frame that was searched, and the person in it, on the tracker's
+        thread.
         """
         self.stream, self._tracker, self._on_tracked = stream, tracker, on_tracked
         self.times_s: dict[int, float] = {}
@@ -143,7 +261,7 @@ class LiveTracking:
         self._mask_px: tuple[int, int] | None = None
         self._fitter: FramePoseFitter | None = None
         self._earlier: EarlierPoses | None = None
-        stream.on_frame = self._track
+        stream.search, stream.on_frame = self._search, self._fit
 
     def start(
         self,
@@ -163,7 +281,7 @@ class LiveTracking:
         """
         while len(self._seen) < START_FRAMES and self.stream.take_next():
             pass
-        seen = list(self._seen.values())
+        seen = sorted(self._seen.values(), key=lambda each: each.time_s)
         if not seen:
             raise InputError(
                 f"No person was found in {self.stream.path} ({len(self.times_s)} frames were "
@@ -174,7 +292,7 @@ class LiveTracking:
             sigma_log_focal=SIGMA_LOG_LIVE_FOCAL if stated_focal else SIGMA_LOG_FOCAL,
         )  # fmt: skip
         self._fitter, self._earlier = FramePoseFitter(person, camera), EarlierPoses(person, camera)
-        self.stream.on_end = self._earlier.fit_rest
+        self.stream.on_end = self._end_of_pass
         for row, each in enumerate(seen):
             self._fitter.add(each, motion[row])
         source = "focal length fitted to the first frames"
@@ -200,7 +318,12 @@ class LiveTracking:
 
     def notes(self) -> Iterator[str]:
         """Messages for the user that need the frames to have come."""
-        looked = len(self.times_s)
+        looked, stream = len(self.times_s), self.stream
+        if looked < stream.count:
+            yield (
+                f"{looked} of {stream.count} frames were tracked, {stream.tracked_later} of them "
+                "after the last one had come."
+            )
         if self.lost:
             times = [self.times_s[number] for number in self.lost]
             yield (
@@ -208,11 +331,23 @@ class LiveTracking:
                 f"{min(times):.1f} and {max(times):.1f} s."
             )
 
-    def _track(self, frame: Frame) -> None:
-        """Find the person in a frame, and fit its pose once there is a person to fit."""
-        self.times_s[frame.index] = frame.time_s
+    def _search(self, frame: Frame, is_new: bool) -> PersonKeypoints | None:
+        """Find the person in a frame."""
         found = None if "corrupt" in frame.flags else self._tracker(frame.rgb)
-        self._on_tracked(frame, found)
+        if is_new:
+            self._on_tracked(frame, found)
+        return found
+
+    def _end_of_pass(self) -> None:
+        """Fit what is left together; the next frame is no neighbor of the last one."""
+        assert self._fitter is not None
+        assert self._earlier is not None
+        self._earlier.fit_rest()
+        self._fitter.forget()
+
+    def _fit(self, frame: Frame, found: PersonKeypoints | None) -> None:
+        """Fit the pose in a frame once there is a person to fit."""
+        self.times_s[frame.index] = frame.time_s
         if found is None:
             self.lost.append(frame.index)
             return

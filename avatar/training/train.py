@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import threading
 import time
 from collections.abc import Iterator
 from typing import final
@@ -52,6 +53,11 @@ MIN_STEPS_AFTER_LAST_FRAME = 20
 STREAMING_RATE_FACTOR = 0.5
 """Factor of the learning rates while a video plays in real time: without a falling rate, smaller
 swings of the parameters leave their mean closer to the optimum."""
+CLOSING_S = 2.0
+"""Time after the last frame of a paced source in which rates fall and surfaces become firm,
+seconds: somebody waits."""
+LEAST_STEPS = 250
+"""Steps that a paced source is trained for, however short it is; fewer make no surface."""
 EVALUATION_TIME_SHARE = 0.004
 """Share of the time budget that one evaluation may take; it scores at least one frame. A minute
 has seven of them: 3 % at most."""
@@ -86,12 +92,12 @@ def train(
 ) -> Iterator[TrainEvent]:
     """Trains on the frames that have arrived until the time, or the steps, are used up.
 
-    The learning rate is constant while frames arrive and falls as a cosine after the last one. No
-    frame of a recording is lost: if the time is too short to read them all beside training, reading
-    takes precedence and may overrun the time. Frames of a paced source are not waited for, except
-    for the first. A live source is left when the time is up, and training ends with the last frame
-    of a folder that grows. Where steps are counted, one more
-    frame of a recording is read before each step until all are read.
+    The learning rate is constant while frames arrive and falls as a cosine after the last one; of a
+    paced source for `CLOSING_S`, if no more time is left. No frame of a recording is lost: if the
+    time is too short to read them all beside training, reading takes precedence and may overrun the
+    time. Frames of a paced source are not waited for, except for the first. A live source is left
+    when the time is up, and training closes with the last frame of a folder that grows. Where steps
+    are counted, one more frame of a recording is read before each step until all are read.
 
     Held-out frames that arrive are appended to `held_out`. Events are yielded on the caller's
     thread; the time the caller spends on one counts as training time.
@@ -118,13 +124,13 @@ def train(
 
 
 def _train_step(trainer: Trainer, stream: "_FrameIntake", now: float) -> Stepped:
-    falling = cosine_decay(stream.progress(now))
+    falling, done = cosine_decay(stream.progress(now)), stream.share_done(now)
     cpu = time.process_time()
     result = trainer.step(
         rate=min(falling, stream.highest_rate),
         pose_rate=falling,
-        hard_surface_share=min(1.0, 4.0 * now / trainer.config.seconds),
-        detail_share=1.0 - cosine_decay(now / trainer.config.seconds),
+        hard_surface_share=min(1.0, 4.0 * done),
+        detail_share=1.0 - cosine_decay(done),
     )
     trainer.step_cpu_seconds += time.process_time() - cpu
     stream.clock.read()
@@ -167,6 +173,7 @@ class _FrameIntake:
         self._trainer, self._inbox, self._held_out = trainer, inbox, held_out
         self._began = trainer.scheduled_seconds
         self._ended_at: float | None = None
+        self._end, self._steps_before_end, self._least_steps = trainer.config.seconds, 0, 0
         self._last_frame_step: int | None = None
         self.clock = TrainingClock(trainer)
         self._started = len(trainer.replay) > 0  # a resumed run remembers frames
@@ -197,6 +204,10 @@ class _FrameIntake:
         too_late = self._inbox.live and self._started and now >= self._trainer.config.seconds
         if self._inbox.finished or too_late:
             self._ended_at = self.clock.read()
+            if self._inbox.paced:
+                least = 0.0 if self._inbox.ends_run else self._end
+                self._end = max(least, self._ended_at + CLOSING_S)
+                self._steps_before_end, self._least_steps = self._trainer.steps, LEAST_STEPS
 
     def _accept(self, item: StreamItem) -> Iterator[FrameArrived | FrameLeftOut]:
         if isinstance(item, DroppedFrame):
@@ -238,17 +249,23 @@ class _FrameIntake:
     def is_done(self, now: float) -> bool:
         """True if the schedule is over and every frame has been trained on."""
         config, admitted_at = self._trainer.config, self._last_frame_step
-        if not self.ended or (now < config.seconds and not self._inbox.ends_run):
+        if not self.ended or now < self._end:
             return False
         farewell = 0 if config.steps or admitted_at is None else MIN_STEPS_AFTER_LAST_FRAME
-        return self._trainer.steps >= (admitted_at or 0) + farewell
+        return self._trainer.steps >= max((admitted_at or 0) + farewell, self._least_steps)
 
     def progress(self, now: float) -> float:
         """Elapsed share of the time after the last frame, in [0, 1]; 0 before it."""
         if self._ended_at is None:
             return 0.0
-        tail = self._trainer.config.seconds - self._ended_at
-        return (now - self._ended_at) / max(tail, 1e-6)
+        in_time = (now - self._ended_at) / max(self._end - self._ended_at, 1e-6)
+        left = self._least_steps - self._steps_before_end
+        made = self._trainer.steps - self._steps_before_end
+        return in_time if left <= 0 else min(in_time, made / left)
+
+    def share_done(self, now: float) -> float:
+        """Elapsed share of the schedule, of which only the end of a film that comes is known."""
+        return max(now / self._trainer.config.seconds, self.progress(now))
 
 
 @final
@@ -300,15 +317,21 @@ def _evaluation_times(*, after: float) -> Iterator[float]:
 
 
 WARMUP_IMAGE_PX = 16
+WARM_THREADS = set[int]()
+"""Threads that have every kernel."""
 
 
 def warm_up(trainer: Trainer) -> float:
     """Compiles, or loads from disk, every kernel that training and rendering use.
 
-    Must run on the thread that will train. The trainer itself is not changed. Returns the seconds
-    that it took: tens on a machine's first run, about one later.
+    Must run on the thread that will train; a second time on one thread does nothing. The trainer
+    itself is not changed. Returns the seconds that it took: tens on a machine's first run, about
+    one later.
     """
-    began = time.perf_counter()
+    began, thread = time.perf_counter(), threading.get_ident()
+    if thread in WARM_THREADS:
+        return 0.0
+    WARM_THREADS.add(thread)
     rig = trainer.avatar.rig
     config = dataclasses.replace(trainer.config, rays=64, empty_space_points=16, density_tv_pairs=8)
     stand_in = Trainer(rig, config)

@@ -83,9 +83,9 @@ class PackageWriter:
     Tables can be added and compressed while the player that draws them is still being checked.
     """
 
-    def __init__(self, path: Path) -> None:
-        """Open nothing yet."""
-        self._path = path
+    def __init__(self, path: Path, *, level: int = 6) -> None:
+        """Open nothing yet; `level` is zlib's, 1 for a package that another one soon replaces."""
+        self._path, self._level = path, level
         self._sums: dict[str, str] = {}
 
     def __enter__(self) -> "PackageWriter":
@@ -136,7 +136,7 @@ class PackageWriter:
     def _add(self, name: str, content: bytes) -> None:
         self._sums[name] = hashlib.sha256(content).hexdigest()
         info = zipfile.ZipInfo(name, ENTRY_TIMESTAMP)
-        self._archive.writestr(info, content, zipfile.ZIP_DEFLATED, 6)
+        self._archive.writestr(info, content, zipfile.ZIP_DEFLATED, self._level)
 
 
 def read_package(path: Path, *, tier: str | None = "hq") -> AvatarPackage:

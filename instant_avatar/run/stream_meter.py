@@ -126,6 +126,7 @@ class StreamMeter:
                 "--size."
             )
         is_playback = self._source.paced and self._source.frame_count is not None
+        is_playback = is_playback and not self._source.skippable
         if is_playback and not dropped and late.p95 > LATENESS_WARNING_S:
             yield (
                 f"Playback lagged by up to {max(self.lateness_s):.1f} s (median {late.p50:.1f} s): "

@@ -108,6 +108,7 @@ class FramePoseFitter:
         self._model, self._camera = OutlineModel(ProportionSpace.around(shaped)), camera
         self._seen: deque[SeenPerson] = deque(maxlen=WINDOW_FRAMES)
         self._poses: deque[BodyPose] = deque(maxlen=WINDOW_FRAMES)
+        self._last: BodyPose | None = None
 
     def add(self, seen: SeenPerson, start: BodyPose | None = None) -> None:
         """Fit the poses of the window that ends with the next frame.
@@ -118,8 +119,8 @@ class FramePoseFitter:
         shaped = self._model.space.shaped
         if start is None:
             start = _lift([seen], shaped, self._camera)[0]
-            if self._poses:
-                start = _at_distance_of(start, self._poses[-1], shaped.joints[0])
+            if self._last is not None:
+                start = _at_distance_of(start, self._last, shaped.joints[0])
         self._poses.append(start)
         count = len(self._seen)
         outlined = {count - 1, count - 1 - LAG_FRAMES}
@@ -130,6 +131,12 @@ class FramePoseFitter:
         for _ in range(FRAME_ITERATIONS[1]):
             fitter.iterate(poses_only)
         self._poses = deque((fitter.pose(index) for index in range(count)), maxlen=WINDOW_FRAMES)
+        self._last = self._poses[-1]
+
+    def forget(self) -> None:
+        """Start again without frames, but at the last one's distance."""
+        self._seen.clear()
+        self._poses.clear()
 
     def pose(self, number: int) -> BodyPose:
         """Present pose of one of the last frames, by its number."""
@@ -160,12 +167,16 @@ class EarlierPoses:
         if len(self._new) < REVISED_FRAMES:
             return
         if self._fit is None or self._fit.done():
-            self.fit_rest()
+            self._fit_new()
         else:
             self._new = {}
 
     def fit_rest(self) -> None:
-        """Fit the frames that were added since the last fit."""
+        """Fit the frames that were added since the last fit, which have no later neighbors."""
+        self._fit_new()
+        self._pool.submit(self._recent.clear)
+
+    def _fit_new(self) -> None:
         if self._fit is not None and self._fit.done():
             self._fit.result()  # raises what it raised
         if self._new:
@@ -186,7 +197,8 @@ class EarlierPoses:
         for _ in range(REVISION_ITERATIONS):
             fitter.iterate(FitParameters(proportions=False, focal=False))
         poses = [fitter.pose(row) for row in range(count)]
-        self._recent = dict(zip(seen[-OVERLAP_FRAMES:], poses[-OVERLAP_FRAMES:], strict=True))
+        self._recent.clear()
+        self._recent.update(zip(seen[-OVERLAP_FRAMES:], poses[-OVERLAP_FRAMES:], strict=True))
         self._revised.append({each.number: p for each, p in zip(seen, poses, strict=True)})
 
 

@@ -1,10 +1,13 @@
 """Streams without poses: frames are tracked as they come, and late ones are left out."""
 
+import threading
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from PIL import Image
 
 from capture.input_error import InputError
@@ -22,6 +25,7 @@ from preprocess.observation import DroppedFrame, Observation
 from preprocess.open_capture import open_tracked_stream
 from preprocess.tracked_stream import (
     LiveTracking,
+    SkippedFrames,
     TrackedMasks,
     TrackedObservations,
     TrackedStream,
@@ -162,16 +166,80 @@ def test_frames_without_the_person_are_dropped_and_reported(standing):
     assert "not found in 2 of 24 frames, between 0.3 and 0.4 s" in " ".join(tracking.notes())
 
 
-def test_late_frames_are_left_out(standing, monkeypatch):
-    monkeypatch.setattr(tracked_stream.time, "perf_counter", lambda: 100.0)
-    stream, tracking, start = started(Tracker(standing), Pictures(due_s=90.0))
+class Filmed(Pictures):
+    """What is being filmed, by a tracker that is busy with a frame until seven more have come."""
+
+    skippable = True
+
+    def __init__(self, found) -> None:
+        super().__init__(due_s=0.0)
+        self._found, self.looked_at = found, []
+        self._begun, self._free = threading.Semaphore(0), threading.Semaphore(0)
+
+    def frames(self):
+        for frame in super().frames():
+            yield frame
+            if frame.index % 7 == 0:  # the newest one
+                if frame.index:
+                    self._free.release()
+                assert self._begun.acquire(timeout=10.0)
+        self._free.release(COUNT)
+
+    def __call__(self, rgb):
+        self._begun.release()
+        assert self._free.acquire(timeout=10.0)
+        return self._found
+
+
+def test_the_tracker_looks_at_the_newest_frame_and_at_skipped_ones_when_filming_is_over(standing):
+    source, looked_at = Filmed(standing), []
+    stream = TrackedStream(source)
+    tracking = LiveTracking(stream, source, lambda frame, found: looked_at.append(frame.index))
+    camera = assume_camera(Path("film.mp4"), "static", stream)
+    start = tracking.start(load_body_model(None).with_shape(), camera)
     seen = observe_all(stream, tracking, start)
-    assert [item.frame.index for item in seen] == [5, 12, 19]  # but not all of them
-    assert stream.dropped == 18
+    order = [item.frame.index for item in seen]
+    assert looked_at == order[:5] == [0, 7, 14, 21, 23]  # advice is about now
+    assert order[5:] == sorted(order[5:])
+    assert np.diff(sorted(order)).max() <= 4
+    assert np.diff(sorted(order)).min() >= 2
+    places = np.array([item.pose.root_translation for item in seen])
+    assert np.abs(np.diff(places, axis=0)).max() < 0.05
+    assert f"{len(order)} of 24 frames were tracked, {len(order) - 5}" in next(tracking.notes())
 
 
-def test_of_a_fast_camera_every_second_frame_is_taken(standing, monkeypatch):
-    monkeypatch.setattr(tracked_stream.time, "perf_counter", lambda: 90.0)
+@given(st.lists(st.booleans(), min_size=1, max_size=120), st.integers(1, 30))
+@settings(max_examples=30, deadline=None)
+def test_skipped_frames_are_taken_where_gaps_are_largest(tracked, count):
+    skipped = SkippedFrames()
+    picture = np.zeros((1, 1, 3), np.uint8)
+    for number, is_tracked in enumerate(tracked):
+        frame = Frame(index=number, time_s=number / 5.0, rgb=picture)
+        skipped.mark(frame.time_s) if is_tracked else skipped.add(frame)
+    before = gaps([i for i, mark in enumerate(tracked) if mark], len(tracked))
+    taken = [frame.index for frame in skipped.take(count)]
+    assert taken == sorted(taken)
+    assert len(taken) == min(count, len(tracked) - sum(tracked))
+    after = gaps(sorted([*taken, *(i for i, m in enumerate(tracked) if m)]), len(tracked))
+    assert max(after) <= max(before)
+
+
+def gaps(places, count):
+    return np.diff([-1, *places, count]) if places else np.array([count + 1])
+
+
+def test_skipped_frames_keep_to_their_memory(monkeypatch):
+    picture = np.zeros((8, 8, 3), np.uint8)
+    monkeypatch.setattr(tracked_stream, "KEPT_BYTES", 10 * picture.nbytes)
+    skipped = SkippedFrames()
+    for number in range(200):
+        skipped.add(Frame(index=number, time_s=number / 5.0, rgb=picture))
+    taken = [frame.index for frame in skipped.take(100)]
+    assert len(taken) == 10
+    assert np.diff(taken).max() < 80
+
+
+def test_of_a_fast_camera_every_second_frame_is_taken(standing):
     stream, tracking, start = started(Tracker(standing), Pictures(due_s=90.0))
     seen = observe_all(stream, tracking, start)
     assert [item.frame.index for item in seen] == list(range(0, COUNT, 2))

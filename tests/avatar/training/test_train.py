@@ -261,12 +261,19 @@ def rates_by_frames(rig, clip, *, paced, seconds, opens_after_s):
     return rates, trainer
 
 
-def test_a_video_at_its_own_pace_is_learnt_from_until_its_last_frame(rig, clip, ticking):
+def test_after_the_last_frame_of_a_film_that_comes_rates_fall_for_a_while(
+    rig, clip, ticking, monkeypatch
+):
     """Read as fast as possible, reading would come first after half of the time."""
+    monkeypatch.setattr(train_module, "LEAST_STEPS", 60)
+    monkeypatch.setattr(train_module, "CLOSING_S", 0.1)
     rates, trainer = rates_by_frames(rig, clip, paced=True, seconds=0.4, opens_after_s=0.8)
     assert set(rates[1] + rates[2]) == {train_module.STREAMING_RATE_FACTOR * QUICK.learning_rate}
-    assert len(rates[3]) == train_module.MIN_STEPS_AFTER_LAST_FRAME
-    assert trainer.wall_seconds > 0.8  # the last frame came after the time that was given
+    assert (np.diff(rates[3]) <= 0.0).all()
+    assert rates[3][-1] < 0.1 * QUICK.learning_rate
+    assert len(rates[3]) >= train_module.MIN_STEPS_AFTER_LAST_FRAME
+    assert trainer.steps >= 60  # however short the film is
+    assert trainer.wall_seconds > 0.9  # the last frame came after the time that was given
 
 
 def test_seconds_left_after_the_last_frame_are_the_cosines(rig, clip, ticking):
@@ -296,7 +303,8 @@ def test_a_live_source_is_left_when_the_time_is_up(rig, clip, ticking):
     assert trainer.steps >= train_module.MIN_STEPS_AFTER_LAST_FRAME
 
 
-def test_training_ends_with_the_last_image_of_a_folder_that_grows(rig, clip):
+def test_training_ends_with_the_last_image_of_a_folder_that_grows(rig, clip, ticking, monkeypatch):
+    monkeypatch.setattr(train_module, "LEAST_STEPS", 0)
     frames = [prepare_frame(observation, rig) for observation in clip.observations[:2]]
     trainer = Trainer(rig, dataclasses.replace(QUICK, seconds=3600.0))
     events = list(train(trainer, Inbox(frames, paced=True, ends_run=True), []))
