@@ -142,16 +142,32 @@ def flatten_pose(pose: BodyPose) -> Float32[np.ndarray, "75"]:
     return np.concatenate(parts).astype(np.float32)
 
 
+def pack_runtime(compression_level: int) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """Pack the WebAssembly module: the entry by which pages read it, and its file by its path."""
+    draft = _ArrayFiles(compression_level)
+    return draft.array(_byte_array(runtime_files()[WASM_FILE])), draft.files
+
+
 def build_page(
-    path: Path, clip: PageMotion, *, name: str, compression_level: int = 6
+    path: Path,
+    clip: PageMotion,
+    *,
+    name: str,
+    compression_level: int = 6,
+    module: dict[str, Any] | None = None,
 ) -> dict[str, bytes]:
     """Build all files of the page by relative path; index.html is the one to open.
 
-    The page has all tiers of the package. zlib's level: 1 for a local browser, 6 for a host.
+    The page has all tiers of the package.
+
+    Args:
+        compression_level: zlib's: 1 for a local browser, 6 for a host.
+        module: Entry of a WebAssembly module that is stored elsewhere (`pack_runtime`); None packs
+            it into the page.
     """
     runtime = runtime_files()
     draft = _ArrayFiles(compression_level)
-    package = read_package(path)
+    package, wasm = read_package(path, tier=None), runtime.pop(WASM_FILE)
     manifest = package.manifest
     content = {
         "name": name,
@@ -166,13 +182,8 @@ def build_page(
             "middle_m": clip.start_view.middle_m,
         },
         "motion": {"fps": clip.fps, "poses": draft.array(clip.poses)},
-        "runtime": draft.array(_byte_array(runtime.pop(WASM_FILE))),
-        "tiers": {
-            tier: _tier_content(
-                draft, package if tier == "hq" else read_package(path, tier=tier), tier
-            )
-            for tier in manifest.tiers
-        },
+        "runtime": module or draft.array(_byte_array(wasm)),
+        "tiers": {tier: _tier_content(draft, package, tier) for tier in manifest.tiers},
         "golden": [
             _golden_content(draft, frame, picture)
             for frame, picture in zip(manifest.golden, package.golden, strict=True)

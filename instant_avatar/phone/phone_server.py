@@ -6,6 +6,7 @@ import tempfile
 import threading
 from collections import deque
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, final
 
@@ -14,14 +15,14 @@ from aiohttp import web
 
 from capture.input_error import InputError
 from export.package.package_file import read_package
-from export.player import Player
-from export.player_page import build_page
+from export.player_page import PageMotion, StartView, build_page, flatten_pose, pack_runtime
 from instant_avatar.animation.driving_motion import demo_motion, pose_rate
-from instant_avatar.animation.web_server import MIME_TYPES, web_clip
+from instant_avatar.animation.web_server import MIME_TYPES
 from instant_avatar.cli.console import Console
 from instant_avatar.export import ExportArguments, export
 from instant_avatar.phone.access_control import AccessControl
 from instant_avatar.phone.film_queue import Film, FilmQueue, FilmRefused
+from preprocess.body.kinematics import rotation_matrices
 
 PAGE = Path(__file__).with_name("page")
 """Folder of the page's own files."""
@@ -37,6 +38,8 @@ HEARTBEAT_S = 5.0
 """Longest time without a message to a page, seconds: proxies cut silent connections."""
 MESH_TRIANGLES = 20_000
 """Triangles of the meshes that the page offers."""
+MAX_AUTHOR_LENGTH = 80
+"""Longest author that a VRM names, characters."""
 HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin", "Cross-Origin-Embedder-Policy": "require-corp",
     "Cross-Origin-Resource-Policy": "same-origin", "X-Content-Type-Options": "nosniff",
@@ -44,6 +47,8 @@ HEADERS = {
     "X-Frame-Options": "SAMEORIGIN",
 }  # fmt: skip
 """Headers of all answers; the first two isolate the page, so that its player may use threads."""
+KEPT = {"Cache-Control": "max-age=31536000, immutable"}
+"""Header of files that are named by a hash of their content."""
 REFUSED = (
     "This page is opened by the address that ia-capture prints. Each address opens it once, in one "
     "browser: scan the newest code, or look at the terminal for it.\n"
@@ -61,6 +66,7 @@ class PhoneServer:
         self.on_entered: Callable[[], object] = lambda: None
         self._loop = asyncio.new_event_loop()
         self._pages: dict[str, tuple[float, dict[str, bytes]]] = {}
+        self._module: tuple[dict[str, Any], dict[str, bytes]] = ({}, {})
         self._requests: dict[str, deque[float]] = {}
         self._listeners: dict[str, set[asyncio.Event]] = {}
         self._app = web.Application(client_max_size=MAX_PIECE_BYTES, middlewares=[self._guard])
@@ -76,11 +82,14 @@ class PhoneServer:
                 web.get("/films/{number}/messages", self._messages),
                 web.get("/avatars", self._avatars),
                 web.get("/avatars/{name}/{file:.*}", self._avatar),
+                web.get("/runtime/{file:.*}", self._runtime),
             ]
         )
 
     def start(self, host: str, sites: list[tuple[int, Any]]) -> None:
         """Serve at ports, each with a TLS context or None; raise an OSError if one is in use."""
+        with suppress(InputError):  # the player's page names what is missing
+            self._module = pack_runtime(1)
         runner = web.AppRunner(self._app, access_log=None, shutdown_timeout=1.0)
 
         async def listen() -> None:
@@ -128,7 +137,8 @@ class PhoneServer:
         except ConnectionError as error:  # the answer reaches no one
             answer = web.json_response({"message": f"The connection broke: {error}"}, status=400)
         if not answer.prepared:
-            answer.headers.update(HEADERS)
+            for name, value in HEADERS.items():
+                answer.headers.setdefault(name, value)
         return answer
 
     def _enter(self, request: web.Request) -> web.Response:
@@ -155,7 +165,8 @@ class PhoneServer:
         policy = "default-src 'self'; img-src 'self' data: blob:; media-src 'self' blob:"
         headers = {"Content-Security-Policy": f"{policy}; base-uri 'none'; form-action 'none'"}
         live = "here" if request.secure else "elsewhere" if self._live_port else "no"
-        text = text.replace("{{live}}", live)
+        module = "".join(f"runtime/{file}" for file in self._module[1])
+        text = text.replace("{{live}}", live).replace("{{module}}", module)
         return web.Response(text=text, content_type="text/html", headers=headers)
 
     async def _go_live(self, request: web.Request) -> web.Response:
@@ -170,6 +181,13 @@ class PhoneServer:
             raise InputError("There is no such file.")
         kind = MIME_TYPES[path.suffix]
         return web.Response(body=path.read_bytes(), headers={"Content-Type": kind})
+
+    async def _runtime(self, request: web.Request) -> web.Response:
+        """The player's WebAssembly module, which the page fetches while somebody films."""
+        content = self._module[1].get(request.match_info["file"])
+        if content is None:
+            raise InputError("There is no such file.")
+        return web.Response(body=content, headers=HEADERS | KEPT)
 
     def _film(self, request: web.Request) -> Film:
         return self._queue.find(request.match_info["number"], request.cookies[COOKIE])
@@ -260,35 +278,50 @@ class PhoneServer:
         saved = {"Content-Disposition": f'attachment; filename="{name}{Path(file).suffix}"'}
         if file == "avatar.iavatar":
             return web.FileResponse(package, headers=saved | HEADERS)
-        if file in ("avatar.glb", "avatar.ply", "avatar.obj"):
-            content = await asyncio.to_thread(_mesh, package, file)
+        if file in ("avatar.glb", "avatar.ply", "avatar.obj", "avatar.vrm"):
+            author = request.query.get("author", "").strip()[:MAX_AUTHOR_LENGTH]
+            content = await asyncio.to_thread(_mesh, package, file, author)
             return web.Response(body=content, headers=saved)
         if file == "poster.png":
             content = await asyncio.to_thread(lambda: read_package(package).preview)
             return web.Response(body=content, content_type="image/png")
         written = package.stat().st_mtime
         if self._pages.get(name, (0.0,))[0] != written:
-            self._pages = {name: (written, await asyncio.to_thread(_player_page, package, name))}
+            page = await asyncio.to_thread(_player_page, package, name, self._module[0])
+            self._pages = {name: (written, page)}
         files = self._pages[name][1]
         if file not in files:
             raise InputError("There is no such file.")
         kind = MIME_TYPES.get(Path(file).suffix, "application/octet-stream")
-        return web.Response(body=files[file], headers={"Content-Type": kind})
+        kept = KEPT if file.startswith("data/") else {}
+        return web.Response(body=files[file], headers={"Content-Type": kind} | kept)
 
 
-def _player_page(package: Path, name: str) -> dict[str, bytes]:
-    """The files of the player page with the built-in motion."""
-    player, motion = Player.load(package), demo_motion()
-    rows = tuple(int(row) for row in np.flatnonzero(motion.valid))
-    clip = web_clip(player, motion, rows, pose_rate(motion))
-    return build_page(package, clip, name=name, compression_level=1)
+def _player_page(package: Path, name: str, module: dict[str, Any]) -> dict[str, bytes]:
+    """The files of the player page with the built-in motion; `module` is served elsewhere."""
+    motion, held = demo_motion(), read_package(package)
+    rows = np.flatnonzero(motion.valid)
+    height_m = held.tables["hq"].surfels.positions[:, 1]  # drawn by no player, which takes time
+    low, high = float(height_m.min()), float(height_m.max())
+    front = np.diag([1.0, -1.0, -1.0]) @ rotation_matrices(motion.root_rotations[rows[0]]).T
+    pelvis = float(held.tables["hq"].pelvis[1])
+    clip = PageMotion(
+        poses=np.stack([flatten_pose(motion[int(row)]) for row in rows]),
+        fps=pose_rate(motion),
+        start_view=StartView(axes=front, height_m=high - low, middle_m=0.5 * (low + high) - pelvis),
+    )
+    there = {**module, "file": f"../../runtime/{module['file']}"} if module else None
+    return build_page(package, clip, name=name, compression_level=1, module=there)
 
 
-def _mesh(package: Path, file: str) -> bytes:
-    """A mesh of an avatar, as ia-export writes it."""
+def _mesh(package: Path, file: str, author: str) -> bytes:
+    """A mesh of an avatar, as ia-export writes it; a VRM names its author."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / file
         to: Any = out.suffix[1:]
-        chosen = ExportArguments(run=package, to=to, out=out, triangles=MESH_TRIANGLES)
+        named = author if author and to == "vrm" else None
+        chosen = ExportArguments(
+            run=package, to=to, out=out, triangles=MESH_TRIANGLES, author=named
+        )
         export(chosen, Console())
         return out.read_bytes()

@@ -2,13 +2,15 @@
 
 import { listen } from "./gestures.js";
 import { Orbit } from "./orbit.js";
-import { Playback } from "./playback.js";
+import { Playback, QUICK_MS } from "./playback.js";
 import { Player } from "./player.js";
 
 const TIERS = { hq: "Full", lite: "Lite" };
 const BACKGROUNDS = { "As the page": "", White: "#ffffff", Grey: "#8c8c8c", Black: "#000000", Green: "#00b140" };
 const THEMES = { system: "System", light: "Light", dark: "Dark" };
 const SAID_MS = 6000;
+const TRIED_MS = 1000; // time in which a page that starts with Lite finds out what the device manages
+const FULL_COSTS = 1.7; // time of a picture in Full, in pictures in Lite
 const $ = (id) => document.getElementById(id);
 
 export async function start() {
@@ -17,8 +19,10 @@ export async function start() {
   const { avatar } = player;
   $("name").textContent = document.title = avatar.name;
   $("licence").textContent = avatar.licence;
-  const state = { tier: "hq", sharpness: "auto", playing: false, speed: 1 };
-  loading.expect(avatar, "hq");
+  const wanted = new URLSearchParams(location.search).get("start");
+  const tier = wanted in avatar.tiers ? wanted : "hq";
+  const state = { tier, sharpness: "auto", playing: false, speed: 1 };
+  loading.expect(avatar, tier);
   await player.open(state);
   const orbit = new Orbit(avatar.look);
   const playback = new Playback($("picture"), player, orbit, state, (news) => tell(news, player, loading));
@@ -29,7 +33,24 @@ export async function start() {
   playback.play(player.count > 1 && !matchMedia("(prefers-reduced-motion: reduce)").matches);
   markPlaying(state);
   loading.done();
+  if (tier !== "hq") tryFull(player, state, playback);
   playback.run().catch((error) => loading.failed(error.message));
+}
+
+/** Change from Lite to Full once the device has shown that it draws fast enough, unless somebody chose. */
+function tryFull(player, state, playback) {
+  setTimeout(async () => {
+    if (state.chosen || playback.typicalMs() * FULL_COSTS > QUICK_MS) return;
+    await player.open({ tier: "hq" });
+    if (state.chosen) return;
+    state.tier = "hq";
+    playback.changed();
+    markTier(state);
+  }, TRIED_MS);
+}
+
+function markTier(state) {
+  for (const input of document.getElementsByName("tiers")) input.checked = input.value === state.tier;
 }
 
 /** The status shown while a tier is being loaded. */
@@ -103,6 +124,7 @@ const known = (names, there) => Object.fromEntries(there.map((name) => [name, na
 
 function settings(player, state, playback, loading) {
   const changeTier = async (tier) => {
+    state.chosen = true;
     loading.expect(player.avatar, tier);
     try {
       await player.open({ tier });
@@ -111,7 +133,7 @@ function settings(player, state, playback, loading) {
       loading.done();
     } catch (error) {
       loading.showError(error.message);
-      for (const input of document.getElementsByName("tiers")) input.checked = input.value === state.tier;
+      markTier(state);
     }
   };
   choices($("tiers"), known(TIERS, Object.keys(player.avatar.tiers)), state.tier, changeTier);

@@ -2,7 +2,7 @@
 
 import { roomIn } from "./orbit.js";
 
-const QUICK_MS = 45; // below this a moving picture may become sharper …
+export const QUICK_MS = 45; // below this a moving picture may become sharper …
 const SLOW_MS = 75; // … and above this it becomes coarser
 const COARSEST = 270, SHARPEST = 1080; // shorter side, pixels
 const STILL_MS = 180; // delay of the sharp picture after the last movement
@@ -13,7 +13,7 @@ export class Playback {
     Object.assign(this, { canvas, player, orbit, state, onNews });
     this.context = canvas.getContext("2d");
     this.row = 0; this.time = 0; this.moving = 540;
-    this.shown = []; this.wake = () => {}; this.dirty = true; this.touched = 0; this.sharp = false;
+    this.shown = []; this.took = []; this.wake = () => {}; this.dirty = true; this.touched = 0; this.sharp = false;
     new ResizeObserver(() => this.changed()).observe(canvas);
   }
 
@@ -97,10 +97,18 @@ export class Playback {
       this.context.clearRect(0, 0, width, height);
     }
     if (part) this.context.putImageData(new ImageData(part.rgba, part.width, part.height), part.x, part.y);
+    if (part && !this.took.length && parent !== window) parent.postMessage("drawn", location.origin);
+    if (part) this.took = [...this.took.slice(-30), part.ms];
     if (part && state.playing) this.adapt(part.ms);
     this.onNews({ row, ms: part ? part.ms : 0, rate: this.rate(), playing: state.playing });
     // lets the browser paint, clicks and keys come in
     await new Promise((resolve) => { const { port1, port2 } = new MessageChannel(); port1.onmessage = resolve; port2.postMessage(0); });
+  }
+
+  /** Median time of a picture so far, milliseconds; infinite before the first one. */
+  typicalMs() {
+    const sorted = [...this.took].sort((a, b) => a - b);
+    return sorted[sorted.length >> 1] ?? Infinity;
   }
 
   /** Sharper or coarser, so that movement stays fluent. */

@@ -4,7 +4,7 @@ import { Growing, Stored, ask, send } from "./upload.js";
 
 const $ = (id) => document.getElementById(id);
 const COUNTDOWN_S = 5;
-const PIECE_MS = 200; // length of what the camera hands over at once
+const PIECE_MS = 100; // length of what the camera hands over at once
 const SPOKEN_AGAIN_MS = 9000;
 const KINDS = ["video/webm;codecs=h264", "video/webm;codecs=vp8", "video/mp4;codecs=avc1.42E01E", "video/webm", "video/mp4"];
 let adding = "", facing = "environment", stream = null, shown = "";
@@ -128,19 +128,29 @@ async function record(film, type) {
   await lock?.release();
 }
 
+/** Show an avatar: its poster until the player has drawn, the older player until a finer one has. */
 function open(name, note) {
   finish();
   adding = "";
+  const address = `avatars/${encodeURIComponent(name)}/`;
   if ($("done").hidden || shown !== name) {
     view("done");
-    $("player").src = `avatars/${encodeURIComponent(name)}/`;
+    $("poster").src = `${address}poster.png`;
+    $("poster").hidden = false;
+    $("player").src = `${address}?start=lite`;
+  } else {
+    const finer = $("player").cloneNode();
+    Object.assign(finer, { src: `${address}?start=hq`, className: "coming", id: "" });
+    $("player").after(finer);
   }
   shown = name;
   $("title").textContent = name;
   $("note").textContent = note;
   for (const [id, file] of [["package", "avatar.iavatar"], ["glb", "avatar.glb"], ["ply", "avatar.ply"], ["obj", "avatar.obj"]]) {
-    $(id).href = `avatars/${encodeURIComponent(name)}/${file}`;
+    $(id).href = address + file;
   }
+  $("author").oninput = () => { $("vrm").href = `${address}avatar.vrm?author=${encodeURIComponent($("author").value)}`; };
+  $("author").oninput();
   $("share").onclick = () => share(name);
   $("more").onclick = () => {
     adding = name;
@@ -149,6 +159,15 @@ function open(name, note) {
     view("home");
   };
 }
+
+addEventListener("message", ({ source, origin, data }) => {
+  if (origin !== location.origin || data !== "drawn") return;
+  $("poster").hidden = true;
+  const finer = document.querySelector(".coming");
+  if (finer?.contentWindow !== source) return;
+  $("player").remove();
+  Object.assign(finer, { className: "", id: "player" });
+});
 
 async function share(name) {
   const blob = await (await fetch($("package").href)).blob();
