@@ -20,8 +20,8 @@ from export.package.player_tables import (
 
 VERTEX_SPACING_M = 0.005
 """Edge of the cells in which the surface is extracted, metres; a crossed cell gives one vertex."""
-SURFACE_DENSITY = 50.0
-"""Density of the surface, 1/m."""
+SURFACE_DENSITY = 25.0
+"""Density of the surface, 1/m: the silhouette is then as wide as the renderer's."""
 HAZE_DENSITY = 15.0
 """Density of the faint cover that closes regions which no camera saw, 1/m."""
 BORDER_VOXELS = 4
@@ -76,10 +76,11 @@ def extract_mesh(
     tables: PlayerTables,
     *,
     spacing_m: float = VERTEX_SPACING_M,
+    density: float = SURFACE_DENSITY,
     triangles: int | None = None,
     textured: bool = False,
 ) -> SkinnedMesh:
-    """Extract the surface of baked bricks, with a vertex about every `spacing_m`.
+    """Extract the surface of baked bricks at a density (1/m), a vertex about every `spacing_m`.
 
     It is simplified to `triangles` (quadric error metrics, Garland and Heckbert 1997; needs
     fast-simplification) unless that is None.
@@ -87,7 +88,7 @@ def extract_mesh(
     codes, low = _dense_grid(tables.bricks)
     voxel_m = tables.bricks.voxel_m
     step = spacing_m / voxel_m
-    nodes, faces = extract_isosurface(resample_grid(_level_function(codes[..., 3]), step))
+    nodes, faces = extract_isosurface(resample_grid(_level_function(codes[..., 3], density), step))
     nodes *= np.float32(step)
     positions = (low + nodes * np.float32(voxel_m)).astype(np.float32)
     normals = _smooth_normals(positions, faces)
@@ -140,14 +141,16 @@ def _simplify(
     return found[0].astype(np.float32), normals[nearest], found[1].astype(np.int32)
 
 
-def _level_function(density: UInt8[np.ndarray, "x y z"]) -> Float32[np.ndarray, "x y z"]:
+def _level_function(
+    codes: UInt8[np.ndarray, "x y z"], density: float
+) -> Float32[np.ndarray, "x y z"]:
     """Return a function that is positive inside: log-density over the level, without floaters."""
-    level, haze = density_code(np.array([SURFACE_DENSITY, HAZE_DENSITY])).astype(np.float32)
+    level, haze = density_code(np.array([density, HAZE_DENSITY])).astype(np.float32)
     solid = remove_floaters_and_cavities(
-        (density > level) | _solid_interior(density > haze),
+        (codes > level) | _solid_interior(codes > haze),
         MIN_VOLUME_FRACTION,
     )
-    height = density.astype(np.float32) - level
+    height = codes.astype(np.float32) - level
     height = np.where(solid, np.maximum(height, 1.0), np.minimum(height, -1.0))
     return ndimage.gaussian_filter(
         np.clip(height, -CODE_CONTRAST, CODE_CONTRAST), BLUR_VOXELS, truncate=3.0
