@@ -249,12 +249,15 @@ class Player:
 
     def bones(self, pose: BodyPose, camera: Camera) -> Float32[np.ndarray, "24 3 4"]:
         """Return camera-from-canonical matrices of the joints."""
+        camera_from_canonical = camera.camera_from_world @ self.world_from_canonical(pose)
+        return camera_from_canonical[:, :3].astype(np.float32)
+
+    def world_from_canonical(self, pose: BodyPose) -> Float[np.ndarray, "24 4 4"]:
+        """Return the joints' matrices that move canonical points into the pose's world."""
         root = world_from_body(
             self.manifest.rest_joints[0], pose.root_rotation, pose.root_translation
         )
-        body_from_canonical = self._body_from_rest(pose.joint_rotations) @ self._rest_from_canonical
-        camera_from_canonical = camera.camera_from_world @ root @ body_from_canonical
-        return camera_from_canonical[:, :3].astype(np.float32)
+        return root @ self._body_from_rest(pose.joint_rotations) @ self._rest_from_canonical
 
     def _body_from_rest(self, rotations: Float[np.ndarray, "23 3"]) -> Float[np.ndarray, "24 4 4"]:
         return body_from_rest(self.manifest.rest_joints, self.manifest.parents, rotations)

@@ -4,12 +4,13 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
+from jaxtyping import Float
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from capture.atomic_files import atomic_file
@@ -17,8 +18,10 @@ from capture.camera import Camera
 from capture.input_error import InputError
 from export.gltf import SkeletonAnimation, encode_glb, encode_vrm
 from export.package.manifest import Manifest
-from export.package.package_file import read_package
+from export.package.package_file import AvatarPackage, read_package
+from export.player import Player
 from export.skinned_mesh import SkinnedMesh, extract_mesh
+from export.splats import build_splats, encode_ply, encode_spz
 from instant_avatar.animation.driving_motion import (
     DISTANCE_HEIGHTS,
     PERSON_HEIGHT_SHARE,
@@ -47,6 +50,8 @@ VIEW_PX = 256
 """Width and height of a synthetic view."""
 UNKNOWN_AUTHOR = "unknown"
 """Author of a VRM file, which must state one, where none is given."""
+SPLAT_ENCODERS = {".ply": encode_ply, ".spz": encode_spz}
+"""Encoders of splats by the suffix of --out."""
 MIN_TRIANGLES = 500
 """Least --triangles; below it a hand is a lump."""
 
@@ -69,6 +74,10 @@ class ExportArguments:
 
         ia-export run/avatar.iavatar --to vrm --triangles 20000 --out me.vrm
 
+    For viewers of 3-D Gaussians, in the pose of a file's first row:
+
+        ia-export run/avatar.iavatar --to splats --poses wave.npz --out wave.spz
+
     The run continues undisturbed; nothing in its folder is changed unless --out names it. A mesh is
     opaque with a hard silhouette: ia-play renders the avatar in full quality.
 
@@ -77,13 +86,15 @@ class ExportArguments:
 
     run: Annotated[Positional[Path], arg(metavar="RUN|AVATAR")]
     """Folder written by ia-ingest (--out), with checkpoint/; for meshes also a package."""
-    to: Literal["iavatar", "glb", "vrm", "ply", "obj"] = "iavatar"
-    """Format: package for ia-play; binary glTF 2.0; VRM 1.0 (humanoid bones, resting in a T); or a
-    static mesh with vertex colors as PLY or OBJ (canonical pose, no skeleton)."""
+    to: Literal["iavatar", "glb", "vrm", "ply", "obj", "splats"] = "iavatar"
+    """Format: package for ia-play; binary glTF 2.0; VRM 1.0 (humanoid bones, resting in a T); a
+    static mesh with vertex colors as PLY or OBJ (canonical pose, no skeleton); or 3-D Gaussians in
+    one pose, as .ply or .spz."""
     out: Annotated[Path, arg(metavar="FILE", help_behavior_hint="(required)")]
     """File to write, whole or not at all."""
     poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """Motion for --to glb, as in ia-play (default: a turn)."""
+    """Motion for --to glb, as in ia-play (default: a turn); --to splats takes its first pose
+    (default: the canonical pose)."""
     person: Annotated[str | None, arg(metavar="ID", help_behavior_hint="")] = None
     """Person ID in the pose file (default: the longest track)."""
     triangles: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
@@ -104,8 +115,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def export(arguments: ExportArguments, console: Console) -> int:
     """Write a package or a mesh."""
-    if arguments.out.suffix.lower() != f".{arguments.to}":
-        raise InputError(f"--out is {arguments.out}, but must end in .{arguments.to}.")
+    suffixes = SPLAT_ENCODERS if arguments.to == "splats" else (f".{arguments.to}",)
+    if arguments.out.suffix.lower() not in suffixes:
+        raise InputError(f"--out is {arguments.out}, but must end in {' or '.join(suffixes)}.")
     if not arguments.out.resolve().parent.is_dir():
         raise InputError(
             f"--out is {arguments.out}, but the folder {arguments.out.resolve().parent} does not "
@@ -115,60 +127,83 @@ def export(arguments: ExportArguments, console: Console) -> int:
         path for path in (arguments.run, arguments.poses) if path is not None and path.is_file()
     ]
     check_output_file(arguments.out, "--out", inputs, overwrite=arguments.overwrite)
-    if arguments.poses is not None and arguments.to != "glb":
-        raise InputError(f"--poses requires --to glb; a .{arguments.to} holds no motion.")
+    if arguments.poses is not None and arguments.to not in ("glb", "splats"):
+        raise InputError(f"--poses requires --to glb or splats; a .{arguments.to} holds no motion.")
     if arguments.author is not None and arguments.to != "vrm":
         raise InputError(f"--author requires --to vrm; a .{arguments.to} states none.")
-    if arguments.triangles is not None and arguments.to == "iavatar":
-        raise InputError("--triangles requires --to glb, vrm, ply or obj; a package has none.")
+    if arguments.triangles is not None and arguments.to in ("iavatar", "splats"):
+        raise InputError("--triangles requires --to glb, vrm, ply or obj; other files have none.")
     if arguments.triangles is not None and arguments.triangles < MIN_TRIANGLES:
         raise InputError(
             f"--triangles is {arguments.triangles}, but must be at least {MIN_TRIANGLES}."
         )
     if arguments.run.is_file() and arguments.to != "iavatar":
-        _export_mesh(arguments, arguments.run, console)
+        _export_converted(arguments, arguments.run, console)
     else:
         with tempfile.TemporaryDirectory() as folder:
             package = Path(folder) / "avatar.iavatar"
             _export_package(arguments.run, package, console, fine_tune=arguments.to == "iavatar")
             if arguments.to != "iavatar":
-                _export_mesh(arguments, package, console)
+                _export_converted(arguments, package, console)
             else:
                 with atomic_file(arguments.out, replace=arguments.overwrite) as part:
                     shutil.copyfile(package, part)
-    console.print_artifact("mesh" if arguments.to != "iavatar" else "package", arguments.out)
+    kind = {"iavatar": "package", "splats": "splats"}.get(arguments.to, "mesh")
+    console.print_artifact(kind, arguments.out)
     return DONE
 
 
-def _export_mesh(arguments: ExportArguments, package: Path, console: Console) -> None:
-    """Write a mesh of a package in the format of --to, whole or not at all."""
+def _export_converted(arguments: ExportArguments, package: Path, console: Console) -> None:
+    """Write a mesh or splats of a package in the format of --to, whole or not at all."""
     held = read_package(package)
-    motion = demo_motion()
+    motion = None
     if arguments.poses is not None:
         joints = held.manifest.rest_joints
         motion = load_driving_motion(arguments.poses, joints, console, person=arguments.person)
     out = arguments.out
+    if arguments.to == "splats":
+        with console.status("laying Gaussians on the surface"):
+            bones = None if motion is None else _bones_of_first_pose(held, motion)
+            splats = build_splats(held.tables["hq"], bones)
+            content = SPLAT_ENCODERS[out.suffix.lower()](splats)
+        said = f"{len(splats.positions):,} Gaussians."
+    else:
+        content, said = _build_mesh(arguments, held, motion or demo_motion(), console)
+    with atomic_file(out, replace=arguments.overwrite) as part:
+        part.write_bytes(content)
+    console.info(said)
+
+
+def _build_mesh(
+    arguments: ExportArguments, package: AvatarPackage, motion: Motion, console: Console
+) -> tuple[bytes, str]:
+    """Return a file of a mesh, and its size in words."""
+    name = arguments.out.stem
     textured = arguments.to in ("glb", "vrm") and arguments.triangles is not None
     if textured and find_spec("xatlas") is None:
         textured = False
         console.info("note: colors of vertices instead of a texture, which needs xatlas.")
     with console.status("extracting the surface"):
         mesh = extract_mesh(
-            held.tables["hq"],
+            package.tables["hq"],
             triangles=arguments.triangles,
             textured=textured,
         )
         if arguments.to == "glb":
-            content = _encode_animated(mesh, held.manifest, motion, out.stem)
+            content = _encode_animated(mesh, package.manifest, motion, name)
         elif arguments.to == "vrm":
-            content = encode_vrm(
-                mesh, held.manifest, name=out.stem, author=arguments.author or UNKNOWN_AUTHOR
-            )
+            author = arguments.author or UNKNOWN_AUTHOR
+            content = encode_vrm(mesh, package.manifest, name=name, author=author)
         else:
             content = _encode_static(mesh, arguments.to)
-    with atomic_file(out, replace=arguments.overwrite) as part:
-        part.write_bytes(content)
-    console.info(f"{len(mesh.positions):,} vertices, {len(mesh.faces):,} triangles.")
+    return content, f"{len(mesh.positions):,} vertices, {len(mesh.faces):,} triangles."
+
+
+def _bones_of_first_pose(package: AvatarPackage, motion: Motion) -> Float[np.ndarray, "24 4 4"]:
+    """Return world-from-canonical matrices of a motion's first pose, upright at the origin."""
+    pose = motion[int(np.flatnonzero(motion.valid)[0])]
+    upright = replace(pose, root_rotation=np.zeros(3), root_translation=np.zeros(3))
+    return Player(package).world_from_canonical(upright)
 
 
 def _encode_animated(mesh: SkinnedMesh, manifest: Manifest, motion: Motion, name: str) -> bytes:

@@ -1,0 +1,135 @@
+"""Gaussians of the surface: read back from their files, moved, and drawn by a rasterizer here."""
+
+import gzip
+import struct
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from export.package.package_file import read_package
+from export.player import Player, picture_on_white, premultiply
+from export.skinned_mesh import extract_mesh
+from export.splats import DENSITY, SPACING_M, build_splats, encode_ply, encode_spz
+
+
+@pytest.fixture(scope="module")
+def package(exported):
+    return read_package(exported.path)
+
+
+@pytest.fixture(scope="module")
+def splats(package):
+    return build_splats(package.tables["hq"])
+
+
+def covariances(scales, rotations):
+    """Of Gaussians whose rotations are quaternions w, x, y, z."""
+    axes = Rotation.from_quat(rotations, scalar_first=True).as_matrix() * scales[:, None]
+    return axes @ axes.transpose(0, 2, 1)
+
+
+def rasterize(splats, camera):
+    """A picture on white as 3DGS defines it (EWA, front to back), with Mip-Splatting's filter."""
+    points = splats.positions @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]
+    order = np.argsort(points[:, 2])
+    points, depth = points[order], points[order, 2:]
+    center = points[:, :2] / depth * camera.focal_px + camera.center_px
+    slopes = np.zeros((len(points), 2, 3))
+    slopes[:, [0, 1], [0, 1]] = camera.focal_px / depth
+    slopes[:, :, 2] = -points[:, :2] / depth**2 * camera.focal_px
+    slopes = slopes @ camera.camera_from_world[:3, :3]
+    shape = covariances(splats.scales[order], splats.rotations[order])
+    shape = slopes @ shape @ slopes.transpose(0, 2, 1)
+    wide = shape + 0.3 * np.eye(2)
+    peak = splats.opacities[order] * np.sqrt(
+        np.maximum(np.linalg.det(shape), 0.0) / np.linalg.det(wide)
+    )
+    reach = np.arange(-4, 5)
+    pixels = np.floor(center).astype(int)[:, None] + np.stack(
+        np.meshgrid(reach, reach), axis=-1
+    ).reshape(-1, 2)
+    away = pixels + 0.5 - center[:, None]
+    power = np.einsum("spa,sab,spb->sp", away, np.linalg.inv(wide), away)
+    alpha = np.where(power < 8.0, peak[:, None] * np.exp(-0.5 * power), 0.0)
+    width, height = camera.size_px
+    seen = (alpha > 1 / 512) & ((pixels >= 0) & (pixels < [width, height])).all(axis=2)
+    splat, _ = np.nonzero(seen)
+    place = (pixels[..., 1] * width + pixels[..., 0])[seen]
+    sort = np.lexsort((splat, place))  # pixel after pixel, the nearest Gaussian first
+    place, splat, passed = place[sort], splat[sort], np.log1p(-alpha[seen][sort])
+    before = np.cumsum(passed) - passed
+    first = np.searchsorted(place, place)
+    weight = np.exp(before - before[first]) * -np.expm1(passed)
+    picture = np.ones((height * width, 3))
+    for channel in range(3):
+        darker = weight * (splats.colors[order][splat, channel] - 1.0)
+        picture[:, channel] += np.bincount(place, darker, height * width)
+    return picture.reshape(height, width, 3)
+
+
+def test_a_ply_holds_the_same_gaussians_with_y_down(splats):
+    content = encode_ply(splats)
+    head, rows = content.split(b"end_header\n", 1)
+    names = [line.split()[-1] for line in head.decode().splitlines() if "float" in line]
+    assert f"element vertex {len(splats.positions)}\n".encode() in head
+    columns = dict(zip(names, np.frombuffer(rows, "<f4").reshape(-1, len(names)).T, strict=True))
+
+    def read(*wanted):
+        return np.stack([columns[name] for name in wanted], axis=1)
+
+    flip = np.diag([1.0, -1.0, -1.0])
+    np.testing.assert_allclose(read("x", "y", "z") @ flip, splats.positions, atol=1e-6)
+    color = 0.5 + 0.28209479 * read("f_dc_0", "f_dc_1", "f_dc_2")
+    np.testing.assert_allclose(color, splats.colors, atol=1e-5)
+    opacity = 1.0 / (1.0 + np.exp(-read("opacity")[:, 0]))
+    np.testing.assert_allclose(opacity, splats.opacities, atol=1e-5)
+    scales = np.exp(read("scale_0", "scale_1", "scale_2"))
+    found = covariances(scales, read("rot_0", "rot_1", "rot_2", "rot_3"))
+    expected = flip @ covariances(splats.scales, splats.rotations) @ flip
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_an_spz_holds_the_same_gaussians_in_few_bytes(splats):
+    content = encode_spz(splats)
+    assert len(content) < 24 * len(splats.positions)
+    plain = gzip.decompress(content)
+    magic, version, count, degree, fraction, _, _ = struct.unpack_from("<IIIBBBB", plain)
+    assert (magic, version, count, degree) == (0x5053474E, 2, len(splats.positions), 0)
+    codes = np.frombuffer(plain, np.uint8, offset=16)
+    place, opacity, color, scale, turn = np.split(codes, np.cumsum([9, 1, 3, 3]) * count)
+    places = place.reshape(-1, 3, 3).astype(np.int32) @ [1, 1 << 8, 1 << 16]
+    places = np.where(places >= 1 << 23, places - (1 << 24), places) / 2**fraction
+    np.testing.assert_allclose(places, splats.positions, atol=2e-4)
+    np.testing.assert_allclose(opacity / 255.0, splats.opacities, atol=2e-3)
+    colors = (color.reshape(-1, 3) / 255.0 - 0.5) / 0.15 * 0.28209479 + 0.5
+    np.testing.assert_allclose(colors, splats.colors, atol=4e-3)
+    scales = np.exp(scale.reshape(-1, 3) / 16.0 - 10.0)
+    np.testing.assert_allclose(scales / splats.scales, 1.0, atol=0.04)
+    vector = turn.reshape(-1, 3) / 127.5 - 1.0
+    real = np.sqrt(np.maximum(0.0, 1.0 - (vector**2).sum(axis=1)))
+    given = Rotation.from_quat(splats.rotations, scalar_first=True)
+    found = Rotation.from_quat(np.column_stack([real, vector]), scalar_first=True)
+    assert np.median((found * given.inv()).magnitude()) < np.deg2rad(1.0)
+
+
+def test_they_lie_flat_under_the_surface(package, splats):
+    mesh = extract_mesh(package.tables["hq"], spacing_m=SPACING_M, density=DENSITY)
+    inward = np.sum((mesh.positions - splats.positions) * mesh.normals, axis=1)
+    np.testing.assert_allclose(inward, inward[0], atol=1e-6)
+    assert 0.0 < inward[0] < 0.005
+    across = np.einsum(
+        "sa,sab,sb->s", mesh.normals, covariances(splats.scales, splats.rotations), mesh.normals
+    )
+    np.testing.assert_allclose(np.sqrt(across), splats.scales.min(axis=1), rtol=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pose", ["canonical", "bent"])
+def test_they_look_like_the_avatar(package, stand_in, camera, bent, pose):
+    player, view = Player(package), camera(320, 400)
+    pose = stand_in.canonical if pose == "canonical" else bent
+    drawn = rasterize(build_splats(package.tables["hq"], player.world_from_canonical(pose)), view)
+    expected = picture_on_white(premultiply(player.render(pose, view)))
+    error = ((drawn - expected) ** 2).mean()
+    assert -10.0 * np.log10(error) > 28.0  # 26 without their inset
