@@ -12,6 +12,7 @@ import sys
 import tarfile
 import zlib
 from dataclasses import asdict, dataclass
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import Any, final
@@ -142,6 +143,7 @@ def flatten_pose(pose: BodyPose) -> Float32[np.ndarray, "75"]:
     return np.concatenate(parts).astype(np.float32)
 
 
+@cache
 def pack_runtime(compression_level: int) -> tuple[dict[str, Any], dict[str, bytes]]:
     """Pack the WebAssembly module: the entry by which pages read it, and its file by its path."""
     draft = _ArrayFiles(compression_level)

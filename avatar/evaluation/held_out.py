@@ -6,6 +6,7 @@ a frame, so that its scores over time can be compared. Weighted by the strata's 
 without bias the errors that `score_frame` measures on all pixels.
 """
 
+import bisect
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -112,16 +113,19 @@ def score_rendering(
 def add_held_out(
     frames: list[HeldOutFrame], frame: HeldOutFrame, *, max_frames: int = MAX_HELD_OUT
 ) -> None:
-    """Adds a held-out frame, in place; above `max_frames` every second frame is dropped.
+    """Adds a held-out frame at its place, in place; above `max_frames` every second is dropped.
 
-    The frames that stay are spread evenly over the stream: later frames are added only at the
-    distance that the kept ones have from each other.
+    The frames that stay are spread evenly over the stream: once half as many are kept, others are
+    added only at the distance that these have from each other.
     """
     places = [kept.observation.frame.index for kept in frames]
     closest = min((b - a for a, b in pairwise(places)), default=0)
-    if frames and frame.observation.frame.index - places[-1] < closest:
+    number = frame.observation.frame.index
+    place = bisect.bisect(places, number)
+    beside = places[max(place - 1, 0) : place + 1]
+    if 2 * len(frames) >= max_frames and any(abs(number - other) < closest for other in beside):
         return
-    frames.append(frame)
+    frames.insert(place, frame)
     if len(frames) > max_frames:
         del frames[1::2]
 

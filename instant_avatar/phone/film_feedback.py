@@ -103,7 +103,7 @@ class FilmFeedback:
                 self._film.tell("state", state="done")
 
     def _look(self, seen: Tracked) -> None:
-        """Speak of the framing once it is sure; on the thread that reads frames."""
+        """Speak of the framing once it is sure; on the tracker's thread."""
         text = framing_advice(seen)
         self._repeats = self._repeats + 1 if text == self._framing else 1
         self._framing = text

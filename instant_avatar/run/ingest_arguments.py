@@ -85,8 +85,8 @@ class IngestArguments(CaptureArguments):
     speed of the machine, but for rounding. Two cores make about 50 per second. Every frame takes
     at least one step."""
     realtime: Flag = False
-    """Simulate a live camera: deliver frames at their timestamps. The avatar is ready when the
-    video ends; extra --seconds continue training after the last frame."""
+    """Simulate a live camera: deliver frames at their timestamps. The avatar is ready some seconds
+    after the video ends; extra --seconds continue training after the last frame."""
     live: Flag = False
     """VIDEO is a folder to which another program is still writing images; the person is tracked
     while they come, and each image is used, however late it is its turn. The run ends with a file

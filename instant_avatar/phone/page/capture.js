@@ -43,7 +43,12 @@ async function begin(type, size) {
   on("preview", ({ image }) => { $("preview").src = image; $("preview").hidden = false; });
   on("progress", ({ text, share }) => { $("progress").value = share; if (!$("done").hidden) $("note").textContent = `${text} …`; });
   on("warning", ({ text }) => warn(text));
-  on("avatar", ({ name, final }) => open(name, final ? "It is ready." : "It can be played; finer detail follows."));
+  let opened = false;
+  on("avatar", ({ name, final }) => {
+    if (opened && $("done").hidden) return; // somebody films again
+    opened = true;
+    open(name, final ? "It is ready." : "It can be played; finer detail follows.");
+  });
   on("failed", ({ text }) => { finish(); view("home"); warn(text); });
   on("over", () => { events.close(); listEarlier(); });
   await new Promise((resolve) => on("state", ({ state, behind, text }) => {

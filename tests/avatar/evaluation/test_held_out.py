@@ -160,6 +160,14 @@ def test_of_a_long_stream_a_bounded_spread_of_held_out_frames_stays(held, count,
         assert indices == list(places)
 
 
+def test_held_out_frames_that_come_later_from_before_are_put_between_the_others(held):
+    kept = []
+    for index in (40, 90, 140, 10, 65, 100, 120):
+        frame = replace(held.observation.frame, index=index)
+        add_held_out(kept, HeldOutFrame(observation=replace(held.observation, frame=frame)))
+    assert [each.observation.frame.index for each in kept] == [10, 40, 65, 90, 100, 120, 140]
+
+
 @pytest.mark.slow
 def test_a_warp_that_is_solved_when_it_is_needed_gives_the_same_score(rig, held, learnt):
     lazy = HeldOutFrame(observation=held.observation)

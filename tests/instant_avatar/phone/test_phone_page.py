@@ -76,8 +76,13 @@ def test_a_film_of_the_pages_camera_becomes_an_avatar_in_its_player(camera_film,
             until(lambda: browser.run("!document.getElementById('preview').hidden"), 600.0)
             browser.click("Stop")
             until(lambda: browser.run("!document.getElementById('done').hidden"), 900.0)
+            until(lambda: browser.run("document.getElementById('poster').naturalWidth"), 60.0)
             played = "!!document.getElementById('player').contentWindow.player"
             until(lambda: browser.run(played), 600.0)
+            until(lambda: browser.run("document.getElementById('poster').hidden"), 600.0)
+            finer = "[...document.querySelectorAll('#show iframe')].map((f) => f.src).join()"
+            until(lambda: browser.run(finer).endswith("/avatars/Anna/?start=hq"), 900.0)
+            until(lambda: browser.run(finer).count("start") == 1, 600.0)
             assert browser.run(
                 "document.getElementById('player').contentWindow.crossOriginIsolated"
             )

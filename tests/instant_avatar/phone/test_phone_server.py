@@ -2,6 +2,7 @@
 
 import http.client
 import json
+import re
 import shutil
 import time
 
@@ -205,3 +206,38 @@ def test_what_is_no_certificate_is_bad_input(tmp_path):
     path.write_text("notes")
     with pytest.raises(InputError, match=r"--cert .*notes\.pem.*PEM files"):
         load_certificate(path, path)
+
+
+@pytest.fixture
+def anna(queue, run):
+    """A finished avatar of that name."""
+    place = queue.folder / "Anna" / "run"
+    place.mkdir(parents=True)
+    shutil.copy(run / "avatar.iavatar", place)
+
+
+@pytest.mark.slow
+def test_an_avatar_is_saved_as_vrm_with_the_author_who_was_named(phone, anna):
+    for query, author in (("?author=Ann%20M.", "Ann M."), ("?author=", "unknown")):
+        answer = phone.ask("GET", f"/avatars/Anna/avatar.vrm{query}")
+        assert answer.status == 200
+        assert answer.headers["Content-Disposition"] == 'attachment; filename="Anna.vrm"'
+        length = int.from_bytes(answer.content[12:16], "little")
+        scene = json.loads(answer.content[20 : 20 + length])
+        assert scene["extensions"]["VRMC_vrm"]["meta"]["authors"] == [author]
+
+
+@pytest.mark.slow
+def test_the_players_module_is_served_once_for_all_avatars(phone, anna):
+    page = phone.ask("GET", "/").content.decode()
+    link = re.search(r'rel="prefetch" as="fetch" href="(runtime/[^"]+)"', page)
+    if link is None:
+        pytest.skip("onnxruntime-web is not here (make web)")
+    content = json.loads(phone.ask("GET", "/avatars/Anna/avatar.json").content)
+    assert content["runtime"]["file"] == f"../../{link[1]}"
+    module = phone.ask("GET", f"/{link[1]}")
+    assert len(module.content) == content["runtime"]["bytes"]
+    assert "immutable" in module.headers["Cache-Control"]
+    assert phone.ask("GET", f"/{link[1]}", cookie="").status == 403
+    height_m = content["look"]["height_m"]
+    assert 1.4 < height_m < 2.2
