@@ -37,7 +37,7 @@ from export.bake.fine_tuning import (
 from export.bake.proxy_surface import FieldFunction
 from export.bake.reference_player import PlayerInputs, draw_reference
 from export.graph.player_graph import build_graph
-from export.package.manifest import MAX_GOLDEN_PX, GoldenFrame, Manifest, TierInfo
+from export.package.manifest import LICENCE_NOTE, MAX_GOLDEN_PX, GoldenFrame, Manifest, TierInfo
 from export.package.package_file import AvatarPackage, PackageWriter
 from export.package.player_tables import (
     QUALITY_TIERS,
@@ -323,6 +323,9 @@ def _unchecked_package(
             tiers=notes,
             golden=tuple(golden),
             metrics=dict(metrics),
+            licence=" ".join(
+                [LICENCE_NOTE, *filter(None, [metrics.get("made_with", {}).get("summary")])]
+            ),
             sha256={},
         ),
         graphs={

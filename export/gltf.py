@@ -107,12 +107,13 @@ def encode_glb(
 def encode_vrm(mesh: SkinnedMesh, manifest: Manifest, *, name: str, author: str) -> bytes:
     """Encode a skinned mesh and its skeleton as a VRM 1.0 file, which rests in a T.
 
-    Expressions are left empty, as no face was told apart. What the licence allows is the least
-    that VRM knows: the author alone may play the avatar, not commercially, unmodified.
+    Expressions are left empty, as no face was told apart. The author alone may play the avatar,
+    unmodified, and commercially if all that it was made with allows that.
     (vrm.dev, VRMC_vrm-1.0.)
     """
     draft = _GltfBuffer()
     skin, nodes = _skeleton(draft, mesh, manifest, np.zeros((24, 3)))
+    is_free = manifest.metrics.get("made_with", {}).get("commercial_use") == "yes"
     humanoid = {bone: {"node": FIRST_JOINT + joint} for joint, bone in VRM_BONES.items()}
     meta = {
         "name": name,
@@ -120,7 +121,7 @@ def encode_vrm(mesh: SkinnedMesh, manifest: Manifest, *, name: str, author: str)
         "copyrightInformation": manifest.licence,
         "licenseUrl": "https://vrm.dev/licenses/1.0/",
         "avatarPermission": "onlyAuthor",
-        "commercialUsage": "personalNonProfit",
+        "commercialUsage": "personalProfit" if is_free else "personalNonProfit",
         "creditNotation": "required",
         "modification": "prohibited",
     }

@@ -102,7 +102,7 @@ class ExportArguments:
     (default: some 300,000, with vertex colors). 20,000 are enough for most."""
     author: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
     """Author that --to vrm states (default: unknown); its licence allows the author's own use
-    alone."""
+    alone, commercial use only if all that the avatar was made with does."""
     overwrite: Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")] = False
     """Replace the file that --out names, if it exists."""
 
@@ -249,12 +249,18 @@ def _export_package(folder: Path, out: Path, console: Console, *, fine_tune: boo
         from export.bake.bake_tables import ExportRefused
         from instant_avatar.run.snapshot_writer import write_packages
 
-        trainer, _ = checkpoint.load(run.checkpoint)
+        trainer, notes = checkpoint.load(run.checkpoint)
     with console.progress("writing the package", 1.0) as bar:
         shots = synthetic_views(trainer.avatar.rig)
         try:
             (exported,) = write_packages(
-                trainer, out, shots, curve_point=None, fine_tune=fine_tune, progress=bar.set_share
+                trainer,
+                out,
+                shots,
+                curve_point=None,
+                made_with=notes.get("made_with", ()),
+                fine_tune=fine_tune,
+                progress=bar.set_share,
             )
         except ExportRefused as error:
             raise CommandExit(str(error), NO_AVATAR) from error

@@ -47,6 +47,7 @@ from preprocess.masks.mask_sources import (
 )
 from preprocess.plugins import (
     DEFAULT_SEGMENTER,
+    DEFAULT_TRACKER,
     PersonTracker,
     make_segmenter,
     segmenter_name,
@@ -338,6 +339,7 @@ def open_tracked_stream(
         fixed_body=avatar_body is not None,
         stated_focal=find_stream_cameras(inputs.video, inputs.cameras) is not None,
     )
+    motion = replace(motion, program=inputs.tracker or DEFAULT_TRACKER)
     masks: MaskSource = TrackedMasks(tracking, make_refinement(source.size_px))
     made = Provenance("masks", masks.origin, uncertainty=1.0)
     if segmenter is None or inputs.masks is not None:

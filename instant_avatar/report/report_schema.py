@@ -236,6 +236,7 @@ class Report:
     earlier_videos: EarlierVideoStats | None = None
     cameras: dict[str, Any] | None = None
     tracking: dict[str, Any] | None = None
+    licence: dict[str, Any] | None = None
 
     @property
     def verdict(self) -> SharpnessVerdict | None:

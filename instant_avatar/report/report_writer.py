@@ -333,6 +333,7 @@ def _build_report(
         earlier_videos=result.earlier_videos,
         cameras=capture.figures("cameras"),
         tracking=capture.figures("tracking"),
+        licence=result.licence,
     )
 
 

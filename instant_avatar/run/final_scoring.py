@@ -108,6 +108,7 @@ class TrainingResult:
         exported: Describes the package; None without one, and `refusal` may say why.
         ready_at: When the package could be played, on `time.perf_counter`'s clock.
         scores: Final scores of the held-out frames; empty before they are scored.
+        licence: What it was made with, and what that allows (`preprocess.licence_chain`).
     """
 
     trainer: Trainer
@@ -122,6 +123,7 @@ class TrainingResult:
     ready_at: float | None = None
     scores: FinalScores = field(default_factory=FinalScores)
     earlier_videos: EarlierVideoStats | None = None
+    licence: dict[str, Any] = field(default_factory=dict)
 
     @property
     def is_trained(self) -> bool:

@@ -276,7 +276,12 @@ def fit_tracked_video(
     """
     camera = assume_camera(inputs.video, inputs.cameras, source)
     lifted = lift_keypoints(tracked.keypoints, load_body_model(inputs.body).with_shape(), camera)
-    imported = _import_poses(source, replace(lifted, space="camera"), inputs, masks_beside)
+    imported = _import_poses(
+        source,
+        replace(lifted, space="camera", program=inputs.tracker or DEFAULT_TRACKER),
+        inputs,
+        masks_beside,
+    )
     capture = align_capture(imported, skip_checks=True)
     fit = fit_capture(capture)
     if fit is None:

@@ -29,6 +29,7 @@ from instant_avatar.run.run_tracking import remove_tracking
 from instant_avatar.run.session_events import EventReader, SessionEvent
 from instant_avatar.run.training_session import TrainingSession
 from preprocess.capture_session import Capture
+from preprocess.licence_chain import made_with
 from preprocess.observation_source import ObservationSource
 
 
@@ -182,7 +183,11 @@ def _new_run(arguments: IngestArguments, capture: Capture) -> PreparedTrainer:
         refine_poses=arguments.refine_poses,
         hold_every=arguments.hold_out,
     )
-    notes = {"video": capture.identity, "name": capture.paths.video.name}
+    notes = {
+        "video": capture.identity,
+        "name": capture.paths.video.name,
+        "made_with": made_with(capture),
+    }
     return PreparedTrainer(trainer=trainer, restore_count=0, notes=notes)
 
 
@@ -233,6 +238,9 @@ def _add_video(
     console.info(f"Adding another video to an avatar with {spent:.0f} {unit} of training.")
     earlier.start_new_video(trainer, console)
     notes["name"], notes["video"] = capture.paths.video.name, capture.identity
+    known = notes.get("made_with", [])
+    if known:  # else it is of a run before these were recorded, and remains unknown
+        known += [part for part in made_with(capture) if part not in known]
     _extend_budget(trainer, arguments, capture, spent)
     return PreparedTrainer(trainer=trainer, restore_count=0, notes=notes)
 

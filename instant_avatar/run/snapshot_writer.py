@@ -1,7 +1,7 @@
 """Write the avatar in its current state: checkpoints while it is trained, and packages."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
@@ -19,6 +19,7 @@ from instant_avatar.report.report_schema import CurvePoint
 from instant_avatar.run.run_folder import RunFolder
 from preprocess.body.parametric_body import write_shaped_body
 from preprocess.capture_session import Capture
+from preprocess.licence_chain import licence_chain
 from preprocess.observation import shrink_to_longer_side
 
 CHECKPOINT_INTERVAL_S = 5.0
@@ -120,15 +121,22 @@ def write_packages(
     views: Sequence[PosedView],
     *,
     curve_point: CurvePoint | None,
+    made_with: Sequence[Mapping[str, str]] = (),
     baked_first: bool = False,
     fine_tune: bool = True,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Iterator[ExportReport]:
-    """Write the package of a trainer that is between two steps; see `export_avatar`."""
+    """Write the package of a trainer that is between two steps; see `export_avatar`.
+
+    `made_with` are the parts of the avatar's captures (`preprocess.licence_chain`).
+    """
     scores = None if curve_point is None else asdict(curve_point)
     return export_avatar(
         trainer.avatar, path, views=views,
-        metrics={"held_out": scores, "recipe": asdict(trainer.config)},
+        metrics={
+            "held_out": scores, "recipe": asdict(trainer.config),
+            "made_with": licence_chain(made_with),
+        },
         baked_first=baked_first, fine_tune_bricks=fine_tune, progress=progress,
     )  # fmt: skip
 

@@ -50,6 +50,7 @@ from instant_avatar.run.snapshot_writer import (
 )
 from instant_avatar.run.stream_meter import StreamMeter
 from preprocess.body.body_pose import BodyPose
+from preprocess.licence_chain import licence_chain
 from preprocess.observation import Observation
 from preprocess.observation_source import ObservationSource
 
@@ -129,7 +130,8 @@ class TrainingSession:
         """Write the avatar in its current state, between two steps; raise like `export_avatar`."""
         (exported,) = write_packages(
             self.trainer, self._run.package, validation_views(self.held_out, self._capture),
-            curve_point=self.curve[-1] if self.curve else None, fine_tune=False,
+            curve_point=self.curve[-1] if self.curve else None,
+            made_with=self._notes.get("made_with", ()), fine_tune=False,
         )  # fmt: skip
         return exported
 
@@ -176,6 +178,7 @@ class TrainingSession:
             coverage=self.coverage,
             frames_added=added + self.trainer.frames_seen,
             interrupted=self.is_interrupted,
+            licence=licence_chain(self._notes.get("made_with", ())),
         )
 
     def _write_packages(self) -> Iterator[SessionEvent]:
@@ -191,7 +194,8 @@ class TrainingSession:
         try:
             for exported in write_packages(
                 self.trainer, self._run.package, validation_views(self.held_out, self._capture),
-                curve_point=self.curve[-1] if self.curve else None, baked_first=True,
+                curve_point=self.curve[-1] if self.curve else None,
+                made_with=self._notes.get("made_with", ()), baked_first=True,
                 progress=check_stop,
             ):  # fmt: skip
                 self._checkpoints.settle()

@@ -87,6 +87,7 @@ class Motion:
         proportions: Coefficients of `ProportionSpace` around the mean of the embedded body, if the
             poses were fitted together with them; then they are the person's shape, not the betas.
         keypoints: Key points in the video's frames that the poses were made of, if there are any.
+        program: Name of the program that made the poses, if it is known.
         note: Message for the user about how the file was read.
     """
 
@@ -105,6 +106,7 @@ class Motion:
     camera_from_world: Float[np.ndarray, "poses 4 4"] | None = None
     proportions: Float[np.ndarray, "coefficients"] | None = None
     keypoints: KeypointTrack | None = None
+    program: str | None = None
     note: str | None = None
 
     def __len__(self) -> int:

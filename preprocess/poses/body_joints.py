@@ -129,6 +129,7 @@ class JointTrack:
         fps: Rows a second, if the file says so.
         turns: World rotations of our joints since SMPL's T-pose, if the file says so.
         lens: As in `build_motion`.
+        program: Name of the program that made them, if it is known.
     """
 
     body: str
@@ -138,6 +139,7 @@ class JointTrack:
     space: PoseSpace = "world"
     turns: Float[np.ndarray, "rows 24 3 3"] | None = None
     lens: Any = None
+    program: str | None = None
 
     def fitted(self) -> Motion:
         """Our body's motion, and a note that says how near its joints are.
@@ -171,7 +173,8 @@ class JointTrack:
             body_model="body24", space=self.space, lens=self.lens,
         )  # fmt: skip
         note = f"The body was fitted to the joints of {self.body}: its joints are {said}."
-        return replace(motion, proportions=found.coefficients, note=note)
+        program = self.program or f"joints of {self.body}"
+        return replace(motion, proportions=found.coefficients, program=program, note=note)
 
 
 def parse_joints(content: Any, prefer_world: bool = False) -> MotionByPerson | None:
@@ -342,6 +345,7 @@ def _join(rows: list[_Item], fps: Any) -> JointTrack:
         fps=None if fps is None else float(fps),
         space="camera" if in_camera else "world",
         lens=(np.median(known, axis=0) if known else SAM_FOCAL) if in_camera else None,
+        program="SAM 3D Body" if rows[0].body.startswith("MHR") else None,
     )
 
 
@@ -376,7 +380,7 @@ def _read_soma(content: Any, prefer_world: bool) -> JointTrack | None:
         turns[:, joint] = turned[name]
     return JointTrack(
         body="SOMA", places=places, turns=turns, space="camera" if in_camera else "world",
-        lens=content.get("K_fullimg") if in_camera else None,
+        lens=content.get("K_fullimg") if in_camera else None, program="GEM-X",
     )  # fmt: skip
 
 

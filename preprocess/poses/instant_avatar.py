@@ -50,7 +50,7 @@ SIBLING_KEYS = ("frame", "time", "valid", "K", "camera")
 """Keys that may lie beside `smpl`."""
 RECOGNIZED_KEYS = (
     *{key: None for keys in POSE_KEY_LAYOUTS for key in keys}, *CAMERA_KEYS, "betas", "frame",
-    "time", "valid", "K", "model", "space", "scale", "proportions", *KEYPOINT_SHAPES,
+    "time", "valid", "K", "model", "space", "scale", "proportions", "program", *KEYPOINT_SHAPES,
 )  # fmt: skip
 """Keys that are read of a file; all others are left there."""
 CLIFF_FOCAL = RelativeFocalLength(ratio=1.0, reference="diagonal")

@@ -36,7 +36,8 @@ def motion_from_arrays(arrays: Arrays, path: Path) -> Motion:
     Keys: global_orient (N, 3) and body_pose (N, 69), or thetas or poses (N, 72); transl or trans
     (N, 3); optional betas (B,), (1, B) or (N, B), frame (N), time (N), valid (N), K (3, 3) or
     (N, 3, 3), camera (4, 4) or (N, 4, 4) camera-from-world, model (else SMPL's), space
-    ("world", or "camera": each row is in the camera of its frame), proportions (see `Motion`), and
+    ("world", or "camera": each row is in the camera of its frame), proportions and program (see
+    `Motion`), and
     the arrays of `KeypointTrack`. Rows with NaN are marked as not valid. Rotations may be 3x3
     matrices; a body_pose of 63 numbers has no hands.
 
@@ -79,6 +80,7 @@ def _motion(arrays: Arrays) -> Motion:
         space=_space(arrays),
         proportions=_proportions(arrays),
         keypoints=KeypointTrack.from_arrays(arrays),
+        program=str(arrays["program"]) if "program" in arrays else None,
     )
 
 
@@ -107,6 +109,7 @@ def _motion_arrays(motion: Motion) -> Arrays:
         "camera": motion.camera_from_world,
         "space": None if motion.space == "world" else np.array(motion.space),
         "proportions": motion.proportions,
+        "program": None if motion.program is None else np.array(motion.program),
         **({} if motion.keypoints is None else motion.keypoints.as_arrays()),
     }
     return {key: array for key, array in arrays.items() if array is not None}

@@ -59,6 +59,7 @@ def read_poses(
     if tool is None:
         return motion
     whole, note = fill_gaps(motion), motion.note
+    program = motion.program or (tool if tool in TRACKERS else None)
     filled = int(whole.valid.sum() - motion.valid.sum())
     if filled:
         said = (
@@ -66,7 +67,7 @@ def read_poses(
             f"up to {MAX_GAP_FRAMES} frames)."
         )
         note = said if note is None else f"{note} {said}"
-    return replace(whole, note=note)
+    return replace(whole, program=program, note=note)
 
 
 def _recognize(content: Any, path: Path, driving: bool) -> tuple[str | None, MotionByPerson]:
