@@ -287,6 +287,17 @@ VRM_NEEDS = {
 """Bones that VRM 1.0 requires."""
 
 
+@pytest.mark.parametrize(
+    ("use", "stated"), [("yes", "personalProfit"), ("no", "personalNonProfit"), (None,) * 2]
+)
+def test_a_vrms_licence_follows_what_the_avatar_was_made_with(mesh, package, use, stated):
+    metrics = {} if use is None else {"made_with": {"commercial_use": use}}
+    manifest = replace(package.manifest, metrics=metrics)
+    vrm = Read(encode_vrm(mesh, manifest, name="x", author="Anna"))
+    meta = vrm.json["extensions"]["VRMC_vrm"]["meta"]
+    assert meta["commercialUsage"] == (stated or "personalNonProfit")
+
+
 def test_a_vrm_names_its_bones_and_rests_in_a_t_on_the_floor(mesh, package):
     manifest = package.manifest
     vrm = Read(encode_vrm(mesh, manifest, name="x", author="Anna"))

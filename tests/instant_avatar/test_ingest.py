@@ -142,6 +142,16 @@ def test_the_package_is_the_one_that_was_reported(run, report):
     assert kept["recipe"]["rays"] == report["recipe"]["rays"]
 
 
+def test_package_and_page_say_what_the_avatar_was_made_with(run, report):
+    licence = report["licence"]
+    assert licence["commercial_use"] == "unknown"  # the poses' file says nothing of its origin
+    assert {part["part"] for part in licence["parts"]} == {"poses", "body", "masks"}
+    manifest = Player.load(run / "avatar.iavatar").manifest
+    assert manifest.metrics["made_with"] == licence
+    assert manifest.licence.endswith(licence["summary"])
+    assert "Commercial use: unknown" in (run / "report.html").read_text()
+
+
 def test_an_actor_who_turns_twice_is_seen_from_all_sides(report):
     coverage = report["coverage"]
     assert coverage["seen"] > 0.95
