@@ -85,7 +85,7 @@ def licence_chain(parts: Sequence[Mapping[str, str]]) -> dict[str, Any]:
             + ("" if worst == "unknown" else f" ({part['licence']})")
             for part in _with(parts, worst)
         )
-    made = "; ".join(f"{part['part']} by {part['name']} ({part['licence']})" for part in parts)
+    made = "; ".join(f"{part['part']}: {part['name']} ({part['licence']})" for part in parts)
     allowed = f"Commercial use: {worst}, because {because}."
     return {
         "commercial_use": worst,

@@ -339,7 +339,6 @@ def open_tracked_stream(
         fixed_body=avatar_body is not None,
         stated_focal=find_stream_cameras(inputs.video, inputs.cameras) is not None,
     )
-    motion = replace(motion, program=inputs.tracker or DEFAULT_TRACKER)
     masks: MaskSource = TrackedMasks(tracking, make_refinement(source.size_px))
     made = Provenance("masks", masks.origin, uncertainty=1.0)
     if segmenter is None or inputs.masks is not None:
@@ -347,8 +346,8 @@ def open_tracked_stream(
         made = _mask_provenance(masks, segmenter)
     capture = Capture(
         paths=CapturePaths(video=inputs.video, poses=poses, masks=own, cameras=None),
-        source=tracking.stream, motion=motion, masks=masks, cameras=cameras,
-        shaped=person, size_px=longer_side_px(source),
+        source=tracking.stream, motion=replace(motion, program=inputs.tracker or DEFAULT_TRACKER),
+        masks=masks, cameras=cameras, shaped=person, size_px=longer_side_px(source),
         provenance=(
             Provenance("poses", "tracked", tuple(_unread_live_parts(inputs)), uncertainty=1.0),
             Provenance("cameras", cameras.source, uncertainty=1.0),

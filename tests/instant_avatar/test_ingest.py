@@ -25,7 +25,8 @@ from instant_avatar.run.snapshot_writer import CheckpointWriter
 
 KEYS = {
     "": "format verdict command recipe machine frames training held_out held_out_refined all_round "
-    "curve stream package coverage earlier_videos cameras tracking",
+    "curve stream package coverage earlier_videos cameras tracking licence",
+    "licence": "commercial_use because parts summary",
     "machine": "threads device backend",
     "frames": "read used held_out dropped near_duplicates not_replayed",
     "training": "wall_seconds cpu_seconds step_cpu_seconds startup_seconds "
