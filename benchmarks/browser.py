@@ -28,7 +28,7 @@ from export.package.player_tables import QUALITY_TIERS
 from export.player import Player
 from export.player_page import build_page
 from instant_avatar.animation.driving_motion import FollowingCamera, demo_motion
-from instant_avatar.animation.web_server import make_server, web_clip
+from instant_avatar.animation.web_server import make_server
 from instant_avatar.cli.command_line import run_command
 from preprocess.body.body_pose import Motion
 from tests.instant_avatar.browser import Browser, until
@@ -51,8 +51,8 @@ def compare(package: Path, rounds: int) -> int:
     limit_threads(1)
     players = {tier: Player.load(package, tier=tier) for tier in QUALITY_TIERS}
     motion = demo_motion(FRAMES)
-    clip = web_clip(players["hq"], motion, tuple(range(FRAMES)), 16.0)
-    server = make_server(build_page(package, clip, name="benchmark", compression_level=1), 8090)
+    page = build_page(package, motion, 16.0, name="benchmark", compression_level=1)
+    server = make_server(page, 8090)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     found: dict[str, list[tuple[float, float, float]]] = {tier: [] for tier in QUALITY_TIERS}
     with tempfile.TemporaryDirectory() as folder, Browser(Path(folder)) as browser:

@@ -168,7 +168,7 @@ def filmed_views(job: ExportJob, avatar: Avatar) -> list[ComparedView]:
         kinds = views_of_person(job.capture, avatar, job.dance, size=job.size)
     else:
         count = open_sample(job.capture).source.frame_count
-        kinds = views_of_sample(job.capture, avatar, frames=count, stride=job.stride)
+        kinds = views_of_sample(job.capture, avatar, frames=count or 0, stride=job.stride)
     return kinds["held out"]
 
 

@@ -1,31 +1,26 @@
-"""The files of a page that plays an avatar in a browser: graph, expanded tables, runtime, no CDN.
+"""The files of a page that plays an avatar in a browser: package, motion, runtime, no CDN.
 
 onnxruntime-web runs the graph: one pinned release, stored with the page.
 """
 
 import base64
 import hashlib
+import html
 import io
-import json
 import os
 import sys
 import tarfile
 import zlib
-from dataclasses import asdict, dataclass
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any, final
 
 import numpy as np
-from jaxtyping import Float, Float32, Shaped
 
 from capture.atomic_files import atomic_file
 from capture.input_error import InputError, quote_command
-from export.package.manifest import GoldenFrame
-from export.package.package_file import AvatarPackage, read_package
-from export.player_inputs import graph_initializers
-from preprocess.body.body_pose import BodyPose
+from export.package.package_file import read_package
+from preprocess.body.body_pose import Motion
 
 ORT_WEB_VERSION = "1.30.0"
 """Release of the npm package `onnxruntime-web` (MIT)."""
@@ -104,159 +99,55 @@ PAGE_SUFFIXES = (".html", ".css", ".js", ".svg")
 PAGE_SCRIPT = "ort.js"
 """Name of onnxruntime's script on the page: hosts such as nginx serve .mjs as
 application/octet-stream, which browsers do not run."""
-PAGE_DTYPES = {"float32", "int32", "uint32", "uint16", "uint8", "int8"}
-"""Element types that the page reads (arrays.js)."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class StartView:
-    """The page's first camera; it follows the pelvis.
-
-    Attributes:
-        axes: The picture's right, down and forward in the world, as rows.
-        height_m: Height of the standing person, metres.
-        middle_m: Height of the person's middle above the pelvis, metres.
-    """
-
-    axes: Float[np.ndarray, "3 3"]
-    height_m: float
-    middle_m: float
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class PageMotion:
-    """The motion that the page plays.
-
-    Attributes:
-        poses: Root rotation, root translation and 23 joint rotations, one row a pose.
-        start_view: View of the first pose from the front.
-    """
-
-    poses: Float32[np.ndarray, "poses 75"]
-    fps: float
-    start_view: StartView
-
-
-def flatten_pose(pose: BodyPose) -> Float32[np.ndarray, "75"]:
-    """Return a pose in the page's order: root rotation, root translation, joint rotations."""
-    parts = (pose.root_rotation, pose.root_translation, pose.joint_rotations.ravel())
-    return np.concatenate(parts).astype(np.float32)
+PACKAGE_FILE, MOTION_FILE = "avatar.iavatar", "motion.npz"
+"""The package and its motion, as index.html names them."""
+PACKED_WASM_FILE = f"{WASM_FILE}.zlib"
+"""The WebAssembly module as graph_worker.js reads it: not all hosts compress what they send."""
 
 
 @cache
-def pack_runtime(compression_level: int) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """Pack the WebAssembly module: the entry by which pages read it, and its file by its path."""
-    draft = _ArrayFiles(compression_level)
-    return draft.array(_byte_array(runtime_files()[WASM_FILE])), draft.files
+def pack_runtime(compression_level: int) -> bytes:
+    """Pack the WebAssembly module, once a process."""
+    return zlib.compress(runtime_files()[WASM_FILE], compression_level)
 
 
 def build_page(
-    path: Path,
-    clip: PageMotion,
-    *,
-    name: str,
-    compression_level: int = 6,
-    module: dict[str, Any] | None = None,
+    path: Path, motion: Motion, fps: float, *, name: str, compression_level: int = 6
 ) -> dict[str, bytes]:
     """Build all files of the page by relative path; index.html is the one to open.
 
-    The page has all tiers of the package.
-
-    Args:
-        compression_level: zlib's: 1 for a local browser, 6 for a host.
-        module: Entry of a WebAssembly module that is stored elsewhere (`pack_runtime`); None packs
-            it into the page.
+    The page has all tiers of the package. zlib's level: 1 for a local browser, 6 for a host.
     """
     runtime = runtime_files()
-    draft = _ArrayFiles(compression_level)
-    package, wasm = read_package(path, tier=None), runtime.pop(WASM_FILE)
-    manifest = package.manifest
-    content = {
-        "name": name,
-        "licence": manifest.licence,
-        "rest_joints": manifest.rest_joints.tolist(),
-        "parents": manifest.parents.tolist(),
-        "canonical_rotations": manifest.canonical_rotations.tolist(),
-        "look": {
-            "axes": clip.start_view.axes.tolist(),
-            "pelvis": manifest.rest_joints[0].tolist(),
-            "height_m": clip.start_view.height_m,
-            "middle_m": clip.start_view.middle_m,
-        },
-        "motion": {"fps": clip.fps, "poses": draft.array(clip.poses)},
-        "runtime": module or draft.array(_byte_array(wasm)),
-        "tiers": {tier: _tier_content(draft, package, tier) for tier in manifest.tiers},
-        "golden": [
-            _golden_content(draft, frame, picture)
-            for frame, picture in zip(manifest.golden, package.golden, strict=True)
-        ],
-    }
-    draft.files["avatar.json"] = json.dumps(content, allow_nan=False).encode()
+    runtime[PACKED_WASM_FILE] = pack_runtime(compression_level)
+    del runtime[WASM_FILE]
     runtime[PAGE_SCRIPT] = runtime.pop(SCRIPT_FILE)
-    draft.files.update({f"runtime/{file}": held for file, held in runtime.items()})
-    return {**static_page_files(), **draft.files}
+    read_package(path)  # every checksum
+    pages = static_page_files()
+    title = f"<title>{html.escape(name)}</title>".encode()
+    pages["index.html"] = pages["index.html"].replace(b"<title>Avatar</title>", title)
+    return {
+        **pages,
+        PACKAGE_FILE: path.read_bytes(),
+        MOTION_FILE: encode_motion(motion, fps),
+        **{f"runtime/{file}": held for file, held in runtime.items()},
+    }
+
+
+def encode_motion(motion: Motion, fps: float) -> bytes:
+    """Encode the valid poses as an .npz file with InstantAvatar's keys, and their rate."""
+    content = io.BytesIO()
+    arrays = {
+        "global_orient": motion.root_rotations,
+        "body_pose": motion.joint_rotations.reshape(-1, 69),
+        "transl": motion.root_translations,
+    }
+    rows = {name: array[motion.valid].astype(np.float32) for name, array in arrays.items()}
+    np.savez_compressed(content, fps=np.float32(fps), **rows)
+    return content.getvalue()
 
 
 def static_page_files() -> dict[str, bytes]:
     """Read the page's own files, the same for every avatar."""
     files = sorted(file for file in (WEB / "page").iterdir() if file.suffix in PAGE_SUFFIXES)
     return {file.name: file.read_bytes() for file in files}
-
-
-@final
-class _ArrayFiles:
-    """Files named by a hash of their content, so that what tiers share is stored once."""
-
-    def __init__(self, level: int) -> None:
-        self.files: dict[str, bytes] = {}
-        self._level = level
-
-    def array(self, array: Shaped[np.ndarray, "..."]) -> dict[str, Any]:
-        """Store an array; return the entry by which the page reads it."""
-        assert array.dtype.name in PAGE_DTYPES
-        plain = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<"))
-        planes = plain.reshape(-1).view(np.uint8).reshape(-1, array.dtype.itemsize).T
-        content = np.ascontiguousarray(planes).tobytes()
-        file = f"data/{hashlib.sha256(content).hexdigest()[:16]}.bin"
-        if file not in self.files:
-            self.files[file] = zlib.compress(content, self._level)
-        shape = list(array.shape)
-        return {
-            "file": file,
-            "dtype": array.dtype.name,
-            "shape": shape,
-            "bytes": len(self.files[file]),
-        }
-
-
-def _byte_array(content: bytes) -> Shaped[np.ndarray, "bytes"]:
-    return np.frombuffer(content, dtype=np.uint8)
-
-
-def _tier_content(draft: _ArrayFiles, package: AvatarPackage, tier: str) -> dict[str, Any]:
-    note = package.manifest.tiers[tier]
-    tables = graph_initializers(package.tables[tier], note.settings)
-    return {
-        "settings": asdict(note.settings),
-        "layout": asdict(note.layout),
-        "graph": draft.array(_byte_array(package.graphs[tier])),
-        "tables": [{"name": name, **draft.array(array)} for name, array in tables.items()],
-    }
-
-
-def _golden_content(
-    draft: _ArrayFiles, frame: GoldenFrame, picture: Shaped[np.ndarray, "height width 4"]
-) -> dict[str, Any]:
-    camera = frame.camera
-    width, height = camera.size_px
-    return {
-        "pose": [float(number) for number in flatten_pose(frame.pose)],
-        "camera": {
-            "focal": list(camera.focal_px),
-            "center": list(camera.center_px),
-            "width": width,
-            "height": height,
-            "cameraFromWorld": camera.camera_from_world[:3].ravel().tolist(),
-        },
-        "picture": draft.array(picture),
-    }

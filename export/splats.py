@@ -67,7 +67,8 @@ def build_splats(
 ) -> GaussianSplats:
     """Lay Gaussians under the surface of baked bricks, moved by world-from-canonical matrices."""
     mesh = extract_mesh(tables, spacing_m=SPACING_M, density=DENSITY)
-    distances, neighbors = KDTree(mesh.positions).query(mesh.positions, 1 + NEIGHBORS)
+    found = KDTree(mesh.positions).query(mesh.positions, 1 + NEIGHBORS)
+    distances, neighbors = np.asarray(found[0]), np.asarray(found[1])
     sizes = SPREAD * distances[:, 1 : 1 + NEAREST].mean(axis=1)
     shares = np.exp(-0.5 * (distances / np.hypot(sizes, VIEWER_BLUR_M)[neighbors]) ** 2)
     facing = np.einsum("vnx,vx->vn", mesh.normals[neighbors], mesh.normals)

@@ -150,7 +150,7 @@ def _run_web(arguments: PlayArguments, port: int, console: Console) -> int:
     from export.player import Player
     from export.player_page import build_page, runtime_files
     from instant_avatar.animation.driving_motion import demo_motion, load_driving_motion, pose_rate
-    from instant_avatar.animation.web_server import serve_site, web_clip, write_site
+    from instant_avatar.animation.web_server import serve_site, write_site
     from instant_avatar.cli.shared_options import check_output_folder
 
     if not 0 < port < 1 << 16:
@@ -163,17 +163,15 @@ def _run_web(arguments: PlayArguments, port: int, console: Console) -> int:
     joints, motion = player.manifest.rest_joints, demo_motion()
     if arguments.poses is not None:
         motion = load_driving_motion(arguments.poses, joints, console, person=arguments.person)
-    rows = tuple(int(row) for row in np.flatnonzero(motion.valid))
-    clip = web_clip(player, motion, rows, arguments.fps or arguments.speed * pose_rate(motion))
+    fps = arguments.fps or arguments.speed * pose_rate(motion)
     name = (
         arguments.avatar.resolve().parent.name
         if arguments.avatar.stem == "avatar"
         else arguments.avatar.stem
     )
-    with console.status("unpacking the avatar for the page"):
-        files = build_page(
-            arguments.avatar, clip, name=name, compression_level=1 if arguments.out is None else 6
-        )
+    with console.status("packing the page"):
+        level = 1 if arguments.out is None else 6
+        files = build_page(arguments.avatar, motion, fps, name=name, compression_level=level)
     if arguments.out is None:
         serve_site(files, port, console)
         return DONE

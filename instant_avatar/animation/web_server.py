@@ -15,17 +15,11 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
-import numpy as np
-
 from capture.atomic_files import atomic_folder
 from capture.input_error import InputError
 from export import player_page
-from export.player import Player
-from export.player_page import PageMotion, StartView, flatten_pose
-from instant_avatar.animation.driving_motion import FollowingCamera
 from instant_avatar.cli.command_line import DONE, parse_arguments, run_command, stop_on_interrupt
 from instant_avatar.cli.console import Console
-from preprocess.body.body_pose import Motion
 
 HOST = "127.0.0.1"
 """Loopback address: only browsers of this machine reach the page."""
@@ -40,18 +34,6 @@ MIME_TYPES = {
     ".txt": "text/plain; charset=utf-8",
 }
 """MIME type by suffix."""
-
-
-def web_clip(player: Player, motion: Motion, rows: tuple[int, ...], fps: float) -> PageMotion:
-    """Return poses of a motion and a start view in front of the first valid one."""
-    camera = FollowingCamera.of(player, motion, 540)
-    return PageMotion(
-        poses=np.stack([flatten_pose(motion[row]) for row in rows]),
-        fps=fps,
-        start_view=StartView(
-            axes=camera.level_axes, height_m=camera.height_m, middle_m=camera.center_above_pelvis_m
-        ),
-    )
 
 
 def write_site(files: Mapping[str, bytes], path: Path) -> None:

@@ -10,19 +10,17 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, final
 
-import numpy as np
 from aiohttp import web
 
 from capture.input_error import InputError
 from export.package.package_file import read_package
-from export.player_page import PageMotion, StartView, build_page, flatten_pose, pack_runtime
+from export.player_page import ORT_WEB_VERSION, PACKED_WASM_FILE, build_page, pack_runtime
 from instant_avatar.animation.driving_motion import demo_motion, pose_rate
 from instant_avatar.animation.web_server import MIME_TYPES
 from instant_avatar.cli.console import Console
 from instant_avatar.export import ExportArguments, export
 from instant_avatar.phone.access_control import AccessControl
 from instant_avatar.phone.film_queue import Film, FilmQueue, FilmRefused
-from preprocess.body.kinematics import rotation_matrices
 
 PAGE = Path(__file__).with_name("page")
 """Folder of the page's own files."""
@@ -47,8 +45,10 @@ HEADERS = {
     "X-Frame-Options": "SAMEORIGIN",
 }  # fmt: skip
 """Headers of all answers; the first two isolate the page, so that its player may use threads."""
+MODULE_FILE = f"ort-{ORT_WEB_VERSION}.wasm.zlib"
+"""The player's WebAssembly module, named by its release."""
 KEPT = {"Cache-Control": "max-age=31536000, immutable"}
-"""Header of files that are named by a hash of their content."""
+"""Header of that file."""
 REFUSED = (
     "This page is opened by the address that ia-capture prints. Each address opens it once, in one "
     "browser: scan the newest code, or look at the terminal for it.\n"
@@ -66,7 +66,7 @@ class PhoneServer:
         self.on_entered: Callable[[], object] = lambda: None
         self._loop = asyncio.new_event_loop()
         self._pages: dict[str, tuple[float, dict[str, bytes]]] = {}
-        self._module: tuple[dict[str, Any], dict[str, bytes]] = ({}, {})
+        self._module = b""
         self._requests: dict[str, deque[float]] = {}
         self._listeners: dict[str, set[asyncio.Event]] = {}
         self._app = web.Application(client_max_size=MAX_PIECE_BYTES, middlewares=[self._guard])
@@ -165,8 +165,7 @@ class PhoneServer:
         policy = "default-src 'self'; img-src 'self' data: blob:; media-src 'self' blob:"
         headers = {"Content-Security-Policy": f"{policy}; base-uri 'none'; form-action 'none'"}
         live = "here" if request.secure else "elsewhere" if self._live_port else "no"
-        module = "".join(f"runtime/{file}" for file in self._module[1])
-        text = text.replace("{{live}}", live).replace("{{module}}", module)
+        text = text.replace("{{live}}", live).replace("{{module}}", f"runtime/{MODULE_FILE}")
         return web.Response(text=text, content_type="text/html", headers=headers)
 
     async def _go_live(self, request: web.Request) -> web.Response:
@@ -184,10 +183,9 @@ class PhoneServer:
 
     async def _runtime(self, request: web.Request) -> web.Response:
         """The player's WebAssembly module, which the page fetches while somebody films."""
-        content = self._module[1].get(request.match_info["file"])
-        if content is None:
+        if request.match_info["file"] != MODULE_FILE:
             raise InputError("There is no such file.")
-        return web.Response(body=content, headers=HEADERS | KEPT)
+        return web.Response(body=self._module, headers=HEADERS | KEPT)
 
     def _film(self, request: web.Request) -> Film:
         return self._queue.find(request.match_info["number"], request.cookies[COOKIE])
@@ -285,33 +283,22 @@ class PhoneServer:
         if file == "poster.png":
             content = await asyncio.to_thread(lambda: read_package(package).preview)
             return web.Response(body=content, content_type="image/png")
+        if file == f"runtime/{PACKED_WASM_FILE}":  # one module for all avatars
+            return web.Response(status=302, headers={"Location": f"../../../runtime/{MODULE_FILE}"})
         written = package.stat().st_mtime
         if self._pages.get(name, (0.0,))[0] != written:
-            page = await asyncio.to_thread(_player_page, package, name, self._module[0])
-            self._pages = {name: (written, page)}
+            self._pages = {name: (written, await asyncio.to_thread(_player_page, package, name))}
         files = self._pages[name][1]
         if file not in files:
             raise InputError("There is no such file.")
         kind = MIME_TYPES.get(Path(file).suffix, "application/octet-stream")
-        kept = KEPT if file.startswith("data/") else {}
-        return web.Response(body=files[file], headers={"Content-Type": kind} | kept)
+        return web.Response(body=files[file], headers={"Content-Type": kind})
 
 
-def _player_page(package: Path, name: str, module: dict[str, Any]) -> dict[str, bytes]:
-    """The files of the player page with the built-in motion; `module` is served elsewhere."""
-    motion, held = demo_motion(), read_package(package)
-    rows = np.flatnonzero(motion.valid)
-    height_m = held.tables["hq"].surfels.positions[:, 1]  # drawn by no player, which takes time
-    low, high = float(height_m.min()), float(height_m.max())
-    front = np.diag([1.0, -1.0, -1.0]) @ rotation_matrices(motion.root_rotations[rows[0]]).T
-    pelvis = float(held.tables["hq"].pelvis[1])
-    clip = PageMotion(
-        poses=np.stack([flatten_pose(motion[int(row)]) for row in rows]),
-        fps=pose_rate(motion),
-        start_view=StartView(axes=front, height_m=high - low, middle_m=0.5 * (low + high) - pelvis),
-    )
-    there = {**module, "file": f"../../runtime/{module['file']}"} if module else None
-    return build_page(package, clip, name=name, compression_level=1, module=there)
+def _player_page(package: Path, name: str) -> dict[str, bytes]:
+    """The files of the player page with the built-in motion."""
+    motion = demo_motion()
+    return build_page(package, motion, pose_rate(motion), name=name, compression_level=1)
 
 
 def _mesh(package: Path, file: str, author: str) -> bytes:

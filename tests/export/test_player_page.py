@@ -1,6 +1,5 @@
 """The page's files: what they hold, what they refuse, and that they come from nowhere else."""
 
-import json
 import re
 import zlib
 
@@ -9,9 +8,8 @@ import pytest
 
 from capture.input_error import InputError
 from export import player_page
-from export.package.package_file import read_package
-from export.player_inputs import graph_initializers
-from export.player_page import PageMotion, StartView, flatten_pose
+from preprocess.body.body_pose import Motion
+from preprocess.poses.pose_format_registry import read_poses
 
 
 @pytest.fixture(scope="module")
@@ -24,49 +22,43 @@ def kept(tmp_path_factory):
 
 
 @pytest.fixture
-def clip(bent):
-    return PageMotion(
-        poses=np.stack([flatten_pose(bent)] * 3),
-        fps=25.0,
-        start_view=StartView(axes=np.diag([1.0, -1.0, -1.0]), height_m=1.7, middle_m=-0.1),
+def motion(bent):
+    """Three poses, of which the tracker lost the second."""
+    share = np.array([0.5, 1.0, 0.8])[:, None]
+    return Motion(
+        root_rotations=share * bent.root_rotation,
+        root_translations=share * bent.root_translation,
+        joint_rotations=share[:, None] * bent.joint_rotations,
+        valid=np.array([True, False, True]),
+        betas=np.zeros(10),
+        body_model="body24",
     )
 
 
 @pytest.fixture
-def files(exported, clip, kept, monkeypatch):
+def files(exported, motion, kept, monkeypatch):
     monkeypatch.setattr(player_page, "RUNTIME_FOLDER", kept)
-    return player_page.build_page(exported.path, clip, name="an avatar")
+    return player_page.build_page(exported.path, motion, 25.0, name="<an avatar>")
 
 
-def unpacked(files, entry):
-    """An array as the page reads it."""
-    dtype = np.dtype(entry["dtype"]).newbyteorder("<")
-    planes = np.frombuffer(zlib.decompress(files[entry["file"]]), dtype=np.uint8)
-    elements = np.ascontiguousarray(planes.reshape(dtype.itemsize, -1).T)
-    return elements.view(dtype).reshape(entry["shape"])
-
-
-def test_every_array_comes_back_as_it_was(files, exported, clip):
-    package, told = read_package(exported.path), json.loads(files["avatar.json"])
-    assert set(told["tiers"]) == set(package.manifest.tiers)
-    tables = {entry["name"]: unpacked(files, entry) for entry in told["tiers"]["hq"]["tables"]}
-    expected = graph_initializers(package.tables["hq"], package.manifest.tiers["hq"].settings)
-    assert tables.keys() == expected.keys()
-    for name, array in expected.items():
-        assert tables[name].dtype == array.dtype
-        np.testing.assert_array_equal(tables[name], array)
-    graph = unpacked(files, told["tiers"]["hq"]["graph"])
-    assert graph.tobytes() == package.graphs["hq"]
-    np.testing.assert_array_equal(unpacked(files, told["motion"]["poses"]), clip.poses)
-    for golden, picture in zip(told["golden"], package.golden, strict=True):
-        np.testing.assert_array_equal(unpacked(files, golden["picture"]), picture)
-    for entry in told["tiers"]["hq"]["tables"]:
-        assert entry["bytes"] == len(files[entry["file"]])
+def test_the_page_holds_the_package_and_the_valid_poses(files, exported, motion, tmp_path):
+    assert files["avatar.iavatar"] == exported.path.read_bytes()
+    assert b"<title>&lt;an avatar&gt;</title>" in files["index.html"]
+    assert zlib.decompress(files["runtime/ort.wasm.zlib"]) == b"ort.wasm"
+    path = tmp_path / "motion.npz"
+    path.write_bytes(files["motion.npz"])
+    with np.load(path) as held:
+        assert held["fps"] == 25.0
+    again = read_poses(path)
+    chosen = motion.select_rows(np.array([0, 2]))
+    for field in ("root_rotations", "root_translations", "joint_rotations"):
+        np.testing.assert_allclose(getattr(again, field), getattr(chosen, field), atol=1e-6)
 
 
 def test_the_page_loads_nothing_from_other_hosts(files):
-    own = {name: text for name, text in files.items() if not name.startswith(("data/", "runtime/"))}
-    assert {"index.html", "avatar.json", "graph_worker.js"} <= own.keys()
+    own = {name: text for name, text in files.items() if name.endswith(player_page.PAGE_SUFFIXES)}
+    own = {name: text for name, text in own.items() if not name.startswith("runtime/")}
+    assert {"index.html", "ia-avatar.js", "graph_worker.js"} <= own.keys()
     for name, content in own.items():
         found = set(re.findall(r"(?:https?:)?//[\w.-]+\.\w+", content.decode()))
         assert found <= {"http://www.w3.org"}, (
@@ -80,9 +72,9 @@ def test_the_page_loads_nothing_from_other_hosts(files):
 def test_every_file_that_the_page_names_is_there(files):
     scripts = {name: text.decode() for name, text in files.items() if name.endswith(".js")}
     for name, script in scripts.items():
-        named = re.findall(r'(?:from|import|URL)\s*\(?\s*"\./([\w./]+)"', script)
+        named = re.findall(r'(?:from|import|URL)\s*\(?\s*"\./([\w./-]+)"', script)
         assert set(named) <= files.keys(), name
-    named = re.findall(r'(?:src|href)="([^"]+)"', files["index.html"].decode())
+    named = re.findall(r'(?:src|href|motion)="([^"]+)"', files["index.html"].decode())
     assert set(named) <= files.keys()
     assert {"runtime/LICENSE", "runtime/ThirdPartyNotices.txt"} <= files.keys()
 

@@ -113,10 +113,11 @@ class Browser:
         processes = self._ask("SystemInfo.getProcessInfo", whole=True)["processInfo"]
         return sum(process["cpuTime"] for process in processes)
 
-    def emulate(self, *, scheme: str, size: tuple[int, int]) -> None:
-        """A device's size, and whether its owner likes it dark."""
-        preference = {"name": "prefers-color-scheme", "value": scheme}
-        self._ask("Emulation.setEmulatedMedia", features=[preference])
+    def emulate(self, *, scheme: str, size: tuple[int, int], motion: str = "") -> None:
+        """A device's size, and whether its owner likes it dark and calm (motion: "reduce")."""
+        preferences = {"prefers-color-scheme": scheme, "prefers-reduced-motion": motion}
+        features = [{"name": name, "value": value} for name, value in preferences.items()]
+        self._ask("Emulation.setEmulatedMedia", features=features)
         width, height = size
         self._ask(
             "Emulation.setDeviceMetricsOverride",

@@ -1,8 +1,8 @@
 // Draws pictures in a worker, which runs the package's ONNX graph on the CPU.
 
 export class Engine {
-  /** onProgress: called with {arrived: bytes} and {preparing: true} while a tier is being opened. */
-  constructor(avatar, onProgress) {
+  /** onProgress: called with {total} and {arrived} bytes, and {preparing: true} as a tier is opened. */
+  constructor(avatar, { streams, graphs }, onProgress) {
     this.avatar = avatar;
     this.waiting = new Map();
     this.next = 0;
@@ -18,10 +18,16 @@ export class Engine {
       for (const { reject } of this.waiting.values()) reject(error);
       this.waiting.clear();
     };
+    this.loaded = this.ask("load", { streams, graphs, tiers: avatar.tiers });
   }
 
   async open(tier) {
-    await this.ask("open", { tier, note: this.avatar.tiers[tier], runtime: this.avatar.runtime });
+    await this.loaded;
+    await this.ask("open", { tier });
+  }
+
+  close() {
+    this.worker.terminate();
   }
 
   /** Draw straight-alpha RGBA of width × height: {rgba, ms}. */

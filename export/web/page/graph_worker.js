@@ -1,21 +1,30 @@
 // Runs the package's own ONNX graph in WebAssembly, one thread, away from the page.
 
 import { InferenceSession, Tensor, env } from "./runtime/ort.js";
-import { load } from "./arrays.js";
+import { decodeTables, fetched, inflated } from "./package.js";
 
 const sessions = {};
+let package_, wasm;
 
-async function open({ tier, note, runtime }) {
+/** Take the package's graphs, streams and manifest; fetch the runtime. */
+async function load({ streams, graphs, tiers }) {
+  package_ = { streams, graphs, tiers };
+  const packed = await fetched(new URL("./runtime/ort.wasm.zlib", import.meta.url), (news) => postMessage(news));
+  wasm = await inflated(packed, "deflate");
+}
+
+async function open({ tier }) {
   if (sessions[tier]) return;
-  const files = [runtime, note.graph, ...note.tables].map((entry) => load(entry, (bytes) => postMessage({ arrived: bytes })));
-  const [wasm, graph, ...tables] = await Promise.all(files);
+  const { streams, graphs, tiers } = package_, { layout } = tiers.hq;
   env.wasm.numThreads = 1;
   env.wasm.wasmBinary ??= wasm;
   env.logLevel = "error";
   postMessage({ preparing: true });
-  sessions[tier] = await InferenceSession.create(graph, {
+  const voxels = streams.voxels.slice(); // decoded in place
+  const tables = decodeTables({ ...streams, voxels }, layout, tiers[tier].settings.skinning_subdivision);
+  sessions[tier] = await InferenceSession.create(graphs[tier], {
     executionProviders: ["wasm"],
-    externalData: tables.map((data, i) => ({ path: note.tables[i].name, data: new Uint8Array(data.buffer) })),
+    externalData: Object.entries(tables).map(([path, data]) => ({ path, data: new Uint8Array(data.buffer) })),
   });
 }
 
@@ -30,12 +39,12 @@ async function draw({ tier, bones, camera, width, height, samples }) {
   return { rgba: rgba.data.buffer, ms: performance.now() - began };
 }
 
-// "open" and "draw" are answered one after the other; draw returns {rgba: ArrayBuffer, ms}.
+// "load", "open" and "draw" are answered one after the other; draw returns {rgba: ArrayBuffer, ms}.
 let before = Promise.resolve();
 onmessage = ({ data: { number, kind, ...given } }) => {
   before = before.then(async () => {
     try {
-      const found = (await (kind === "open" ? open(given) : draw(given))) ?? {};
+      const found = (await { load, open, draw }[kind](given)) ?? {};
       postMessage({ number, ...found }, found.rgba ? [found.rgba] : []);
     } catch (error) {
       postMessage({ number, failed: String((error && error.message) || error) });

@@ -8,12 +8,11 @@ const WIDEST = 1.3; // factor by which narrow pictures count as wider
 const MARGIN_M = 0.35; // largest distance of the avatar's surface from the nearest joint
 const NEAREST_M = 0.3;
 const ABOUT_M = 0.25; // depth about a joint that belongs to it, metres
-const BAR_PX = 76; // the bar's height and the gap below it
 const LIFT = 0.035; // height of the person's middle above the picture's, in picture heights
 
-/** Fraction of a picture that the person takes, and its lift above the bar; height in CSS pixels. */
-export function roomIn(height) {
-  const bar = BAR_PX / Math.max(1, height);
+/** Fraction of a picture that the person takes, and its lift above a bar at its end; CSS pixels. */
+export function roomIn(height, barPx) {
+  const bar = barPx / Math.max(1, height);
   const share = Math.max(0.3, Math.min(SHARE, 0.97 - bar));
   return { share, lift: Math.max(LIFT, share / 2 - 0.5 + bar) };
 }

@@ -1,9 +1,7 @@
 // The page: buttons, settings and words around the playback.
 
-import { listen } from "./gestures.js";
-import { Orbit } from "./orbit.js";
-import { Playback, QUICK_MS } from "./playback.js";
-import { Player } from "./player.js";
+import "./ia-avatar.js";
+import { QUICK_MS } from "./playback.js";
 
 const TIERS = { hq: "Full", lite: "Lite" };
 const BACKGROUNDS = { "As the page": "", White: "#ffffff", Grey: "#8c8c8c", Black: "#000000", Green: "#00b140" };
@@ -11,30 +9,31 @@ const THEMES = { system: "System", light: "Light", dark: "Dark" };
 const SAID_MS = 6000;
 const TRIED_MS = 1000; // time in which a page that starts with Lite finds out what the device manages
 const FULL_COSTS = 1.7; // time of a picture in Full, in pictures in Lite
+const BAR_PX = 76; // the bar's height and the gap below it
 const $ = (id) => document.getElementById(id);
 
-export async function start() {
-  const loading = new Loading();
-  const player = await Player.load((news) => loading.onProgress(news));
-  const { avatar } = player;
-  $("name").textContent = document.title = avatar.name;
-  $("licence").textContent = avatar.licence;
-  const wanted = new URLSearchParams(location.search).get("start");
-  const tier = wanted in avatar.tiers ? wanted : "hq";
-  const state = { tier, sharpness: "auto", playing: false, speed: 1 };
-  loading.expect(avatar, tier);
-  await player.open(state);
-  const orbit = new Orbit(avatar.look);
-  const playback = new Playback($("picture"), player, orbit, state, (news) => tell(news, player, loading));
-  settings(player, state, playback, loading);
-  transport(player, state, playback, orbit);
-  listen($("picture"), orbit, () => playback.changed());
-  window.player = player; // for scripts: verify(), measure()
-  playback.play(player.count > 1 && !matchMedia("(prefers-reduced-motion: reduce)").matches);
-  markPlaying(state);
-  loading.done();
-  if (tier !== "hq") tryFull(player, state, playback);
-  playback.run().catch((error) => loading.failed(error.message));
+export function start() {
+  const loading = new Loading(), avatar = $("picture"), { state } = avatar;
+  $("name").textContent = document.title;
+  state.barPx = BAR_PX;
+  state.tier = new URLSearchParams(location.search).get("start") ?? "hq";
+  avatar.addEventListener("progress", ({ detail }) => loading.onProgress(detail));
+  avatar.addEventListener("failed", ({ detail }) => loading.failed(detail.message));
+  avatar.addEventListener("picture", ({ detail }) => tell(detail, avatar.player));
+  avatar.addEventListener("picture", () => parent.postMessage("drawn", location.origin), { once: true });
+  avatar.addEventListener("ready", ({ detail: { player } }) => {
+    $("licence").textContent = player.avatar.licence;
+    settings(player, state, avatar.playback, loading);
+    transport(player, state, avatar.playback, avatar.orbit);
+    window.player = player; // for scripts: verify(), measure()
+    markPlaying(state);
+    loading.done();
+    if (state.tier !== "hq") tryFull(player, state, avatar.playback);
+  });
+  document.addEventListener("keydown", (event) => { // before anything was clicked
+    const { key, ctrlKey, metaKey, altKey } = event;
+    if (event.target === document.body) avatar.dispatchEvent(new KeyboardEvent("keydown", { key, ctrlKey, metaKey, altKey }));
+  });
 }
 
 /** Change from Lite to Full once the device has shown that it draws fast enough, unless somebody chose. */
@@ -56,23 +55,16 @@ function markTier(state) {
 /** The status shown while a tier is being loaded. */
 class Loading {
   constructor() {
-    this.bytes = 0;
-    this.total = 1;
+    this.bytes = this.total = 0;
   }
 
-  expect(avatar, tier) {
-    const { graph, tables } = avatar.tiers[tier];
-    this.bytes = 0;
-    this.total = [avatar.runtime, graph, ...tables].reduce((sum, entry) => sum + entry.bytes, 0);
-    $("status").hidden = false;
-    $("status").classList.remove("failed");
-  }
-
-  onProgress({ arrived, preparing }) {
+  onProgress({ total = 0, arrived = 0, preparing }) {
     if ($("status").classList.contains("failed")) return; // other files may still be coming
-    this.bytes += arrived || 0;
-    const [done, all] = [this.bytes, this.total].map((bytes) => (bytes / 1e6).toFixed(1));
-    $("status-bar").value = preparing ? 1 : Math.min(1, this.bytes / this.total);
+    this.bytes += arrived;
+    this.total += total;
+    const [done, all] = [this.bytes, Math.max(this.bytes, this.total)].map((bytes) => (bytes / 1e6).toFixed(1));
+    $("status").hidden = false;
+    $("status-bar").value = preparing ? 1 : Math.min(1, this.bytes / Math.max(1, this.total));
     $("status-text").textContent = preparing ? "Preparing …" : `Loading ${done} of ${all} MB`;
   }
 
@@ -93,8 +85,7 @@ class Loading {
   }
 }
 
-function tell({ failed, row, ms, rate, playing }, player, loading) {
-  if (failed) return loading.failed(failed.message);
+function tell({ row, ms, rate, playing }, player) {
   const second = (value) => (value / player.fps).toFixed(1);
   $("timeline").value = row;
   $("time").textContent = `${second(row)} / ${second(player.count)} s`;
@@ -102,7 +93,6 @@ function tell({ failed, row, ms, rate, playing }, player, loading) {
   $("rate").replaceChildren(...Object.entries(figures).map(([className, textContent]) => (
     Object.assign(document.createElement("span"), { className, textContent })
   )));
-  return undefined;
 }
 
 /** Radio buttons; chosen is called with the value. */
@@ -125,7 +115,6 @@ const known = (names, there) => Object.fromEntries(there.map((name) => [name, na
 function settings(player, state, playback, loading) {
   const changeTier = async (tier) => {
     state.chosen = true;
-    loading.expect(player.avatar, tier);
     try {
       await player.open({ tier });
       state.tier = tier;
@@ -142,7 +131,7 @@ function settings(player, state, playback, loading) {
   $("sharpness").onchange = () => { state.sharpness = $("sharpness").value; playback.changed(); };
   $("speed").onchange = () => { state.speed = Number($("speed").value); };
   $("check").onclick = () => check(player);
-  $("save").onclick = () => save(player.avatar.name, playback);
+  $("save").onclick = () => save(document.title, playback);
 }
 
 function backgrounds() {

@@ -8,13 +8,14 @@ const COARSEST = 270, SHARPEST = 1080; // shorter side, pixels
 const STILL_MS = 180; // delay of the sharp picture after the last movement
 
 export class Playback {
-  /** state: {tier, sharpness, playing, speed}; onNews: called for every picture and failure. */
+  /** state: {tier, sharpness, playing, speed, barPx, inSight}; onNews: called for every picture and failure. */
   constructor(canvas, player, orbit, state, onNews) {
     Object.assign(this, { canvas, player, orbit, state, onNews });
     this.context = canvas.getContext("2d");
     this.row = 0; this.time = 0; this.moving = 540;
     this.shown = []; this.took = []; this.wake = () => {}; this.dirty = true; this.touched = 0; this.sharp = false;
-    new ResizeObserver(() => this.changed()).observe(canvas);
+    this.resized = new ResizeObserver(() => this.changed());
+    this.resized.observe(canvas);
   }
 
   /** Request another picture. */
@@ -36,15 +37,25 @@ export class Playback {
     this.changed();
   }
 
+  stop() {
+    this.stopped = true;
+    this.resized.disconnect();
+    this.wake();
+  }
+
   async run() {
-    for (;;) {
+    while (!this.stopped) {
+      if (!this.state.inSight) {
+        await new Promise((resolve) => { this.wake = resolve; });
+        continue;
+      }
       if (this.state.playing) this.advance();
       else if (!this.dirty && !(await this.settled())) continue;
       this.dirty = false;
       try {
         await this.picture(this.size());
       } catch (error) {
-        return this.onNews({ failed: error });
+        return this.stopped || this.onNews({ failed: error });
       }
     }
   }
@@ -87,17 +98,17 @@ export class Playback {
   async picture([wide, high]) {
     const { player, orbit, state, row } = this;
     const pose = player.pose(row);
-    const room = roomIn(this.canvas.clientHeight); // the bar takes the lower end of the stage
+    const room = roomIn(this.canvas.clientHeight, state.barPx);
     const camera = player.drawable(state, pose, orbit.camera(pose, wide, high, room));
     const { width, height } = camera;
     const part = await player.draw(state, pose, camera);
+    if (this.stopped) return;
     if (this.canvas.width !== width || this.canvas.height !== height) {
       Object.assign(this.canvas, { width, height });
     } else {
       this.context.clearRect(0, 0, width, height);
     }
     if (part) this.context.putImageData(new ImageData(part.rgba, part.width, part.height), part.x, part.y);
-    if (part && !this.took.length && parent !== window) parent.postMessage("drawn", location.origin);
     if (part) this.took = [...this.took.slice(-30), part.ms];
     if (part && state.playing) this.adapt(part.ms);
     this.onNews({ row, ms: part ? part.ms : 0, rate: this.rate(), playing: state.playing });

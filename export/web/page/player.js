@@ -1,28 +1,51 @@
 // The avatar, its motion and the engine that draws it, without the page around them.
 
-import { fetched, load } from "./arrays.js";
 import { Engine } from "./engine.js";
-import { Skeleton, bones, moved } from "./kinematics.js";
+import { Skeleton, bones, moved, rigid } from "./kinematics.js";
 import { Orbit, coarser, nearestOf, windowOf } from "./orbit.js";
+import { fetched, heights, readMotion, unzip } from "./package.js";
 
 const CLOSE = 2; // largest difference of a premultiplied channel between close pixels, in 1/255
 const ALIKE = 0.999; // least fraction of close pixels in pictures that count as the same
 const POSE = 75; // numbers in a pose: root rotation, root translation, 23 axis-angles
 
+const STREAMS = ["blocks", "voxels", "positions", "normals", "thickness", "skin_nodes", "skin_weights"];
+
 export class Player {
-  /** onProgress: see Engine. */
-  static async load(onProgress) {
-    const avatar = await (await fetched("avatar.json")).json();
-    return new Player(avatar, await load(avatar.motion.poses), onProgress);
+  /**
+   * Read an .iavatar file and a motion (.npz; the canonical pose without one).
+   * onProgress: as of Engine. onPreview: called with a small picture (Blob) before all else is there.
+   */
+  static async load(src, motion, onProgress, onPreview = () => {}) {
+    const read = async (url, parse) => {
+      const buffer = await fetched(url, onProgress);
+      return Promise.resolve(buffer).then(parse).catch((error) => {
+        throw new Error(`${String(url).split("/").pop()} cannot be read: ${error.message}`);
+      });
+    };
+    const reading = motion && read(motion, readMotion);
+    reading?.catch(() => {}); // awaited below
+    const entries = await read(src, unzip);
+    if (!entries["manifest.json"]) throw new Error(`${src} is no .iavatar file.`);
+    const avatar = JSON.parse(new TextDecoder().decode(await entries["manifest.json"]()));
+    onPreview(new Blob([await entries["preview.png"]()], { type: "image/png" }));
+    const all = (names) => Promise.all(names.map(async ([name, entry]) => [name, await entries[entry]()])).then(Object.fromEntries);
+    const streams = await all(STREAMS.map((name) => [name, `hq/${name}.bin`]));
+    const graphs = await all(Object.keys(avatar.tiers).map((tier) => [tier, tier === "hq" ? "player.onnx" : `${tier}/player.onnx`]));
+    const standing = new Float32Array(POSE);
+    standing.set(avatar.canonical_rotations.flat(), 6);
+    const { poses, fps } = (await reading) || { poses: standing, fps: 30 };
+    const { low, high } = heights(streams, avatar.tiers.hq.layout);
+    const front = rigid(poses.slice(0, 3)); // the first pose is upright
+    const axes = [1, -1, -1].map((sign, axis) => [0, 4, 8].map((row) => sign * front[row + axis]));
+    avatar.look = { axes, pelvis: avatar.rest_joints[0], height_m: high - low, middle_m: (high + low) / 2 };
+    return new Player(avatar, entries, new Engine(avatar, { streams, graphs }, onProgress), poses, fps);
   }
 
-  constructor(avatar, poses, onProgress) {
-    this.avatar = avatar;
-    this.poses = poses;
+  constructor(avatar, entries, engine, poses, fps) {
+    Object.assign(this, { avatar, entries, engine, poses, fps });
     this.count = poses.length / POSE;
-    this.fps = avatar.motion.fps;
     this.skeleton = new Skeleton(avatar);
-    this.engine = new Engine(avatar, onProgress);
   }
 
   pose(row) {
@@ -63,14 +86,14 @@ export class Player {
   async verify() {
     await this.open({ tier: "hq" });
     const differences = [];
-    for (const golden of this.avatar.golden) {
-      const stored = await load(golden.picture);
-      const { worldFromCanonical } = this.skeleton.posed(golden.pose);
+    for (const [number, golden] of this.avatar.golden.entries()) {
+      const stored = await this.entries[`golden/${number}.rgba`]();
+      const pose = [...golden.root_rotation, ...golden.root_translation, ...golden.joint_rotations.flat()];
       const { rgba } = await this.engine.draw("hq", {
-        bones: bones(worldFromCanonical, golden.camera.cameraFromWorld),
-        camera: [...golden.camera.focal, ...golden.camera.center],
-        width: golden.camera.width,
-        height: golden.camera.height,
+        bones: bones(this.skeleton.posed(pose).worldFromCanonical, golden.camera_from_world.flat()),
+        camera: [...golden.focal_px, ...golden.center_px],
+        width: golden.size_px[0],
+        height: golden.size_px[1],
       });
       differences.push(pictureDifference(rgba, stored));
     }

@@ -1,22 +1,30 @@
 """The avatar in a browser: served, written to a folder, and driven as a person would."""
 
+import hashlib
 import http.client
 import json
 import re
 import signal
 import subprocess
 import sys
+import threading
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from capture.input_error import InputError
 from export import player_page
+from export.package.package_file import read_package
 from export.player import PictureDifference, Player, premultiply
+from export.player_inputs import graph_initializers
 from instant_avatar.animation.driving_motion import FollowingCamera
+from instant_avatar.animation.web_server import make_server
 from preprocess.poses.pose_format_registry import read_poses
 from tests.instant_avatar.browser import Browser, chromium, until
 
+EXAMPLES = Path(__file__).parents[3] / "examples"
 SIZE = (900, 700)
 STAGE = (slice(60, 600), slice(4, -4))
 """Between the page's head and its bar, inside of the ring that marks the focus."""
@@ -125,15 +133,51 @@ def test_the_browser_draws_the_golden_frames_again(page):
 @with_runtime
 @with_chromium
 @pytest.mark.slow
+@pytest.mark.parametrize("subdivision", [1, 2])
+def test_the_browser_decodes_the_tables_that_python_decodes(page, package, subdivision):
+    found = page.run(
+        f"""(async () => {{
+          const {{ decodeTables }} = await import("./package.js");
+          const names = {{}}, entries = player.entries, hashes = {{}};
+          for (const entry of Object.keys(entries)) {{
+            const [, name] = /^hq\\/(\\w+)\\.bin$/.exec(entry) ?? [];
+            if (name) names[name] = await entries[entry]();
+          }}
+          const tables = decodeTables(names, player.avatar.tiers.hq.layout, {subdivision});
+          for (const [name, table] of Object.entries(tables)) {{
+            const hash = new Uint8Array(await crypto.subtle.digest("SHA-256", table));
+            hashes[name] = [...hash].map((byte) => byte.toString(16).padStart(2, "0")).join("");
+          }}
+          return hashes;
+        }})()""",
+        seconds=120.0,
+    )
+    held = read_package(package)
+    settings = replace(held.manifest.tiers["hq"].settings, skinning_subdivision=subdivision)
+    expected = graph_initializers(held.tables["hq"], settings)
+    assert found == {
+        name: hashlib.sha256(table.tobytes()).hexdigest() for name, table in expected.items()
+    }
+
+
+@with_runtime
+@with_chromium
+@pytest.mark.slow
 def test_the_browser_draws_what_the_player_draws(page, package, novel):
     player, motion = Player.load(package), read_poses(novel)
     row, size = 7, 96
+    view = FollowingCamera.of(player, motion, size).camera_for(motion[row])
+    camera = {
+        "focal": view.focal_px,
+        "center": view.center_px,
+        "width": size,
+        "height": size,
+        "cameraFromWorld": view.camera_from_world[:3].ravel().tolist(),
+    }
     part = page.run(
         f"""(async () => {{
-          const {{ Orbit }} = await import("./orbit.js");
           const pose = player.pose({row});
-          const camera = new Orbit(player.avatar.look).camera(pose, {size}, {size});
-          const part = await player.draw({{ tier: "hq" }}, pose, camera);
+          const part = await player.draw({{ tier: "hq" }}, pose, {json.dumps(camera)});
           return {{ ...part, rgba: Array.from(part.rgba) }};
         }})()""",
         seconds=120.0,
@@ -142,9 +186,7 @@ def test_the_browser_draws_what_the_player_draws(page, package, novel):
     columns = slice(part["x"], part["x"] + part["width"])
     shown = np.zeros((size, size, 4), dtype=np.uint8)
     shown[rows, columns] = np.reshape(part["rgba"], (part["height"], part["width"], 4))
-    expected = player.render(
-        motion[row], FollowingCamera.of(player, motion, size).camera_for(motion[row])
-    )
+    expected = player.render(motion[row], view)
     assert expected[..., 3].max() == 255
     assert PictureDifference.of(premultiply(shown), premultiply(expected)).matches
 
@@ -216,7 +258,7 @@ def test_the_person_stands_above_the_bar_however_low_the_screen(page, size):
         until(lambda: not moves(page), 30.0)
         feet, bar = page.run(
             """(() => {
-              const canvas = document.getElementById("picture");
+              const canvas = document.getElementById("picture").canvas;
               const { width, height, clientHeight } = canvas;
               const { data } = canvas.getContext("2d").getImageData(0, 0, width, height);
               let last = 0;
@@ -269,9 +311,6 @@ def test_the_folder_plays_below_any_address(call_play, package, tmp_path):
     out = tmp_path / "host" / "people" / "actor"
     outcome = call_play(package, "--web", "--out", out)
     assert outcome.code == 0
-    told = json.loads((out / "avatar.json").read_text())
-    told["tiers"]["other"] = told["tiers"]["hq"]
-    (out / "avatar.json").write_text(json.dumps(told))
     host = [sys.executable, "-u", "-m", "http.server", "0", "--bind", "127.0.0.1"]
     with subprocess.Popen(
         host, cwd=tmp_path / "host", stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
@@ -284,18 +323,60 @@ def test_the_folder_plays_below_any_address(call_play, package, tmp_path):
                 until(lambda: browser.run("!!window.player"), 120.0)
                 until(lambda: drawn(browser).mean() > 0.03, 60.0)
                 paused(browser)
-                before = browser.picture()
-                browser.run("document.querySelector('#tiers input[value=other]').click()")
-                until(lambda: browser.run("document.getElementById('status').hidden"), 60.0)
-                until(lambda: np.array_equal(browser.picture()[STAGE], before[STAGE]), 30.0)
-                largest = max((out / "data").iterdir(), key=lambda file: file.stat().st_size)
-                largest.write_bytes(largest.read_bytes()[:-1000])  # as a copy that was cut off
-                browser.run("location.reload()")
+                before = browser.picture()[STAGE]
+                browser.run("document.querySelector('#tiers input[value=lite]').click()")
                 until(
-                    lambda: f"{largest.name} arrived damaged or incomplete" in browser.text(), 60.0
+                    lambda: browser.run("document.getElementById('picture').state.tier == 'lite'"),
+                    60.0,
                 )
+                until(lambda: not moves(browser), 30.0)
+                assert np.abs(browser.picture()[STAGE].astype(int) - before).mean() < 2.0
+                held = out / "avatar.iavatar"
+                held.write_bytes(held.read_bytes()[:-1000])  # as a copy that was cut off
+                browser.run("location.reload()")
+                told = "avatar.iavatar cannot be read: it is damaged"
+                until(lambda: told in browser.text(), 60.0)
         finally:
             process.terminate()
+
+
+@with_runtime
+@with_chromium
+@pytest.mark.slow
+def test_the_element_plays_in_a_page_of_ones_own(call_play, package, novel, tmp_path):
+    """The example: one avatar dances, another one is loaded when it is scrolled near."""
+    words = ("--poses", novel, "--web", "--out", tmp_path / "player")
+    assert call_play(package, *words).code == 0
+    files = {"index.html": (EXAMPLES / "4_avatar_in_a_page.html").read_bytes()}
+    for file in (tmp_path / "player").rglob("*.*"):
+        files[str(file.relative_to(tmp_path))] = file.read_bytes()
+    server = make_server(files, 8390)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        with Browser(tmp_path / "browser", size=SIZE) as browser:
+            for motion in ("reduce", ""):
+                browser.emulate(scheme="light", size=SIZE, motion=motion)
+                browser.go(f"http://127.0.0.1:{server.server_port}/?{motion}")
+                until(lambda: browser.run("!!window.dancer?.playback?.shown.length"), 120.0)
+                assert browser.run("dancer.state.playing") is (motion == "")
+            assert browser.run("stander.loading === undefined")
+            browser.run("dancer.pause(); dancer.focus()")
+            before = browser.run("dancer.orbit.yaw")
+            browser.press("ArrowLeft")
+            until(lambda: browser.run("dancer.orbit.yaw") > before, 30.0)
+            browser.run(
+                "stander.preview = (blob) => { early = [blob.type, !stander.playback]; };"
+                "stander.scrollIntoView()"
+            )
+            until(lambda: browser.run("!!stander.playback?.shown.length"), 120.0)
+            assert browser.run("early") == ["image/png", True]
+            assert browser.run("dancer.state.inSight") is False
+            assert browser.run("stander.player.count") == 1
+            browser.run("stander.setAttribute('src', 'player/none.iavatar')")
+            until(lambda: "404" in browser.run("stander.message.textContent"), 30.0)
+    finally:
+        server.shutdown()
+        server.server_close()
 
 
 @with_runtime
