@@ -63,7 +63,7 @@ POLL_S = 0.01
 KEPT_BYTES = 160 << 20
 """Memory for skipped frames."""
 LATER_S = 0.8
-"""Time after the last frame in which skipped ones are tracked, seconds: somebody waits."""
+"""Time after the last frame in which skipped ones are tracked, seconds: a user waits."""
 LEAST_FRAMES = 40
 """Frames that are tracked in all before nothing more is, if there are as many."""
 FoundPerson = tuple[Frame, PersonKeypoints | None]

@@ -55,7 +55,7 @@ STREAMING_RATE_FACTOR = 0.5
 swings of the parameters leave their mean closer to the optimum."""
 CLOSING_S = 2.0
 """Time after the last frame of a paced source in which rates fall and surfaces become firm,
-seconds: somebody waits."""
+seconds: a user waits."""
 LEAST_STEPS = 250
 """Steps that a paced source is trained for, however short it is; fewer make no surface."""
 EVALUATION_TIME_SHARE = 0.004

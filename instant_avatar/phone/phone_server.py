@@ -182,7 +182,7 @@ class PhoneServer:
         return web.Response(body=path.read_bytes(), headers={"Content-Type": kind})
 
     async def _runtime(self, request: web.Request) -> web.Response:
-        """The player's WebAssembly module, which the page fetches while somebody films."""
+        """The player's WebAssembly module, which the page fetches during filming."""
         if request.match_info["file"] != MODULE_FILE:
             raise InputError("There is no such file.")
         return web.Response(body=self._module, headers=HEADERS | KEPT)

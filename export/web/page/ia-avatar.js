@@ -35,7 +35,7 @@ export class IaAvatar extends HTMLElement {
     root.innerHTML = "<canvas></canvas><p role=status part=message></p>";
     [this.canvas, this.message] = root.children;
     this.state = { tier: "hq", sharpness: "auto", playing: false, speed: 1, barPx: 0, inSight: false };
-    this.watch = new IntersectionObserver(([{ isIntersecting }]) => this.seen(isIntersecting), { rootMargin: NEAR });
+    this.watch = new IntersectionObserver((news) => this.seen(news.at(-1).isIntersecting), { rootMargin: NEAR });
   }
 
   connectedCallback() {

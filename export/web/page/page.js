@@ -36,7 +36,7 @@ export function start() {
   });
 }
 
-/** Change from Lite to Full once the device has shown that it draws fast enough, unless somebody chose. */
+/** Change from Lite to Full once the device has shown that it draws fast enough, unless a tier was chosen. */
 function tryFull(player, state, playback) {
   setTimeout(async () => {
     if (state.chosen || playback.typicalMs() * FULL_COSTS > QUICK_MS) return;

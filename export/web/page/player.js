@@ -23,7 +23,7 @@ export class Player {
         throw new Error(`${String(url).split("/").pop()} cannot be read: ${error.message}`);
       });
     };
-    const reading = motion && read(motion, readMotion);
+    const reading = motion ? read(motion, readMotion) : undefined;
     reading?.catch(() => {}); // awaited below
     const entries = await read(src, unzip);
     if (!entries["manifest.json"]) throw new Error(`${src} is no .iavatar file.`);

@@ -323,14 +323,17 @@ def test_the_folder_plays_below_any_address(call_play, package, tmp_path):
                 until(lambda: browser.run("!!window.player"), 120.0)
                 until(lambda: drawn(browser).mean() > 0.03, 60.0)
                 paused(browser)
-                before = browser.picture()[STAGE]
+                until(
+                    lambda: browser.run("document.getElementById('picture').playback.sharp"), 30.0
+                )
+                until(lambda: not moves(browser), 30.0)
+                before = browser.picture()[STAGE].astype(int)
                 browser.run("document.querySelector('#tiers input[value=lite]').click()")
                 until(
                     lambda: browser.run("document.getElementById('picture').state.tier == 'lite'"),
                     60.0,
                 )
-                until(lambda: not moves(browser), 30.0)
-                assert np.abs(browser.picture()[STAGE].astype(int) - before).mean() < 2.0
+                until(lambda: np.abs(browser.picture()[STAGE] - before).mean() < 2.0, 60.0)
                 held = out / "avatar.iavatar"
                 held.write_bytes(held.read_bytes()[:-1000])  # as a copy that was cut off
                 browser.run("location.reload()")
