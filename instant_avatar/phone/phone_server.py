@@ -165,7 +165,8 @@ class PhoneServer:
         policy = "default-src 'self'; img-src 'self' data: blob:; media-src 'self' blob:"
         headers = {"Content-Security-Policy": f"{policy}; base-uri 'none'; form-action 'none'"}
         live = "here" if request.secure else "elsewhere" if self._live_port else "no"
-        text = text.replace("{{live}}", live).replace("{{module}}", f"runtime/{MODULE_FILE}")
+        module = f"runtime/{MODULE_FILE}" if self._module else ""
+        text = text.replace("{{live}}", live).replace("{{module}}", module)
         return web.Response(text=text, content_type="text/html", headers=headers)
 
     async def _go_live(self, request: web.Request) -> web.Response:
