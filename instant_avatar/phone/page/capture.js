@@ -45,7 +45,7 @@ async function begin(type, size) {
   on("warning", ({ text }) => warn(text));
   let opened = false;
   on("avatar", ({ name, final }) => {
-    if (opened && $("done").hidden) return; // somebody films again
+    if (opened && $("done").hidden) return; // a person films again
     opened = true;
     open(name, final ? "It is ready." : "It can be played; finer detail follows.");
   });
