@@ -138,6 +138,88 @@ def _fetch_cells(
         t += cell_m
 
 
+@compile_kernel(**NO_ALLOCATION)
+def _march_block(
+    block, origins, directions, slots, jitter, sample_step_m,
+    cell_index, cell_roots, cell_low, cell_shape, cell_m,
+    occupied, density, low, cells_per_m, opaque_margin_steps, points, rows, counts, next_steps,
+):  # fmt: skip
+    """Marches the rays of a block."""
+    most = U32(points.shape[1])
+    ends = opaque_margin_steps < UNLIMITED_STEPS
+    steps_a_m = F32(1) / sample_step_m
+    first = block * RAYS_PER_BLOCK
+    last = min(first + RAYS_PER_BLOCK, origins.shape[0])
+    for fetch in range(2 if ends else 0):
+        for ray in range(first, last):
+            _fetch_cells(
+                origins, directions, ray, slots, cell_low, cell_shape, cell_m,
+                cell_index, cell_roots, fetch == 1,
+            )  # fmt: skip
+    for ray in range(first, last):
+        slot = U32(slots[ray])
+        nx, ny, nz = cell_shape[slot, 0], cell_shape[slot, 1], cell_shape[slot, 2]
+        ox, oy, oz, dx, dy, dz, ix, iy, iz, enter, leave = _enter_grid(
+            origins, directions, ray, cell_low, cell_shape, slot, cell_m
+        )
+        wx = F32(1) if ix > 0 else F32(0)  # the far wall of a cell
+        wy = F32(1) if iy > 0 else F32(0)
+        wz = F32(1) if iz > 0 else F32(0)
+        a_step = sample_step_m * cell_m  # of a ray's direction in cells, in metres
+        optical, left, kept, step = F32(0), opaque_margin_steps, U32(0), F32(0)
+        while kept < most and left >= 0:
+            t = enter + (step + jitter[ray]) * sample_step_m
+            if t >= leave:
+                break
+            gx, gy, gz = ox + t * dx, oy + t * dy, oz + t * dz
+            i, j, k = cell_index_at(gx, nx), cell_index_at(gy, ny), cell_index_at(gz, nz)
+            packed = cell_index[slot, (i * U32(ny) + j) * U32(nz) + k]
+            way_x, way_y = (F32(i) + wx - gx) * ix, (F32(j) + wy - gy) * iy
+            way = min(min(way_x, way_y), (F32(k) + wz - gz) * iz)
+            if packed <= 0:
+                if packed < -1:  # empty within -packed - 1 more cells in every direction
+                    more = F32(-packed - 1)
+                    way = min(way_x + more * abs(ix), way_y + more * abs(iy))
+                    way = min(way, (F32(k) + wz - gz) * iz + more * abs(iz))
+                step += max(F32(1), np.ceil(way * steps_a_m))
+                continue
+            ex = (gx - (F32(i) + F32(0.5))) * cell_m
+            ey = (gy - (F32(j) + F32(0.5))) * cell_m
+            ez = (gz - (F32(k) + F32(0.5))) * cell_m
+            chosen, bent = U32(packed >> 3), packed & 4
+            px, py, pz = canonical_point(cell_roots, slot, chosen, False, ex, ey, ez)
+            fx, fy, fz = ex + dx * a_step, ey + dy * a_step, ez + dz * a_step
+            ux, uy, uz = canonical_point(cell_roots, slot, chosen, False, fx, fy, fz)
+            ux, uy, uz = ux - px, uy - py, uz - pz
+            straight = packed & 7 == 1  # nine in ten cells: a line through canonical space
+            samples = max(I32(np.ceil(way * steps_a_m)), I32(1)) if straight else I32(1)
+            for _ in range(samples):
+                best, row = F32(-1), chosen
+                if straight:
+                    best = _cached_density(occupied, density, low, cells_per_m, px, py, pz, ends)
+                for _ in range(0 if straight else packed & 3):
+                    x, y, z = canonical_point(cell_roots, slot, row, bent, ex, ey, ez)
+                    asked = ends or packed & 3 > 1
+                    here = _cached_density(occupied, density, low, cells_per_m, x, y, z, asked)
+                    if here > best:
+                        best, chosen, px, py, pz = here, row, x, y, z
+                    row += U32(3) if bent else U32(1)
+                if best >= F32(0):
+                    points[ray, kept, 0] = px
+                    points[ray, kept, 1] = py
+                    points[ray, kept, 2] = pz
+                    rows[ray, kept] = chosen
+                    kept += U32(1)
+                    optical += best * sample_step_m
+                    left -= optical > F32(OPAQUE_DEPTH)
+                step += F32(1)
+                if kept == most or left < 0:
+                    break
+                px, py, pz = px + ux, py + uy, pz + uz
+        counts[ray] = kept
+        next_steps[ray] = I32(step)
+
+
 @compile_kernel(parallel=True, **NO_ALLOCATION)
 def march(
     origins, directions, slots, jitter, sample_step_m,
@@ -151,82 +233,13 @@ def march(
     density is used. A ray ends `opaque_margin_steps` samples after its cached optical depth passes
     `OPAQUE_DEPTH`, or when `points` is full; `next_steps` is the lattice step that continues it.
     """
-    most = U32(points.shape[1])
-    ends = opaque_margin_steps < UNLIMITED_STEPS
-    steps_a_m = F32(1) / sample_step_m
     for block in prange((origins.shape[0] + RAYS_PER_BLOCK - 1) // RAYS_PER_BLOCK):
-        first = block * RAYS_PER_BLOCK
-        last = min(first + RAYS_PER_BLOCK, origins.shape[0])
-        for fetch in range(2 if ends else 0):
-            for ray in range(first, last):
-                _fetch_cells(
-                    origins, directions, ray, slots, cell_low, cell_shape, cell_m,
-                    cell_index, cell_roots, fetch == 1,
-                )  # fmt: skip
-        for ray in range(first, last):
-            slot = U32(slots[ray])
-            nx, ny, nz = cell_shape[slot, 0], cell_shape[slot, 1], cell_shape[slot, 2]
-            ox, oy, oz, dx, dy, dz, ix, iy, iz, enter, leave = _enter_grid(
-                origins, directions, ray, cell_low, cell_shape, slot, cell_m
-            )
-            wx = F32(1) if ix > 0 else F32(0)  # the far wall of a cell
-            wy = F32(1) if iy > 0 else F32(0)
-            wz = F32(1) if iz > 0 else F32(0)
-            a_step = sample_step_m * cell_m  # of a ray's direction in cells, in metres
-            optical, left, kept, step = F32(0), opaque_margin_steps, U32(0), F32(0)
-            while kept < most and left >= 0:
-                t = enter + (step + jitter[ray]) * sample_step_m
-                if t >= leave:
-                    break
-                gx, gy, gz = ox + t * dx, oy + t * dy, oz + t * dz
-                i, j, k = cell_index_at(gx, nx), cell_index_at(gy, ny), cell_index_at(gz, nz)
-                packed = cell_index[slot, (i * U32(ny) + j) * U32(nz) + k]
-                way_x, way_y = (F32(i) + wx - gx) * ix, (F32(j) + wy - gy) * iy
-                way = min(min(way_x, way_y), (F32(k) + wz - gz) * iz)
-                if packed <= 0:
-                    if packed < -1:  # empty within -packed - 1 more cells in every direction
-                        more = F32(-packed - 1)
-                        way = min(way_x + more * abs(ix), way_y + more * abs(iy))
-                        way = min(way, (F32(k) + wz - gz) * iz + more * abs(iz))
-                    step += max(F32(1), np.ceil(way * steps_a_m))
-                    continue
-                ex = (gx - (F32(i) + F32(0.5))) * cell_m
-                ey = (gy - (F32(j) + F32(0.5))) * cell_m
-                ez = (gz - (F32(k) + F32(0.5))) * cell_m
-                chosen, bent = U32(packed >> 3), packed & 4
-                px, py, pz = canonical_point(cell_roots, slot, chosen, False, ex, ey, ez)
-                fx, fy, fz = ex + dx * a_step, ey + dy * a_step, ez + dz * a_step
-                ux, uy, uz = canonical_point(cell_roots, slot, chosen, False, fx, fy, fz)
-                ux, uy, uz = ux - px, uy - py, uz - pz
-                straight = packed & 7 == 1  # nine in ten cells: a line through canonical space
-                samples = max(I32(np.ceil(way * steps_a_m)), I32(1)) if straight else I32(1)
-                for _ in range(samples):
-                    best, row = F32(-1), chosen
-                    if straight:
-                        best = _cached_density(
-                            occupied, density, low, cells_per_m, px, py, pz, ends
-                        )
-                    for _ in range(0 if straight else packed & 3):
-                        x, y, z = canonical_point(cell_roots, slot, row, bent, ex, ey, ez)
-                        asked = ends or packed & 3 > 1
-                        here = _cached_density(occupied, density, low, cells_per_m, x, y, z, asked)
-                        if here > best:
-                            best, chosen, px, py, pz = here, row, x, y, z
-                        row += U32(3) if bent else U32(1)
-                    if best >= F32(0):
-                        points[ray, kept, 0] = px
-                        points[ray, kept, 1] = py
-                        points[ray, kept, 2] = pz
-                        rows[ray, kept] = chosen
-                        kept += U32(1)
-                        optical += best * sample_step_m
-                        left -= optical > F32(OPAQUE_DEPTH)
-                    step += F32(1)
-                    if kept == most or left < 0:
-                        break
-                    px, py, pz = px + ux, py + uy, pz + uz
-            counts[ray] = kept
-            next_steps[ray] = I32(step)
+        _march_block(
+            I32(block), origins, directions, slots, jitter, sample_step_m,
+            cell_index, cell_roots, cell_low, cell_shape, cell_m,
+            occupied, density, low, cells_per_m, opaque_margin_steps,
+            points, rows, counts, next_steps,
+        )  # fmt: skip
 
 
 @compile_kernel(**NO_ALLOCATION)
