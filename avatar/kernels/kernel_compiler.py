@@ -25,12 +25,20 @@ CALLEE_FOLDER = Path(__file__).resolve().parent
 NO_ALLOCATION: dict[str, Any] = {**FAST_MATH, "_nrt": False}
 """Kernel options without allocation: arrays are not reference-counted. The counting is atomic and
 takes half of the time where arrays pass from one small kernel to the next."""
+INLINED: dict[str, Any] = {**NO_ALLOCATION, "forceinline": True}
+"""Options of a kernel that others call. LLVM inlines it: numba's own inlining types its statements
+again in every caller, which takes a third of the time that compilation does."""
+INLINED_ALLOCATION: dict[str, Any] = {**FAST_MATH, "forceinline": True}
+"""Options of such a kernel that allocates."""
 
 
 def compile_kernel(
     *, cache: bool = True, **options: Any
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Decorates a kernel: `numba.njit(**options)` with the machine code cached on disk.
+
+    A parallel region calls one kernel for each of its turns: numba compiles the statements of a
+    region twice, and slowly, and a kernel that it calls once.
 
     Shape-checking hooks wrap every function of a module under test, and numba cannot compile the
     wrapper, so the function is unwrapped first. Numba invalidates its cache when the function's own
@@ -41,10 +49,11 @@ def compile_kernel(
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         plain = inspect.unwrap(function)
+        njit = functools.partial(numba.njit, no_cfunc_wrapper=True, **options)
         try:
-            kernel = numba.njit(cache=cache, **options)(plain)
+            kernel = njit(cache=cache)(plain)
         except RuntimeError:  # "no locator available": no place to keep it
-            kernel = numba.njit(**options)(plain)
+            kernel = njit()(plain)
         file = getattr(getattr(kernel, "_cache", None), "_cache_file", None)
         if file is not None:
             file._source_stamp = _source_digest(Path(plain.__code__.co_filename).resolve().parent)

@@ -11,7 +11,12 @@ import math
 import numpy as np
 from jaxtyping import Float32
 
-from avatar.kernels.kernel_compiler import FAST_MATH, NO_ALLOCATION, compile_kernel
+from avatar.kernels.kernel_compiler import (
+    FAST_MATH,
+    INLINED,
+    NO_ALLOCATION,
+    compile_kernel,
+)
 from avatar.kernels.numba_rendering import canonical_point
 from avatar.kernels.numba_skinning import (
     MATRIX_LANES,
@@ -96,7 +101,7 @@ def pose_seeds(transforms, low, nodes_per_m, seeds, posed, inverses, room):
         invert_rotation(blend, inverses[s])
 
 
-@compile_kernel(inline="always", **FAST_MATH)
+@compile_kernel(**INLINED)
 def _skin_distance(x, y, z, distance, low, cells_per_m):
     """Distance of a canonical point's cell from the skin; far outside the box."""
     a = I32(math.floor((x - low[0]) * cells_per_m[0]))
@@ -107,7 +112,7 @@ def _skin_distance(x, y, z, distance, low, cells_per_m):
     return distance[a, b, c] if inside else F32(1)
 
 
-@compile_kernel(inline="always", **FAST_MATH)
+@compile_kernel(**INLINED)
 def _is_known_root(chain, following, found, x, y, z):
     """True if a cell's chain holds a root near a point, or is full."""
     count = 0
@@ -120,7 +125,7 @@ def _is_known_root(chain, following, found, x, y, z):
     return count == MAX_ROOTS
 
 
-@compile_kernel(inline="always", **FAST_MATH)
+@compile_kernel(**INLINED)
 def _search_root(
     transforms, low, nodes_per_m, distance, cells_per_m, band_m, grid_low, cell_m,
     chains, following, cell_of, found, total, i, j, k, flat, x, inverse, p, blend,
@@ -270,7 +275,7 @@ CELL_SCALE_MARGIN = 1.001
 """Factor by which a cell is enlarged, so that samples on its walls are inside."""
 
 
-@compile_kernel(inline="always")
+@compile_kernel(**INLINED)
 def _cell_span(root, across, low, per_m, cells):
     """First and last canonical cell, on one axis, that a cell's image reaches."""
     first = I32(np.floor((root - across - low) * per_m))
@@ -278,7 +283,7 @@ def _cell_span(root, across, low, per_m, cells):
     return max(first, I32(0)), min(last, I32(cells - 1))
 
 
-@compile_kernel(inline="always")
+@compile_kernel(**INLINED)
 def _image_extent(roots, row, bent, half):
     """Bound of the extent of a cell's image about its root, along each canonical axis."""
     r = roots[row]
@@ -295,7 +300,7 @@ def _image_extent(roots, row, bent, half):
     return x, y, z
 
 
-@compile_kernel(inline="always")
+@compile_kernel(**INLINED)
 def _any_occupied(occupied, a0, a1, b0, b1, c0, c1):
     for a in range(a0, a1 + 1):
         for b in range(b0, b1 + 1):
@@ -346,13 +351,13 @@ def find_unreliable_roots(
                 packed = packed_cells[i, j, k]
                 if packed <= 0:
                     continue
-                row, bent = U32(packed >> 3), packed & 4
+                row, bent = U32(packed >> 3), packed & 4 != 0
                 for _ in range(packed & 3):
                     for corner in range(8):
                         dx = half if corner & 1 else -half
                         dy = half if corner & 2 else -half
                         dz = half if corner & 4 else -half
-                        x, y, z = canonical_point(roots, 0, row, bent, dx, dy, dz)
+                        x, y, z = canonical_point(roots, U32(0), row, bent, dx, dy, dz)
                         interpolate_at(transforms, low, nodes_per_m, x, y, z, MATRIX_LANES, room)
                         x, y, z = transform_point(room, x, y, z)
                         # LBS(x) - p, with p the corner

@@ -5,7 +5,11 @@ In torch and numpy the rays are fifty operations on small arrays, 1.5 core-ms a 
 
 import numpy as np
 
-from avatar.kernels.kernel_compiler import FAST_MATH, compile_kernel
+from avatar.kernels.kernel_compiler import (
+    FAST_MATH,
+    INLINED,
+    compile_kernel,
+)
 
 F32, I32 = np.float32, np.int32
 SIGHT_SPACING_PX = 8
@@ -13,7 +17,7 @@ SIGHT_SPACING_PX = 8
 rounding for a lens without distortion, to about 0.02 px for a strongly bent one."""
 
 
-@compile_kernel(inline="always", **FAST_MATH)
+@compile_kernel(**INLINED)
 def _sight(sights, picture, width, flat):
     """Unit direction of a pixel in its camera's axes, between the four kept ones about it."""
     row, column = flat // width, flat % width
@@ -36,7 +40,7 @@ def _sight(sights, picture, width, flat):
     return x * z, y * z, z
 
 
-@compile_kernel(inline="always")
+@compile_kernel(**INLINED)
 def _find_runs(runs, pixels, pictures, numbers, found):
     """The run that holds each ray's pixel: binary searches, a step of all rays at a time.
 
@@ -47,7 +51,8 @@ def _find_runs(runs, pixels, pictures, numbers, found):
         most = max(most, pixels[picture, 3])
     while 2 * step < most:
         step *= 2
-    found[:] = 0
+    for ray in range(pictures.shape[0]):
+        found[ray] = 0
     while step > 0:
         for ray in range(pictures.shape[0]):
             picture, run = pictures[ray], found[ray] + step

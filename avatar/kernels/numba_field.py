@@ -17,6 +17,7 @@ from numba import prange
 
 from avatar.kernels.kernel_compiler import (
     FAST_MATH,
+    INLINED,
     add4,
     compile_kernel,
     load4,
@@ -39,7 +40,7 @@ multiple of eight."""
 OUTPUTS = 4
 
 
-@compile_kernel(inline="always")
+@compile_kernel(**INLINED)
 def _hidden_units(features, first, number, weights, bias, hidden):
     """Writes relu(f W₁ + b₁) of rows from `first` on, four at a time, to the front of `hidden`."""
     for p in range(0, number, 4):
@@ -67,7 +68,7 @@ def _hidden_units(features, first, number, weights, bias, hidden):
             store8(hidden, p + 3, j + 8, where_positive8(b3, b3))
 
 
-@compile_kernel(inline="always")
+@compile_kernel(**INLINED)
 def _write_outputs(hidden, number, weights, bias, raw, first):
     """Writes h W₂ + b₂ to rows of `raw` from `first` on; `weights` are W₂ᵀ (4, hidden)."""
     for p in range(number):
@@ -80,6 +81,22 @@ def _write_outputs(hidden, number, weights, bias, raw, first):
             q3 = multiply_add8(h, load8(weights, 3, j), q3)
         raw[first + p, 0], raw[first + p, 1] = sum8(q0) + bias[0], sum8(q1) + bias[1]
         raw[first + p, 2], raw[first + p, 3] = sum8(q2) + bias[2], sum8(q3) + bias[3]
+
+
+@compile_kernel(**FAST_MATH)
+def _forward_block(
+    block, points, low, cells_per_m, counts, dense, offsets, table, weights, bias, output_weights,
+    output_bias, features, raw,
+):  # fmt: skip
+    """Writes features and raw outputs of one block of points."""
+    start = block * POINTS_PER_BLOCK
+    stop = min(start + POINTS_PER_BLOCK, points.shape[0])
+    encode_block(points, start, stop, low, cells_per_m, counts, dense, offsets, table, features)
+    hidden = np.empty((POINTS_PER_PASS, HIDDEN_WIDTH), F32)
+    for first in range(start, stop, POINTS_PER_PASS):
+        number = min(stop - first, POINTS_PER_PASS)
+        _hidden_units(features, first, number, weights, bias, hidden)
+        _write_outputs(hidden, number, output_weights, output_bias, raw, first)
 
 
 @compile_kernel(parallel=True, **FAST_MATH)
@@ -97,17 +114,13 @@ def forward(
             next multiple of four.
     """
     for block in prange((points.shape[0] + POINTS_PER_BLOCK - 1) // POINTS_PER_BLOCK):
-        start = block * POINTS_PER_BLOCK
-        stop = min(start + POINTS_PER_BLOCK, points.shape[0])
-        encode_block(points, start, stop, low, cells_per_m, counts, dense, offsets, table, features)
-        hidden = np.empty((POINTS_PER_PASS, HIDDEN_WIDTH), F32)
-        for first in range(start, stop, POINTS_PER_PASS):
-            number = min(stop - first, POINTS_PER_PASS)
-            _hidden_units(features, first, number, weights, bias, hidden)
-            _write_outputs(hidden, number, output_weights, output_bias, raw, first)
+        _forward_block(
+            np.int64(block), points, low, cells_per_m, counts, dense, offsets, table, weights,
+            bias, output_weights, output_bias, features, raw,
+        )  # fmt: skip
 
 
-@compile_kernel(inline="always")
+@compile_kernel(**INLINED)
 def _gather(features, rows, grad_raw, first, number, f, g):
     """Copies a pass's features and output gradients; the rows up to a multiple of 8 become zero."""
     for p in range(number):
@@ -116,11 +129,13 @@ def _gather(features, rows, grad_raw, first, number, f, g):
             store4(f, p, k, load4(features, row, k))
         store4(g, p, 0, load4(grad_raw, first + p, 0))
     for p in range(number, (number + 7) // 8 * 8):
-        f[p, :] = F32(0)
-        g[p, :] = F32(0)
+        for k in range(features.shape[1]):
+            f[p, k] = F32(0)
+        for k in range(OUTPUTS):
+            g[p, k] = F32(0)
 
 
-@compile_kernel(inline="always")
+@compile_kernel(**INLINED)
 def _hidden_gradients(hidden, g, number, output_weights, grad_hidden):
     """Writes (g_y W₂ᵀ) ⊙ [h > 0]."""
     for p in range(number):
@@ -133,7 +148,7 @@ def _hidden_gradients(hidden, g, number, output_weights, grad_hidden):
             store8(grad_hidden, p, j, where_positive8(load8(hidden, p, j), total))
 
 
-@compile_kernel(inline="always")
+@compile_kernel(**INLINED)
 def _feature_gradients(grad_hidden, number, transposed, out):
     """Writes g_h W₁ᵀ of eight points at a time; `transposed` is W₁ᵀ (hidden, width)."""
     for p in range(0, number, 8):
@@ -161,7 +176,7 @@ def _feature_gradients(grad_hidden, number, transposed, out):
             store8(out, p + 7, k, a7)
 
 
-@compile_kernel(inline="always")
+@compile_kernel(**INLINED)
 def _add_weight_gradients(f, grad_hidden, number, total):
     """Adds fᵀ g_h of a pass to `total` (width, hidden), four rows of it at a time."""
     for k in range(0, total.shape[0], 4):
@@ -190,7 +205,7 @@ def _add_weight_gradients(f, grad_hidden, number, total):
             store8(total, k + 3, j + 8, b3)
 
 
-@compile_kernel(inline="always")
+@compile_kernel(**INLINED)
 def _add_output_gradients(hidden, grad_hidden, g, number, total, bias_total):
     """Adds the gradients of W₂ᵀ to `total` (4, hidden), and of b₁ and b₂ to rows of the other."""
     for j in range(0, HIDDEN_WIDTH, 8):
@@ -216,6 +231,35 @@ def _add_output_gradients(hidden, grad_hidden, g, number, total, bias_total):
         store4(bias_total, 1, 0, add4(load4(bias_total, 1, 0), load4(g, p, 0)))
 
 
+@compile_kernel(**FAST_MATH)
+def _backward_of_thread(
+    thread, features, rows, grad_raw, weights, bias, output_weights, transposed, grad_features,
+    weight_sums, output_sums, bias_sums,
+):  # fmt: skip
+    """Adds up the gradients of one thread."""
+    threads, width = weight_sums.shape[0], features.shape[1]
+    f, g = np.empty((POINTS_PER_PASS, width), F32), np.empty((POINTS_PER_PASS, OUTPUTS), F32)
+    hidden = np.empty((POINTS_PER_PASS, HIDDEN_WIDTH), F32)
+    grad_hidden = np.empty((POINTS_PER_PASS, HIDDEN_WIDTH), F32)
+    grad_f = np.empty((POINTS_PER_PASS, transposed.shape[1]), F32)
+    weight_sum, output_sum = weight_sums[thread], output_sums[thread]
+    bias_sum = bias_sums[thread]
+    step = threads * POINTS_PER_PASS
+    for first in range(thread * POINTS_PER_PASS, rows.shape[0], step):
+        number = min(rows.shape[0] - first, POINTS_PER_PASS)
+        padded = (number + 7) // 8 * 8
+        _gather(features, rows, grad_raw, first, number, f, g)
+        _hidden_units(f, 0, padded, weights, bias, hidden)
+        _hidden_gradients(hidden, g, padded, output_weights, grad_hidden)
+        _feature_gradients(grad_hidden, padded, transposed, grad_f)
+        _add_weight_gradients(f, grad_hidden, padded, weight_sum)
+        if output_sum.shape[0] > 0:
+            _add_output_gradients(hidden, grad_hidden, g, padded, output_sum, bias_sum)
+        for p in range(number):
+            for k in range(0, width, 4):
+                store4(grad_features, first + p, k, load4(grad_f, p, k))
+
+
 @compile_kernel(parallel=True, **FAST_MATH)
 def backward(
     features, rows, grad_raw, weights, bias, output_weights, transposed,
@@ -234,25 +278,8 @@ def backward(
             4, hidden) and, of b₁ and of b₂, (threads, 2, hidden); zero before. Without rows, the
             gradients of a frozen network are left out.
     """
-    threads, width = weight_sums.shape[0], features.shape[1]
-    for thread in prange(threads):
-        f, g = np.empty((POINTS_PER_PASS, width), F32), np.empty((POINTS_PER_PASS, OUTPUTS), F32)
-        hidden = np.empty((POINTS_PER_PASS, HIDDEN_WIDTH), F32)
-        grad_hidden = np.empty((POINTS_PER_PASS, HIDDEN_WIDTH), F32)
-        grad_f = np.empty((POINTS_PER_PASS, transposed.shape[1]), F32)
-        weight_sum, output_sum = weight_sums[thread], output_sums[thread]
-        bias_sum = bias_sums[thread]
-        step = threads * POINTS_PER_PASS
-        for first in range(thread * POINTS_PER_PASS, rows.shape[0], step):
-            number = min(rows.shape[0] - first, POINTS_PER_PASS)
-            padded = (number + 7) // 8 * 8
-            _gather(features, rows, grad_raw, first, number, f, g)
-            _hidden_units(f, 0, padded, weights, bias, hidden)
-            _hidden_gradients(hidden, g, padded, output_weights, grad_hidden)
-            _feature_gradients(grad_hidden, padded, transposed, grad_f)
-            _add_weight_gradients(f, grad_hidden, padded, weight_sum)
-            if output_sum.shape[0] > 0:
-                _add_output_gradients(hidden, grad_hidden, g, padded, output_sum, bias_sum)
-            for p in range(number):
-                for k in range(0, width, 4):
-                    store4(grad_features, first + p, k, load4(grad_f, p, k))
+    for thread in prange(weight_sums.shape[0]):
+        _backward_of_thread(
+            np.int64(thread), features, rows, grad_raw, weights, bias, output_weights, transposed,
+            grad_features, weight_sums, output_sums, bias_sums,
+        )  # fmt: skip

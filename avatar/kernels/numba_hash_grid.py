@@ -11,6 +11,8 @@ from numba import get_num_threads, prange
 
 from avatar.kernels.kernel_compiler import (
     FAST_MATH,
+    INLINED,
+    INLINED_ALLOCATION,
     add4,
     compile_kernel,
     dot4,
@@ -27,7 +29,7 @@ F32, I32, U32 = np.float32, np.int32, np.uint32
 PRIME_Y, PRIME_Z = U32(PRIMES[1]), U32(PRIMES[2])
 
 
-@compile_kernel(inline="always")
+@compile_kernel(**INLINED)
 def _box_coordinates(points, start, stop, low, places):
     """Offsets of a block's points from the box's corner, metres."""
     for i in range(stop - start):
@@ -35,7 +37,7 @@ def _box_coordinates(points, start, stop, low, places):
             places[axis, i] = points[start + i, axis] - low[axis]
 
 
-@compile_kernel(inline="always")
+@compile_kernel(**INLINED)
 def _box_coordinates_of_rows(points, rows, start, stop, low, places):
     """Offsets of the points in a block of `rows` from the box's corner, metres."""
     for i in range(stop - start):
@@ -44,7 +46,7 @@ def _box_coordinates_of_rows(points, rows, start, stop, low, places):
             places[axis, i] = points[row, axis] - low[axis]
 
 
-@compile_kernel(inline="always")
+@compile_kernel(**INLINED)
 def _locate_cells(places, number, scale, counts, cells, within):
     """The cell of each place on one level, and the place's offset in it, in cells."""
     for axis in range(3):
@@ -56,7 +58,7 @@ def _locate_cells(places, number, scale, counts, cells, within):
             within[axis, i] = place - F32(cell)
 
 
-@compile_kernel(inline="always")
+@compile_kernel(**INLINED)
 def _corner_entries(cells, number, counts, dense, first, size, entries):
     """Entries of the corners of each cell, x fastest."""
     if dense == 1:
@@ -81,7 +83,7 @@ def _corner_entries(cells, number, counts, dense, first, size, entries):
             entries[6, i], entries[7, i] = first + ((x0 ^ d) & mask), first + ((x1 ^ d) & mask)
 
 
-@compile_kernel(inline="always")
+@compile_kernel(**INLINED)
 def _trilinear_weights(within, number, weights):
     for i in range(number):
         x, y, z = within[0, i], within[1, i], within[2, i]
@@ -91,7 +93,7 @@ def _trilinear_weights(within, number, weights):
         weights[4, i], weights[5, i], weights[6, i], weights[7, i] = a * z, b * z, c * z, d * z
 
 
-@compile_kernel(inline="always")
+@compile_kernel(**INLINED_ALLOCATION)
 def encode_block(points, start, stop, low, cells_per_m, counts, dense, offsets, table, features):
     """Features of the points from `start` to `stop`, at most `POINTS_PER_BLOCK`, as `encode`."""
     number = stop - start
@@ -121,31 +123,43 @@ def encode(points, low, cells_per_m, counts, dense, offsets, table, features):
         encode_block(points, start, stop, low, cells_per_m, counts, dense, offsets, table, features)
 
 
+@compile_kernel(**FAST_MATH)
+def _add_level_gradients(
+    thread, points, rows, low, cells_per_m, counts, dense, offsets, grad_features, grad_table,
+    threads,
+):  # fmt: skip
+    """Adds the gradients of the levels of one thread."""
+    places, within = np.empty((3, POINTS_PER_BLOCK), F32), np.empty((3, POINTS_PER_BLOCK), F32)
+    cells = np.empty((3, POINTS_PER_BLOCK), I32)
+    entries, weights = (
+        np.empty((8, POINTS_PER_BLOCK), I32),
+        np.empty((8, POINTS_PER_BLOCK), F32),
+    )
+    for start in range(0, rows.shape[0], POINTS_PER_BLOCK):
+        number = min(rows.shape[0] - start, POINTS_PER_BLOCK)
+        _box_coordinates_of_rows(points, rows, start, start + number, low, places)
+        for level in range(thread, cells_per_m.shape[0], threads):
+            first, size = offsets[level], offsets[level + 1] - offsets[level]
+            _locate_cells(places, number, cells_per_m[level], counts[level], cells, within)
+            _corner_entries(cells, number, counts[level], dense[level], first, size, entries)
+            _trilinear_weights(within, number, weights)
+            for i in range(number):
+                grad = load4(grad_features, start + i, level * FEATURES_PER_LEVEL)
+                for corner in range(8):
+                    entry = entries[corner, i]
+                    added = scale4(weights[corner, i], grad)
+                    store4(grad_table, entry, 0, add4(load4(grad_table, entry, 0), added))
+
+
 @compile_kernel(parallel=True, **FAST_MATH)
 def _encode_backward(
     points, rows, low, cells_per_m, counts, dense, offsets, grad_features, grad_table, threads
 ):
     for thread in prange(threads):
-        places, within = np.empty((3, POINTS_PER_BLOCK), F32), np.empty((3, POINTS_PER_BLOCK), F32)
-        cells = np.empty((3, POINTS_PER_BLOCK), I32)
-        entries, weights = (
-            np.empty((8, POINTS_PER_BLOCK), I32),
-            np.empty((8, POINTS_PER_BLOCK), F32),
-        )
-        for start in range(0, rows.shape[0], POINTS_PER_BLOCK):
-            number = min(rows.shape[0] - start, POINTS_PER_BLOCK)
-            _box_coordinates_of_rows(points, rows, start, start + number, low, places)
-            for level in range(thread, cells_per_m.shape[0], threads):
-                first, size = offsets[level], offsets[level + 1] - offsets[level]
-                _locate_cells(places, number, cells_per_m[level], counts[level], cells, within)
-                _corner_entries(cells, number, counts[level], dense[level], first, size, entries)
-                _trilinear_weights(within, number, weights)
-                for i in range(number):
-                    grad = load4(grad_features, start + i, level * FEATURES_PER_LEVEL)
-                    for corner in range(8):
-                        entry = entries[corner, i]
-                        added = scale4(weights[corner, i], grad)
-                        store4(grad_table, entry, 0, add4(load4(grad_table, entry, 0), added))
+        _add_level_gradients(
+            np.int64(thread), points, rows, low, cells_per_m, counts, dense, offsets,
+            grad_features, grad_table, threads,
+        )  # fmt: skip
 
 
 def encode_backward(
@@ -158,7 +172,7 @@ def encode_backward(
     )  # fmt: skip
 
 
-@compile_kernel(inline="always")
+@compile_kernel(**INLINED)
 def _add_point_gradient(within, corner_gradients, number, scale, total):
     """Adds one level's gradient, from what pulls at the corners of each cell."""
     for i in range(number):
@@ -188,6 +202,33 @@ def _add_point_gradient(within, corner_gradients, number, scale, total):
         )
 
 
+@compile_kernel(**FAST_MATH)
+def _point_gradients_of_block(
+    block, points, rows, low, cells_per_m, counts, dense, offsets, table, grad_features, factor,
+    grad_points,
+):  # fmt: skip
+    """Writes the gradients of one block of points."""
+    start = block * POINTS_PER_BLOCK
+    number = min(rows.shape[0] - start, POINTS_PER_BLOCK)
+    places, within = np.empty((3, POINTS_PER_BLOCK), F32), np.empty((3, POINTS_PER_BLOCK), F32)
+    cells, entries = np.empty((3, POINTS_PER_BLOCK), I32), np.empty((8, POINTS_PER_BLOCK), I32)
+    pulls, total = np.empty((8, POINTS_PER_BLOCK), F32), np.zeros((3, POINTS_PER_BLOCK), F32)
+    _box_coordinates_of_rows(points, rows, start, start + number, low, places)
+    for level in range(cells_per_m.shape[0]):
+        first, size = offsets[level], offsets[level + 1] - offsets[level]
+        _locate_cells(places, number, cells_per_m[level], counts[level], cells, within)
+        _corner_entries(cells, number, counts[level], dense[level], first, size, entries)
+        for i in range(number):
+            grad = load4(grad_features, start + i, level * FEATURES_PER_LEVEL)
+            for corner in range(8):
+                pulls[corner, i] = dot4(load4(table, entries[corner, i], 0), grad)
+        _add_point_gradient(within, pulls, number, cells_per_m[level], total)
+    for i in range(number):
+        row = rows[start + i]
+        for axis in range(3):
+            grad_points[row, axis] = factor * total[axis, i]
+
+
 @compile_kernel(parallel=True, **FAST_MATH)
 def encode_points_backward(
     points, rows, low, cells_per_m, counts, dense, offsets, table, grad_features, factor,
@@ -198,28 +239,13 @@ def encode_points_backward(
     `grad_features` has the features of these points, and may have more levels than `cells_per_m`.
     """
     for block in prange((rows.shape[0] + POINTS_PER_BLOCK - 1) // POINTS_PER_BLOCK):
-        start = block * POINTS_PER_BLOCK
-        number = min(rows.shape[0] - start, POINTS_PER_BLOCK)
-        places, within = np.empty((3, POINTS_PER_BLOCK), F32), np.empty((3, POINTS_PER_BLOCK), F32)
-        cells, entries = np.empty((3, POINTS_PER_BLOCK), I32), np.empty((8, POINTS_PER_BLOCK), I32)
-        pulls, total = np.empty((8, POINTS_PER_BLOCK), F32), np.zeros((3, POINTS_PER_BLOCK), F32)
-        _box_coordinates_of_rows(points, rows, start, start + number, low, places)
-        for level in range(cells_per_m.shape[0]):
-            first, size = offsets[level], offsets[level + 1] - offsets[level]
-            _locate_cells(places, number, cells_per_m[level], counts[level], cells, within)
-            _corner_entries(cells, number, counts[level], dense[level], first, size, entries)
-            for i in range(number):
-                grad = load4(grad_features, start + i, level * FEATURES_PER_LEVEL)
-                for corner in range(8):
-                    pulls[corner, i] = dot4(load4(table, entries[corner, i], 0), grad)
-            _add_point_gradient(within, pulls, number, cells_per_m[level], total)
-        for i in range(number):
-            row = rows[start + i]
-            for axis in range(3):
-                grad_points[row, axis] = factor * total[axis, i]
+        _point_gradients_of_block(
+            np.int64(block), points, rows, low, cells_per_m, counts, dense, offsets, table,
+            grad_features, factor, grad_points,
+        )  # fmt: skip
 
 
-@compile_kernel(inline="always", **FAST_MATH)
+@compile_kernel(**INLINED)
 def _adam_block(g, m, v, p, rate, new_share, new_square_share, scale, eps):
     for i in range(p.shape[0]):
         here = g[i]

@@ -16,6 +16,7 @@ from numba import prange
 
 from avatar.kernels.kernel_compiler import (
     FAST_MATH,
+    INLINED,
     add4,
     compile_kernel,
     load4,
@@ -34,13 +35,15 @@ MIN_PULL_SHARE = 1e-3
 """Pull on a sample, as a share of its ray's strongest, up to which it is left out."""
 PADDED = 80
 """Length of a row of 75 numbers that is a multiple of a register's; the last five are zero."""
+RAYS_PER_BLOCK = 16
+"""Rays that one call works on."""
 JOINTS = 24
 MIN_RIDGE = 1e-6
 """Least stiffness, as a share of the largest curvature. Below, where one ray outweighs all others,
 sums in single precision are not positive definite."""
 
 
-@compile_kernel(inline="always", **FAST_MATH)
+@compile_kernel(**INLINED)
 def _weights_at(weights, shape, low, nodes_per_m, x, y, z, out):
     """Trilinear weights of a point, four bones at once, in the first row of `out` (rows, 24).
 
@@ -69,23 +72,15 @@ def _weights_at(weights, shape, low, nodes_per_m, x, y, z, out):
         store4(out, 0, q, add4(near, far))
 
 
-@compile_kernel(parallel=True, **FAST_MATH)
-def bone_wrenches(
-    points, grad_points, rows, first, count, slots, cell_roots,
-    weights, shape, low, nodes_per_m, bones, out,
+@compile_kernel(**FAST_MATH)
+def _wrenches_of_block(
+    block, points, grad_points, rows, first, count, slots, cell_roots, weights, shape, low,
+    nodes_per_m, bones, out,
 ):  # fmt: skip
-    """Adds up what each ray's samples exert on the bones that move them.
-
-    Args:
-        points, grad_points: Canonical samples and what pulls them.
-        rows: Root of `cell_roots[slot]` that each sample was warped with.
-        first, count, slots: Each ray's samples and its frame's slot.
-        cell_roots: Roots and inverse Jacobians (slots, roots, 12).
-        bones: Body-from-canonical matrices (slots, 24, 12).
-        out: (rays, 24, 6), zero before: force then moment about the body frame's origin.
-    """
-    for ray in prange(first.shape[0]):
-        share, slot = np.empty((1, 24), F32), slots[ray]
+    """Adds up what the rays of one block exert."""
+    share, first_ray = np.empty((1, 24), F32), block * RAYS_PER_BLOCK
+    for ray in range(first_ray, min(first_ray + RAYS_PER_BLOCK, first.shape[0])):
+        slot = slots[ray]
         strongest = F32(0)
         for i in range(first[ray], first[ray] + count[ray]):
             a, b, c = grad_points[i, 0], grad_points[i, 1], grad_points[i, 2]
@@ -123,7 +118,29 @@ def bone_wrenches(
                 out[ray, joint, 5] += w * (px * fy - py * fx)
 
 
-@compile_kernel(inline="always", **FAST_MATH)
+@compile_kernel(parallel=True, **FAST_MATH)
+def bone_wrenches(
+    points, grad_points, rows, first, count, slots, cell_roots,
+    weights, shape, low, nodes_per_m, bones, out,
+):  # fmt: skip
+    """Adds up what each ray's samples exert on the bones that move them.
+
+    Args:
+        points, grad_points: Canonical samples and what pulls them.
+        rows: Root of `cell_roots[slot]` that each sample was warped with.
+        first, count, slots: Each ray's samples and its frame's slot.
+        cell_roots: Roots and inverse Jacobians (slots, roots, 12).
+        bones: Body-from-canonical matrices (slots, 24, 12).
+        out: (rays, 24, 6), zero before: force then moment about the body frame's origin.
+    """
+    for block in prange((first.shape[0] + RAYS_PER_BLOCK - 1) // RAYS_PER_BLOCK):
+        _wrenches_of_block(
+            np.int64(block), points, grad_points, rows, first, count, slots, cell_roots, weights,
+            shape, low, nodes_per_m, bones, out,
+        )  # fmt: skip
+
+
+@compile_kernel(**INLINED)
 def _prefetch_weights(weights, shape, low, nodes_per_m, roots, row):
     """Has the cache fetch the weights about a root, as `_weights_at` will read them."""
     a = min(max((roots[row, 0] - low[0]) * nodes_per_m[0], F32(0)), F32(shape[0]) - F32(1.001))
@@ -136,6 +153,54 @@ def _prefetch_weights(weights, shape, low, nodes_per_m, roots, row):
             prefetch(weights, pair, q)
 
 
+@compile_kernel(**FAST_MATH)
+def _update_slab(
+    i, packed_cells, cells, grid_low, cell_m, roots, weights, shape, low, nodes_per_m, bones,
+):  # fmt: skip
+    """Moves the roots of one slab of cells."""
+    room, last = np.empty((2, 24), F32), cells[0] * cells[1] * cells[2] - 1
+    for j in range(cells[1]):
+        for k in range(cells[2]):
+            cell = (i * cells[1] + j) * cells[2] + k
+            packed, later = packed_cells[cell], packed_cells[min(cell + ROOTS_AHEAD, last)]
+            if later > 0:
+                _prefetch_weights(weights, shape, low, nodes_per_m, roots, later >> 3)
+            later = packed_cells[min(cell + 2 * ROOTS_AHEAD, last)]
+            if later > 0:
+                prefetch(roots, later >> 3, 0)
+            if packed <= 0:
+                continue
+            rows = 3 if packed & 4 else 1
+            for candidate in range(packed & 3):
+                n = (packed >> 3) + candidate * rows
+                x, y, z = roots[n, 0], roots[n, 1], roots[n, 2]
+                _weights_at(weights, shape, low, nodes_per_m, x, y, z, room)
+                one, two, three = load4(bones, 0, 0), load4(bones, 0, 4), load4(bones, 0, 8)
+                w = room[0, 0]
+                one, two, three = scale4(w, one), scale4(w, two), scale4(w, three)
+                for joint in range(1, 24):
+                    w = room[0, joint]
+                    if w > F32(0):
+                        one = add4(one, scale4(w, load4(bones, joint, 0)))
+                        two = add4(two, scale4(w, load4(bones, joint, 4)))
+                        three = add4(three, scale4(w, load4(bones, joint, 8)))
+                store4(room, 1, 0, one)
+                store4(room, 1, 4, two)
+                store4(room, 1, 8, three)
+                sx, sy, sz = transform_point(room[1], x, y, z)
+                # chord step: x ← x + A e, with e = center - LBS(x)
+                ex = grid_low[0] + (F32(i) + F32(0.5)) * cell_m - sx
+                ey = grid_low[1] + (F32(j) + F32(0.5)) * cell_m - sy
+                ez = grid_low[2] + (F32(k) + F32(0.5)) * cell_m - sz
+                dx = roots[n, 3] * ex + roots[n, 4] * ey + roots[n, 5] * ez
+                dy = roots[n, 6] * ex + roots[n, 7] * ey + roots[n, 8] * ez
+                dz = roots[n, 9] * ex + roots[n, 10] * ey + roots[n, 11] * ez
+                if dx * dx + dy * dy + dz * dz <= F32(MAX_ROOT_STEP_M**2):
+                    roots[n, 0] = x + dx
+                    roots[n, 1] = y + dy
+                    roots[n, 2] = z + dz
+
+
 @compile_kernel(parallel=True, **FAST_MATH)
 def update_roots(
     packed_cells, cells, grid_low, cell_m, roots, weights, shape, low, nodes_per_m, bones
@@ -146,47 +211,63 @@ def update_roots(
     and second-order terms stay. `bones` are the new pose's matrices (24, 12).
     """
     for i in prange(cells[0]):
-        room, last = np.empty((2, 24), F32), cells[0] * cells[1] * cells[2] - 1
-        for j in range(cells[1]):
-            for k in range(cells[2]):
-                cell = (i * cells[1] + j) * cells[2] + k
-                packed, later = packed_cells[cell], packed_cells[min(cell + ROOTS_AHEAD, last)]
-                if later > 0:
-                    _prefetch_weights(weights, shape, low, nodes_per_m, roots, later >> 3)
-                later = packed_cells[min(cell + 2 * ROOTS_AHEAD, last)]
-                if later > 0:
-                    prefetch(roots, later >> 3, 0)
-                if packed <= 0:
-                    continue
-                rows = 3 if packed & 4 else 1
-                for candidate in range(packed & 3):
-                    n = (packed >> 3) + candidate * rows
-                    x, y, z = roots[n, 0], roots[n, 1], roots[n, 2]
-                    _weights_at(weights, shape, low, nodes_per_m, x, y, z, room)
-                    one, two, three = load4(bones, 0, 0), load4(bones, 0, 4), load4(bones, 0, 8)
-                    w = room[0, 0]
-                    one, two, three = scale4(w, one), scale4(w, two), scale4(w, three)
-                    for joint in range(1, 24):
-                        w = room[0, joint]
-                        if w > F32(0):
-                            one = add4(one, scale4(w, load4(bones, joint, 0)))
-                            two = add4(two, scale4(w, load4(bones, joint, 4)))
-                            three = add4(three, scale4(w, load4(bones, joint, 8)))
-                    store4(room, 1, 0, one)
-                    store4(room, 1, 4, two)
-                    store4(room, 1, 8, three)
-                    sx, sy, sz = transform_point(room[1], x, y, z)
-                    # chord step: x ← x + A e, with e = center - LBS(x)
-                    ex = grid_low[0] + (F32(i) + F32(0.5)) * cell_m - sx
-                    ey = grid_low[1] + (F32(j) + F32(0.5)) * cell_m - sy
-                    ez = grid_low[2] + (F32(k) + F32(0.5)) * cell_m - sz
-                    dx = roots[n, 3] * ex + roots[n, 4] * ey + roots[n, 5] * ez
-                    dy = roots[n, 6] * ex + roots[n, 7] * ey + roots[n, 8] * ez
-                    dz = roots[n, 9] * ex + roots[n, 10] * ey + roots[n, 11] * ez
-                    if dx * dx + dy * dy + dz * dz <= F32(MAX_ROOT_STEP_M**2):
-                        roots[n, 0] = x + dx
-                        roots[n, 1] = y + dy
-                        roots[n, 2] = z + dz
+        _update_slab(
+            np.int64(i), packed_cells, cells, grid_low, cell_m, roots, weights, shape, low,
+            nodes_per_m, bones,
+        )  # fmt: skip
+
+
+@compile_kernel(**FAST_MATH)
+def _add_rays_of_thread(
+    thread, slots, wrenches, loss, min_loss, scale, room, parents, turns, places, root_turns,
+    counts, gradients, curvatures, moments, powers, threads,
+):  # fmt: skip
+    """Adds the rays of the slots of one thread."""
+    total, g = np.empty((JOINTS, 6), F32), np.zeros(PADDED, F32)
+    for ray in range(slots.shape[0]):
+        slot = slots[ray]
+        if slot % threads != thread or counts[slot] >= room[slot]:
+            continue
+        counts[slot] += 1
+        for joint in range(JOINTS):
+            for q in range(6):
+                total[joint, q] = wrenches[ray, joint, q]
+        # the wrench of the whole branch below each joint
+        for joint in range(JOINTS - 1, 0, -1):
+            for q in range(6):
+                total[parents[joint], q] += total[joint, q]
+        for joint in range(JOINTS):
+            x, y, z = places[slot, joint, 0], places[slot, joint, 1], places[slot, joint, 2]
+            fx, fy, fz = total[joint, 0], total[joint, 1], total[joint, 2]
+            # u = c × F - M, and its derivative by the correction, σ Rᵀ u
+            ux = y * fz - z * fy - total[joint, 3]
+            uy = z * fx - x * fz - total[joint, 4]
+            uz = x * fy - y * fx - total[joint, 5]
+            for a in range(3):
+                g[3 * joint + a] = F32(scale[0]) * (
+                    turns[slot, joint, 0, a] * ux
+                    + turns[slot, joint, 1, a] * uy
+                    + turns[slot, joint, 2, a] * uz
+                )
+        # the shift moves the whole body: -σ R F, with R the root's correction
+        for a in range(3):
+            g[72 + a] = -F32(scale[1]) * (
+                root_turns[slot, a, 0] * total[0, 0]
+                + root_turns[slot, a, 1] * total[0, 1]
+                + root_turns[slot, a, 2] * total[0, 2]
+            )
+        weight, power = F32(0.5) / (max(loss[ray], F32(0)) + F32(min_loss)), F32(0)
+        for i in range(75):
+            power += g[i] * g[i]
+            gradients[slot, i] += g[i]
+            weighted = weight * g[i]
+            for k in range(PADDED):
+                curvatures[slot, i, k] += weighted * g[k]
+            if moments.shape[0] > 0:
+                for k in range(PADDED):
+                    moments[slot, i, k] += g[i] * g[k]
+        powers[slot, 0] += power
+        powers[slot, 1] += weight * power
 
 
 @compile_kernel(parallel=True, **FAST_MATH)
@@ -217,49 +298,10 @@ def add_rays(
         powers: Sums of |∇ℓ|² and of |∇ℓ|² / 2ℓ (slots, 2).
     """
     for thread in prange(threads):
-        total, g = np.empty((JOINTS, 6), F32), np.zeros(PADDED, F32)
-        for ray in range(slots.shape[0]):
-            slot = slots[ray]
-            if slot % threads != thread or counts[slot] >= room[slot]:
-                continue
-            counts[slot] += 1
-            total[:] = wrenches[ray]
-            # the wrench of the whole branch below each joint
-            for joint in range(JOINTS - 1, 0, -1):
-                for q in range(6):
-                    total[parents[joint], q] += total[joint, q]
-            for joint in range(JOINTS):
-                x, y, z = places[slot, joint, 0], places[slot, joint, 1], places[slot, joint, 2]
-                fx, fy, fz = total[joint, 0], total[joint, 1], total[joint, 2]
-                # u = c × F - M, and its derivative by the correction, σ Rᵀ u
-                ux = y * fz - z * fy - total[joint, 3]
-                uy = z * fx - x * fz - total[joint, 4]
-                uz = x * fy - y * fx - total[joint, 5]
-                for a in range(3):
-                    g[3 * joint + a] = F32(scale[0]) * (
-                        turns[slot, joint, 0, a] * ux
-                        + turns[slot, joint, 1, a] * uy
-                        + turns[slot, joint, 2, a] * uz
-                    )
-            # the shift moves the whole body: -σ R F, with R the root's correction
-            for a in range(3):
-                g[72 + a] = -F32(scale[1]) * (
-                    root_turns[slot, a, 0] * total[0, 0]
-                    + root_turns[slot, a, 1] * total[0, 1]
-                    + root_turns[slot, a, 2] * total[0, 2]
-                )
-            weight, power = F32(0.5) / (max(loss[ray], F32(0)) + F32(min_loss)), F32(0)
-            for i in range(75):
-                power += g[i] * g[i]
-                gradients[slot, i] += g[i]
-                weighted = weight * g[i]
-                for k in range(PADDED):
-                    curvatures[slot, i, k] += weighted * g[k]
-                if moments.shape[0] > 0:
-                    for k in range(PADDED):
-                        moments[slot, i, k] += g[i] * g[k]
-            powers[slot, 0] += power
-            powers[slot, 1] += weight * power
+        _add_rays_of_thread(
+            np.int64(thread), slots, wrenches, loss, min_loss, scale, room, parents, turns,
+            places, root_turns, counts, gradients, curvatures, moments, powers, threads,
+        )  # fmt: skip
 
 
 @compile_kernel(**FAST_MATH)

@@ -6,7 +6,11 @@ second thread cannot share.
 
 import numpy as np
 
-from avatar.kernels.kernel_compiler import FAST_MATH, compile_kernel
+from avatar.kernels.kernel_compiler import (
+    FAST_MATH,
+    INLINED,
+    compile_kernel,
+)
 from avatar.kernels.operands import MAX_LOG_DENSITY
 
 F32 = np.float32
@@ -14,7 +18,7 @@ OPACITY_LENGTH_M = 0.01
 """Length over which opacity is measured, metres."""
 
 
-@compile_kernel(inline="always", **FAST_MATH)
+@compile_kernel(**INLINED)
 def _opacity(log_density):
     """Opacity of one centimetre, α = 1 - exp(-σ · 1 cm), and dα / d log σ."""
     optical = np.exp(min(log_density, F32(MAX_LOG_DENSITY))) * F32(OPACITY_LENGTH_M)
@@ -22,12 +26,12 @@ def _opacity(log_density):
     return F32(1) - through, optical * through
 
 
-@compile_kernel(inline="always", **FAST_MATH)
+@compile_kernel(**INLINED)
 def _sign(x):
     return F32(x > F32(0)) - F32(x < F32(0))
 
 
-@compile_kernel(inline="always", **FAST_MATH)
+@compile_kernel(**INLINED)
 def _sigmoid(x):
     return F32(1) / (F32(1) + np.exp(-x))
 

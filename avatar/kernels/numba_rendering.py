@@ -5,7 +5,13 @@ import math
 import numpy as np
 from numba import prange
 
-from avatar.kernels.kernel_compiler import FAST_MATH, NO_ALLOCATION, compile_kernel, prefetch
+from avatar.kernels.kernel_compiler import (
+    FAST_MATH,
+    INLINED,
+    NO_ALLOCATION,
+    compile_kernel,
+    prefetch,
+)
 from avatar.kernels.operands import MAX_LOG_DENSITY
 
 F32, I32, U32 = np.float32, np.int32, np.uint32
@@ -23,19 +29,19 @@ RAYS_PER_BLOCK = 16
 """Training rays whose cells are fetched before any of them is marched; they fit the first cache."""
 
 
-@compile_kernel(inline="always")
+@compile_kernel(**INLINED)
 def nonzero(x):
     """A ray direction's component, kept away from zero so that it can be divided by."""
     return x if abs(x) > F32(1e-7) else F32(1e-7)
 
 
-@compile_kernel(inline="always", **FAST_MATH)
+@compile_kernel(**INLINED)
 def cell_index_at(g, count):
     """Cell along one axis of a position, in cells, that is inside except for rounding."""
     return U32(min(max(I32(g), I32(0)), count - I32(1)))
 
 
-@compile_kernel(inline="always", **FAST_MATH)
+@compile_kernel(**INLINED)
 def _second_order_term(roots, slot, row, x, y, z):
     """Second-order term Σ c_ij d_i d_j of a bent cell at (x, y, z) from its center."""
     a, b = row + U32(1), row + U32(2)
@@ -50,7 +56,7 @@ def _second_order_term(roots, slot, row, x, y, z):
     )  # fmt: skip
 
 
-@compile_kernel(inline="always", **FAST_MATH)
+@compile_kernel(**INLINED)
 def canonical_point(roots, slot, row, bent, x, y, z):
     """The canonical point of the offset (x, y, z) from the center of a cell with a root."""
     u = roots[slot, row, U32(0)] + (
@@ -68,7 +74,7 @@ def canonical_point(roots, slot, row, bent, x, y, z):
     return u, v, w
 
 
-@compile_kernel(inline="always", **FAST_MATH)
+@compile_kernel(**INLINED)
 def _cached_density(occupied, density, low, cells_per_m, x, y, z, needs_density):
     """Cached density of the canonical cell of a point, 1/m; -1 in empty cells.
 
@@ -84,7 +90,7 @@ def _cached_density(occupied, density, low, cells_per_m, x, y, z, needs_density)
     return density[a, b, c] if needs_density else F32(0)
 
 
-@compile_kernel(inline="always", **FAST_MATH)
+@compile_kernel(**INLINED)
 def _enter_grid(origins, directions, ray, low, shape, slot, cell_m):
     """A ray in the cells of its slot's grid: `g = o + t d` is in cells, t in metres.
 
@@ -109,7 +115,7 @@ def _enter_grid(origins, directions, ray, low, shape, slot, cell_m):
     )  # fmt: skip
 
 
-@compile_kernel(inline="always", **FAST_MATH)
+@compile_kernel(**INLINED)
 def _fetch_cells(
     origins, directions, ray, slots, low, shape, cell_m, cell_index, cell_roots, roots
 ):
@@ -186,7 +192,7 @@ def _march_block(
             ex = (gx - (F32(i) + F32(0.5))) * cell_m
             ey = (gy - (F32(j) + F32(0.5))) * cell_m
             ez = (gz - (F32(k) + F32(0.5))) * cell_m
-            chosen, bent = U32(packed >> 3), packed & 4
+            chosen, bent = U32(packed >> 3), packed & 4 != 0
             px, py, pz = canonical_point(cell_roots, slot, chosen, False, ex, ey, ez)
             fx, fy, fz = ex + dx * a_step, ey + dy * a_step, ez + dz * a_step
             ux, uy, uz = canonical_point(cell_roots, slot, chosen, False, fx, fy, fz)
@@ -235,7 +241,7 @@ def march(
     """
     for block in prange((origins.shape[0] + RAYS_PER_BLOCK - 1) // RAYS_PER_BLOCK):
         _march_block(
-            I32(block), origins, directions, slots, jitter, sample_step_m,
+            np.int64(block), origins, directions, slots, jitter, sample_step_m,
             cell_index, cell_roots, cell_low, cell_shape, cell_m,
             occupied, density, low, cells_per_m, opaque_margin_steps,
             points, rows, counts, next_steps,
@@ -276,37 +282,43 @@ def scatter_max_density(points, log_density, low, cells_per_m, density):
                 density[a, b, c] = here
 
 
-@compile_kernel(inline="always")
+@compile_kernel(**INLINED)
 def _sigmoid(x):
     return F32(1) / (F32(1) + np.exp(-x))
+
+
+@compile_kernel(**NO_ALLOCATION)
+def _composite_ray(ray, raw, offsets, counts, sample_step_m, rendered):
+    """One ray's color and alpha."""
+    through = F32(1)
+    red, green, blue = F32(0), F32(0), F32(0)
+    # 1 - α = exp(-σ Δ); a sample weighs T α, and leaves T (1 - α)
+    for i in range(offsets[ray], offsets[ray] + counts[ray]):
+        kept = np.exp(-np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * sample_step_m)
+        weight = through * (F32(1) - kept)
+        through *= kept
+        red += weight * _sigmoid(raw[i, 0])
+        green += weight * _sigmoid(raw[i, 1])
+        blue += weight * _sigmoid(raw[i, 2])
+    rendered[ray, 0] = red
+    rendered[ray, 1] = green
+    rendered[ray, 2] = blue
+    rendered[ray, 3] = F32(1) - through
 
 
 @compile_kernel(parallel=True, **FAST_MATH)
 def composite(raw, offsets, counts, sample_step_m, rendered):
     """Premultiplied color and alpha of each ray from its samples, front to back."""
     for ray in prange(offsets.shape[0]):
-        through = F32(1)
-        red, green, blue = F32(0), F32(0), F32(0)
-        # 1 - α = exp(-σ Δ); a sample weighs T α, and leaves T (1 - α)
-        for i in range(offsets[ray], offsets[ray] + counts[ray]):
-            kept = np.exp(-np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * sample_step_m)
-            weight = through * (F32(1) - kept)
-            through *= kept
-            red += weight * _sigmoid(raw[i, 0])
-            green += weight * _sigmoid(raw[i, 1])
-            blue += weight * _sigmoid(raw[i, 2])
-        rendered[ray, 0] = red
-        rendered[ray, 1] = green
-        rendered[ray, 2] = blue
-        rendered[ray, 3] = F32(1) - through
+        _composite_ray(np.int64(ray), raw, offsets, counts, sample_step_m, rendered)
 
 
-@compile_kernel(inline="always")
+@compile_kernel(**INLINED)
 def _half_huber_slope(error):
     return max(F32(-0.5), min(F32(0.5), error * F32(0.5 / COLOR_HUBER_DELTA)))
 
 
-@compile_kernel()
+@compile_kernel(**INLINED)
 def _mean_huber(error, excess_alpha):
     """Mean loss of a channel over both backgrounds; its derivatives by color and by alpha."""
     dark, bright = F32(DARK_GRAY), F32(BRIGHT_GRAY)
@@ -315,6 +327,65 @@ def _mean_huber(error, excess_alpha):
     # half of Huber's loss of e is p e - δ p², with p its slope, so that their sum is the mean
     loss = p * on_dark + q * on_bright - F32(COLOR_HUBER_DELTA) * (p * p + q * q)
     return loss, p + q, -(p * dark + q * bright)
+
+
+@compile_kernel(**NO_ALLOCATION)
+def _composite_ray_loss(
+    ray, raw, offsets, counts, sample_step_m, target, alpha_weight, hard_surface_weight, rendered,
+    loss, grad_raw,
+):  # fmt: skip
+    """One ray's composite, loss and gradient."""
+    share = F32(1) / F32(offsets.shape[0])
+    start, stop = offsets[ray], offsets[ray] + counts[ray]
+    through = F32(1)
+    red, green, blue = F32(0), F32(0), F32(0)
+    for i in range(start, stop):
+        kept = np.exp(-np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * sample_step_m)
+        weight = through * (F32(1) - kept)
+        through *= kept
+        q0, q1, q2 = _sigmoid(raw[i, 0]), _sigmoid(raw[i, 1]), _sigmoid(raw[i, 2])
+        grad_raw[i, 0] = q0
+        grad_raw[i, 1] = q1
+        grad_raw[i, 2] = q2
+        grad_raw[i, 3] = through
+        red += weight * q0
+        green += weight * q1
+        blue += weight * q2
+    alpha = F32(1) - through
+    rendered[ray, 0] = red
+    rendered[ray, 1] = green
+    rendered[ray, 2] = blue
+    rendered[ray, 3] = alpha
+
+    off = alpha - target[ray, 3]
+    e0, g0, a0 = _mean_huber(red - target[ray, 0], off)
+    e1, g1, a1 = _mean_huber(green - target[ray, 1], off)
+    e2, g2, a2 = _mean_huber(blue - target[ray, 2], off)
+    g0, g1, g2, g_alpha = share * g0, share * g1, share * g2, share * (a0 + a1 + a2)
+    if abs(off) > F32(ALPHA_DEAD_ZONE):
+        g_alpha += alpha_weight * share * (F32(1) if off > F32(0) else F32(-1))
+    # hard surface: -log(exp(-α) + exp(α - 1)), of slope tanh(1/2 - α)
+    solid, empty = np.exp(-alpha), np.exp(alpha - F32(1))
+    g_alpha += hard_surface_weight * share * (solid - empty) / (solid + empty)
+    loss[ray] = (
+        e0 + e1 + e2
+        + alpha_weight * max(F32(0), abs(off) - F32(ALPHA_DEAD_ZONE))
+        - hard_surface_weight * np.log(solid + empty)
+    )  # fmt: skip
+
+    behind = F32(0)
+    for i in range(stop - 1, start - 1, -1):
+        q0, q1, q2, through = grad_raw[i, 0], grad_raw[i, 1], grad_raw[i, 2], grad_raw[i, 3]
+        weight = (grad_raw[i - 1, 3] if i > start else F32(1)) - through
+        value = q0 * g0 + q1 * g1 + q2 * g2 + g_alpha
+        grad_raw[i, 0] = weight * g0 * q0 * (F32(1) - q0)
+        grad_raw[i, 1] = weight * g1 * q1 * (F32(1) - q1)
+        grad_raw[i, 2] = weight * g2 * q2 * (F32(1) - q2)
+        # dL / d log σ = σ Δ (T behind · value - Σ weight · value of all samples behind)
+        optical = np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * sample_step_m
+        inside = raw[i, 3] < F32(MAX_LOG_DENSITY)
+        grad_raw[i, 3] = optical * (through * value - behind) if inside else F32(0)
+        behind += weight * value
 
 
 @compile_kernel(parallel=True, **FAST_MATH)
@@ -329,55 +400,8 @@ def composite_loss(
     opaque sample nothing would be left of them but rounding, times an optical depth of up to 81.)
     In between, `grad_raw` holds each sample's color and the transmittance behind it.
     """
-    share = F32(1) / F32(offsets.shape[0])
     for ray in prange(offsets.shape[0]):
-        start, stop = offsets[ray], offsets[ray] + counts[ray]
-        through = F32(1)
-        red, green, blue = F32(0), F32(0), F32(0)
-        for i in range(start, stop):
-            kept = np.exp(-np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * sample_step_m)
-            weight = through * (F32(1) - kept)
-            through *= kept
-            q0, q1, q2 = _sigmoid(raw[i, 0]), _sigmoid(raw[i, 1]), _sigmoid(raw[i, 2])
-            grad_raw[i, 0] = q0
-            grad_raw[i, 1] = q1
-            grad_raw[i, 2] = q2
-            grad_raw[i, 3] = through
-            red += weight * q0
-            green += weight * q1
-            blue += weight * q2
-        alpha = F32(1) - through
-        rendered[ray, 0] = red
-        rendered[ray, 1] = green
-        rendered[ray, 2] = blue
-        rendered[ray, 3] = alpha
-
-        off = alpha - target[ray, 3]
-        e0, g0, a0 = _mean_huber(red - target[ray, 0], off)
-        e1, g1, a1 = _mean_huber(green - target[ray, 1], off)
-        e2, g2, a2 = _mean_huber(blue - target[ray, 2], off)
-        g0, g1, g2, g_alpha = share * g0, share * g1, share * g2, share * (a0 + a1 + a2)
-        if abs(off) > F32(ALPHA_DEAD_ZONE):
-            g_alpha += alpha_weight * share * (F32(1) if off > F32(0) else F32(-1))
-        # hard surface: -log(exp(-α) + exp(α - 1)), of slope tanh(1/2 - α)
-        solid, empty = np.exp(-alpha), np.exp(alpha - F32(1))
-        g_alpha += hard_surface_weight * share * (solid - empty) / (solid + empty)
-        loss[ray] = (
-            e0 + e1 + e2
-            + alpha_weight * max(F32(0), abs(off) - F32(ALPHA_DEAD_ZONE))
-            - hard_surface_weight * np.log(solid + empty)
+        _composite_ray_loss(
+            np.int64(ray), raw, offsets, counts, sample_step_m, target, alpha_weight,
+            hard_surface_weight, rendered, loss, grad_raw,
         )  # fmt: skip
-
-        behind = F32(0)
-        for i in range(stop - 1, start - 1, -1):
-            q0, q1, q2, through = grad_raw[i, 0], grad_raw[i, 1], grad_raw[i, 2], grad_raw[i, 3]
-            weight = (grad_raw[i - 1, 3] if i > start else F32(1)) - through
-            value = q0 * g0 + q1 * g1 + q2 * g2 + g_alpha
-            grad_raw[i, 0] = weight * g0 * q0 * (F32(1) - q0)
-            grad_raw[i, 1] = weight * g1 * q1 * (F32(1) - q1)
-            grad_raw[i, 2] = weight * g2 * q2 * (F32(1) - q2)
-            # dL / d log σ = σ Δ (T behind · value - Σ weight · value of all samples behind)
-            optical = np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * sample_step_m
-            inside = raw[i, 3] < F32(MAX_LOG_DENSITY)
-            grad_raw[i, 3] = optical * (through * value - behind) if inside else F32(0)
-            behind += weight * value

@@ -5,7 +5,12 @@ import math
 import numpy as np
 from numba import prange
 
-from avatar.kernels.kernel_compiler import FAST_MATH, NO_ALLOCATION, compile_kernel
+from avatar.kernels.kernel_compiler import (
+    FAST_MATH,
+    INLINED,
+    NO_ALLOCATION,
+    compile_kernel,
+)
 from avatar.kernels.numba_rendering import cell_index_at
 from avatar.kernels.operands import MAX_LOG_DENSITY
 
@@ -14,42 +19,54 @@ MIN_NORMAL_WEIGHT = 1e-3
 """Weight of a sample in its ray up to which its normal does not count."""
 
 
+@compile_kernel(**NO_ALLOCATION)
+def _mean_normal(
+    ray, raw, points, offsets, counts, rows, slots, cell_roots, sample_step_m, normals, low,
+    cells_per_m, mean,
+):  # fmt: skip
+    """One ray's composited normal."""
+    nx, ny, nz, _ = normals.shape
+    slot, through = slots[ray], F32(1)
+    x, y, z = F32(0), F32(0), F32(0)
+    for i in range(offsets[ray], offsets[ray] + counts[ray]):
+        before = through
+        through *= np.exp(-np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * sample_step_m)
+        if before - through <= F32(MIN_NORMAL_WEIGHT):
+            continue  # most samples, whose normals lie anywhere in memory
+        a = cell_index_at((points[i, 0] - low[0]) * cells_per_m[0], I32(nx))
+        b = cell_index_at((points[i, 1] - low[1]) * cells_per_m[1], I32(ny))
+        c = cell_index_at((points[i, 2] - low[2]) * cells_per_m[2], I32(nz))
+        n = U32(rows[i])
+        p, q, r = normals[a, b, c, 0], normals[a, b, c, 1], normals[a, b, c, 2]
+        # in the body frame: Aᵀ normal, normalised
+        u = cell_roots[slot, n, 3] * p + cell_roots[slot, n, 6] * q + cell_roots[slot, n, 9] * r
+        v = (
+            cell_roots[slot, n, 4] * p + cell_roots[slot, n, 7] * q
+            + cell_roots[slot, n, 10] * r
+        )  # fmt: skip
+        w = (
+            cell_roots[slot, n, 5] * p + cell_roots[slot, n, 8] * q
+            + cell_roots[slot, n, 11] * r
+        )  # fmt: skip
+        weight = (before - through) / max(np.sqrt(u * u + v * v + w * w), F32(1e-12))
+        x, y, z = x + weight * u, y + weight * v, z + weight * w
+    mean[ray, 0], mean[ray, 1], mean[ray, 2] = x, y, z
+
+
 @compile_kernel(parallel=True, **NO_ALLOCATION)
 def mean_normals(
     raw, points, offsets, counts, rows, slots, cell_roots, sample_step_m,
     normals, low, cells_per_m, mean,
 ):  # fmt: skip
     """Normals at each ray's samples, in the body frame, composited front to back."""
-    nx, ny, nz, _ = normals.shape
     for ray in prange(offsets.shape[0]):
-        slot, through = slots[ray], F32(1)
-        x, y, z = F32(0), F32(0), F32(0)
-        for i in range(offsets[ray], offsets[ray] + counts[ray]):
-            before = through
-            through *= np.exp(-np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * sample_step_m)
-            if before - through <= F32(MIN_NORMAL_WEIGHT):
-                continue  # most samples, whose normals lie anywhere in memory
-            a = cell_index_at((points[i, 0] - low[0]) * cells_per_m[0], I32(nx))
-            b = cell_index_at((points[i, 1] - low[1]) * cells_per_m[1], I32(ny))
-            c = cell_index_at((points[i, 2] - low[2]) * cells_per_m[2], I32(nz))
-            n = U32(rows[i])
-            p, q, r = normals[a, b, c, 0], normals[a, b, c, 1], normals[a, b, c, 2]
-            # in the body frame: Aᵀ normal, normalised
-            u = cell_roots[slot, n, 3] * p + cell_roots[slot, n, 6] * q + cell_roots[slot, n, 9] * r
-            v = (
-                cell_roots[slot, n, 4] * p + cell_roots[slot, n, 7] * q
-                + cell_roots[slot, n, 10] * r
-            )  # fmt: skip
-            w = (
-                cell_roots[slot, n, 5] * p + cell_roots[slot, n, 8] * q
-                + cell_roots[slot, n, 11] * r
-            )  # fmt: skip
-            weight = (before - through) / max(np.sqrt(u * u + v * v + w * w), F32(1e-12))
-            x, y, z = x + weight * u, y + weight * v, z + weight * w
-        mean[ray, 0], mean[ray, 1], mean[ray, 2] = x, y, z
+        _mean_normal(
+            np.int64(ray), raw, points, offsets, counts, rows, slots, cell_roots, sample_step_m,
+            normals, low, cells_per_m, mean,
+        )  # fmt: skip
 
 
-@compile_kernel(inline="always", **FAST_MATH)
+@compile_kernel(**INLINED)
 def _factor(normals, ray, coefficients, min_length, bounds):
     """Factor of the color of what a ray sees, and the length of its normal."""
     x, y, z = normals[ray, 0], normals[ray, 1], normals[ray, 2]

@@ -4,7 +4,11 @@ import math
 
 import numpy as np
 
-from avatar.kernels.kernel_compiler import FAST_MATH, NO_ALLOCATION, compile_kernel
+from avatar.kernels.kernel_compiler import (
+    INLINED,
+    NO_ALLOCATION,
+    compile_kernel,
+)
 
 F32, U32 = np.float32, np.uint32
 MATRIX_LANES = 16
@@ -14,7 +18,7 @@ MAX_PROBE_CORRECTION_M = 0.03
 """Largest motion of a probe, metres; one that would move farther lies beyond a fold and stays."""
 
 
-@compile_kernel(inline="always", **FAST_MATH)
+@compile_kernel(**INLINED)
 def interpolate_at(volume, low, nodes_per_m, x, y, z, channels, out):
     """Trilinear values of a volume (x, y, z, channels) at a point; the border's outside."""
     a = min(max((x - low[0]) * nodes_per_m[0], F32(0)), F32(volume.shape[0] - 1.001))
@@ -35,7 +39,7 @@ def interpolate_at(volume, low, nodes_per_m, x, y, z, channels, out):
         )  # fmt: skip
 
 
-@compile_kernel(inline="always", **FAST_MATH)
+@compile_kernel(**INLINED)
 def transform_point(m, x, y, z):
     """A point moved by a row-major 3×4 matrix."""
     return (
@@ -67,7 +71,7 @@ ITERATIONS = 12
 LONGEST_STEP_M = 0.3
 
 
-@compile_kernel(inline="always", **FAST_MATH)
+@compile_kernel(**INLINED)
 def invert_rotation(m, out):
     """Inverse of the 3×3 part of a row-major 3×4 matrix."""
     a, b, c, d, e, f, g, h, i = m[0], m[1], m[2], m[4], m[5], m[6], m[8], m[9], m[10]
@@ -80,7 +84,7 @@ def invert_rotation(m, out):
     out[6], out[7], out[8] = r * s, (b * g - a * h) * s, (a * e - b * d) * s
 
 
-@compile_kernel(inline="always", **FAST_MATH)
+@compile_kernel(**INLINED)
 def rotate_vector(m, x, y, z):
     """A vector turned by a row-major 3×3 matrix."""
     return (
@@ -90,7 +94,7 @@ def rotate_vector(m, x, y, z):
     )
 
 
-@compile_kernel(inline="always", **FAST_MATH)
+@compile_kernel(**INLINED)
 def _broyden_update(inverse, dx, dy, dz, yx, yy, yz):
     """Broyden's good update of an inverse Jacobian: a step d has changed the value by y."""
     # J⁻¹ ← J⁻¹ + (d - J⁻¹ y) (dᵀ J⁻¹) / (dᵀ J⁻¹ y)
@@ -112,7 +116,7 @@ def _broyden_update(inverse, dx, dy, dz, yx, yy, yz):
     inverse[8] += uz * rz
 
 
-@compile_kernel(inline="always", **FAST_MATH)
+@compile_kernel(**INLINED)
 def _blended_transform(transforms, low, nodes_per_m, x, y, z, out):
     if transforms.shape[3] == MATRIX_LANES:
         interpolate_at(transforms, low, nodes_per_m, x, y, z, MATRIX_LANES, out)
@@ -161,7 +165,7 @@ def solve_root(transforms, low, nodes_per_m, p, x, blend, inverse, initialize_in
     return fx * fx + fy * fy + fz * fz <= F32(4 * TOLERANCE_M * TOLERANCE_M)
 
 
-@compile_kernel(inline="always", **FAST_MATH)
+@compile_kernel(**INLINED)
 def _probe_root(transforms, low, nodes_per_m, p, dx, dy, dz, x, inverse, blend):
     """Offset from the root x of p to the root of p + d: linear, and one chord step."""
     ux, uy, uz = rotate_vector(inverse, dx, dy, dz)

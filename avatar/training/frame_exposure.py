@@ -127,9 +127,13 @@ def _update_gains(slots, target, rendered, avatar_frozen, pixels, renderings, ga
             pixels[slot, q] = kept * pixels[slot, q] + sums[slot, 1 + q]
             renderings[slot, q] = kept * renderings[slot, q] + sums[slot, 4 + q]
             log_gains[slot] = math.log(pixels[slot, q] / renderings[slot, q])
+        mean, power, kept = 0.0, 1e-12, 1.0
         if not avatar_frozen:
-            log_gains -= log_gains.mean()
+            for slot in range(held):
+                mean += log_gains[slot] / held
+            for slot in range(held):
+                power += (log_gains[slot] - mean) ** 2 / held
             # James and Stein's shrinkage: differences no larger than their error are not believed
-            power = max((log_gains * log_gains).mean(), 1e-12)
-            log_gains *= max(1.0 - CONSTANT_EXPOSURE_ERROR**2 / power, 0.0)
-        gains[:, q] = np.exp(log_gains)
+            kept = max(1.0 - CONSTANT_EXPOSURE_ERROR**2 / power, 0.0)
+        for slot in range(held):
+            gains[slot, q] = math.exp(kept * (log_gains[slot] - mean))

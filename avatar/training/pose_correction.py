@@ -88,16 +88,16 @@ class TemporalPosePrior:
 
 @compile_kernel(**FAST_MATH)
 def neighbor_correlations(
+    order: Int64[np.ndarray, "frames"],
     frames: Int64[np.ndarray, "frames"],
     estimates: Float[np.ndarray, "frames 25 3"],
     known: Bool[np.ndarray, "frames"],
 ) -> tuple[float, float]:
     """Correlations of estimates one frame apart, and two, in [-1, 1]; zeros if there are too few.
 
-    Frames may be in any order; the next known one counts as one apart. `estimates` are each frame's
-    correction by its rays alone, in any unit.
+    `order` sorts the frames, and the next known one counts as one apart. `estimates` are each
+    frame's correction by its rays alone, in any unit.
     """
-    order = np.argsort(frames)
     triples, power, one_apart, two_apart, first, middle = 0, 0.0, 0.0, 0.0, -1, -1
     for last in order:
         if not known[last]:
@@ -130,7 +130,7 @@ def neighbor_precision(
     apart. So r is the ratio of the estimates' correlations, the share of noise is what is missing
     to 1 at distance 0, and neighbors leave (1 - r²) / (1 + r²) of the errors' power unknown.
     """
-    one_apart, two_apart = neighbor_correlations(frames, estimates, known)
+    one_apart, two_apart = neighbor_correlations(np.argsort(frames), frames, estimates, known)
     share = (one_apart - MIN_CORRELATION) / (FULL_CORRELATION - MIN_CORRELATION)
     if share <= 0.0:
         return 0.0

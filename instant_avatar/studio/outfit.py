@@ -23,14 +23,14 @@ BELT_Y = -0.15
 """Trousers end here; the shirt hangs over it."""
 
 
-@compile_kernel(nogil=True, inline="always")
+@compile_kernel(nogil=True, forceinline=True)
 def smoothstep(value: float, low: float, high: float) -> float:
     """0 below `low`, 1 above `high`, smooth between."""
     share = min(max((value - low) / (high - low), 0.0), 1.0)
     return share * share * (3.0 - 2.0 * share)
 
 
-@compile_kernel(nogil=True, inline="always")
+@compile_kernel(nogil=True, forceinline=True)
 def neckline(x: float, z: float, measures: Float32[np.ndarray, "cuts"]) -> float:
     """Height of the collar's edge: a scoop, deeper in front, that ends on the shoulders."""
     front = smoothstep(z, 0.01, 0.09)
@@ -43,7 +43,7 @@ def neckline(x: float, z: float, measures: Float32[np.ndarray, "cuts"]) -> float
     )
 
 
-@compile_kernel(nogil=True, inline="always")
+@compile_kernel(nogil=True, forceinline=True)
 def height_above_hairline(
     x: float, y: float, z: float, measures: Float32[np.ndarray, "cuts"]
 ) -> float:

@@ -37,7 +37,7 @@ STRIPE_M = 0.04
 """Width of a stripe of shirt and trousers."""
 
 
-@compile_kernel(nogil=True, inline="always")
+@compile_kernel(nogil=True, forceinline=True)
 def _hash(i: int, j: int, k: int, seed: int) -> np.float32:
     """A number in [-1, 1) that depends on all its bits."""
     h = np.uint32(i) * np.uint32(374761393) + np.uint32(j) * np.uint32(668265263)
@@ -66,7 +66,7 @@ def value_noise(x: float, y: float, z: float, cell: float, seed: np.uint32) -> f
     return total
 
 
-@compile_kernel(nogil=True, inline="always")
+@compile_kernel(nogil=True, forceinline=True)
 def _lerp(a: SrgbColor, b: SrgbColor, share: float) -> SrgbColor:
     return (
         a[0] + (b[0] - a[0]) * share,
@@ -75,17 +75,17 @@ def _lerp(a: SrgbColor, b: SrgbColor, share: float) -> SrgbColor:
     )
 
 
-@compile_kernel(nogil=True, inline="always")
+@compile_kernel(nogil=True, forceinline=True)
 def _scale(a: SrgbColor, factor: float) -> SrgbColor:
     return a[0] * factor, a[1] * factor, a[2] * factor
 
 
-@compile_kernel(nogil=True, inline="always")
+@compile_kernel(nogil=True, forceinline=True)
 def _swatch(palette: Float32[np.ndarray, "colors 3"], row: int) -> SrgbColor:
     return palette[row, 0], palette[row, 1], palette[row, 2]
 
 
-@compile_kernel(nogil=True, inline="always")
+@compile_kernel(nogil=True, forceinline=True)
 def _stripe_wave(value: float, width: float, blur: float) -> float:
     """Square wave in [0, 1]: stripes of one width, edges `blur` metres soft."""
     phase = value / (2.0 * width)

@@ -14,7 +14,7 @@ from avatar.kernels.kernel_compiler import add4, compile_kernel, dot4, load4, sc
 CALLEE = """
 from avatar.kernels.kernel_compiler import compile_kernel
 
-@compile_kernel(inline="always")
+@compile_kernel(forceinline=True)
 def scale(x):
     return {factor} * x
 """
