@@ -31,7 +31,7 @@ from avatar.kernels.numba_skinning import (
 )
 from avatar.rig import Rig
 
-F32, I32, U32 = np.float32, np.int32, np.uint32
+F32, I32, I64, U32 = np.float32, np.int32, np.int64, np.uint32
 FACE_DIRECTIONS = np.array(
     [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)], dtype=np.int32
 )
@@ -183,11 +183,11 @@ def flood_fill_roots(
     t = F32(PROBE_DISTANCE_CELLS) * cell_m
     for cell in range(chains.shape[0]):
         chains[cell] = -1
-    total, done = 0, 0
+    total, done = I64(0), I64(0)  # 64 bits everywhere: a kernel is compiled for each type
     for s in range(seeds.shape[0]):
-        i = I32((posed[s, 0] - grid_low[0]) / cell_m)
-        j = I32((posed[s, 1] - grid_low[1]) / cell_m)
-        k = I32((posed[s, 2] - grid_low[2]) / cell_m)
+        i = I64((posed[s, 0] - grid_low[0]) / cell_m)
+        j = I64((posed[s, 1] - grid_low[1]) / cell_m)
+        k = I64((posed[s, 2] - grid_low[2]) / cell_m)
         for n in range(9):
             inverse[n] = seed_inverses[s, n]
         # first guess: x = seed + B⁻¹ (center - posed seed), with B the blended 3×3 matrix
@@ -204,7 +204,7 @@ def flood_fill_roots(
             x, inverse, p, blend,
         )  # fmt: skip
         while done < min(total, following.shape[0]):
-            i, j, k = cell_of[done, 0], cell_of[done, 1], cell_of[done, 2]
+            i, j, k = I64(cell_of[done, 0]), I64(cell_of[done, 1]), I64(cell_of[done, 2])
             p[0] = grid_low[0] + (F32(i) + F32(0.5)) * cell_m
             p[1] = grid_low[1] + (F32(j) + F32(0.5)) * cell_m
             p[2] = grid_low[2] + (F32(k) + F32(0.5)) * cell_m

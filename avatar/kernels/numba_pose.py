@@ -373,9 +373,8 @@ def pose_joints(
     own, turn = np.empty((3, 3)), np.zeros((JOINTS, 3, 3))
     place, away = np.empty((JOINTS, 3)), np.empty(3)
     _rotation(correction[0], root_turn)
-    place[0] = rest[0]
     for a in range(3):
-        turn[0, a, a] = 1.0
+        place[0, a], turn[0, a, a] = rest[0, a], 1.0
     for joint in range(1, JOINTS):
         parent = parents[joint]
         _rotation(correction[joint], own)

@@ -209,7 +209,7 @@ def _march_block(
                     here = _cached_density(occupied, density, low, cells_per_m, x, y, z, asked)
                     if here > best:
                         best, chosen, px, py, pz = here, row, x, y, z
-                    row += U32(3) if bent else U32(1)
+                    row = U32(row + (U32(3) if bent else U32(1)))
                 if best >= F32(0):
                     points[ray, kept, 0] = px
                     points[ray, kept, 1] = py
