@@ -30,9 +30,6 @@ BOX_MARGIN_M = 0.17
 """Margin of the canonical box about the skin, metres; clothes must fit into it."""
 DISTANCE_CELL_M = 0.015
 """Cell size of the skin distance and the occupancy, metres."""
-DISTANCE_REACH_M, SKINNING_REACH_M = 0.14, 0.18
-"""Distances from the skin within which its distance, and the weights, are computed, metres: their
-smoothed values are exact within the clothing band and the margin in which roots are searched."""
 
 
 def canonical_rotations() -> Float[np.ndarray, "23 3"]:
@@ -97,7 +94,7 @@ class Rig:
         seeds = _seed_vertices(vertices, body.weights)
         normals = vertex_normals(vertices, body.faces)
         distance, inside = skin_distance_volume(
-            vertices, normals, low, high, DISTANCE_CELL_M, DISTANCE_REACH_M
+            vertices, normals, low, high, DISTANCE_CELL_M, BOX_MARGIN_M + 0.02
         )
         return cls(
             rest_joints=shaped.joints,
@@ -106,7 +103,7 @@ class Rig:
             box_low=low,
             box_high=high,
             weights=skinning_weight_volume(
-                vertices, body.weights, low, high, SKINNING_CELL_M, SKINNING_REACH_M
+                vertices, body.weights, low, high, SKINNING_CELL_M, BOX_MARGIN_M + 0.05
             ),
             skin_distance=distance,
             inside_skin=inside,

@@ -28,14 +28,14 @@ def test_correlations_of_a_process_are_found_in_any_order_of_its_frames(rng, ali
     errors, order = errors_of(rng, 100, alike=alike), rng.permutation(130)
     known, held = order < 100, errors_of(rng, 130, alike=0.0)
     held[known] = errors[order[known]]
-    found = neighbor_correlations(order, held, known)
+    found = neighbor_correlations(np.argsort(order), order, held, known)
     np.testing.assert_allclose(found, (alike, alike**2), atol=0.08)
 
 
 def test_too_few_neighbours_tell_nothing(rng):
     errors = errors_of(rng, MIN_NEIGHBOR_TRIPLES + 2, alike=0.99)
     numbers, known = np.arange(len(errors)), np.ones(len(errors), bool)
-    assert neighbor_correlations(numbers, errors, known)[0] > 0.8
+    assert neighbor_correlations(numbers, numbers, errors, known)[0] > 0.8
     assert neighbor_precision(numbers, errors, known) > 0.0
     assert neighbor_precision(numbers, errors, numbers > 0) == 0.0
     assert neighbor_precision((MAX_FRAME_GAP + 1) * numbers, errors, known) == 0.0
