@@ -16,7 +16,6 @@ from instant_avatar.cli.console import Console
 from instant_avatar.evaluation.evaluation_frames import held_out_frames
 from instant_avatar.run import person_tracking, run_tracking
 from instant_avatar.run.run_folder import RunFolder
-from preprocess import tracked_stream
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.fitting import tracked_frames
 from preprocess.masks.mask_refinement import MaskRefiner
@@ -159,7 +158,6 @@ def test_given_poses_replace_tracked_ones(ingest_video, filmed):
 @pytest.mark.slow
 @pytest.mark.usefixtures("without_baking")
 def test_a_video_played_at_its_own_speed_is_tracked_meanwhile(ingest_video, monkeypatch):
-    monkeypatch.setattr(tracked_stream, "MAX_LATENESS_S", 1e9)  # on a busy machine, too
     done, out = ingest_video("--realtime")
     assert done.code == 0, done.err
     report = json.loads((out / "report.json").read_text())
@@ -171,7 +169,6 @@ def test_a_video_played_at_its_own_speed_is_tracked_meanwhile(ingest_video, monk
 
 @pytest.mark.usefixtures("without_baking", "fits_at_once")
 def test_a_stream_learns_from_given_masks_and_brings_poses_along(ingest_video, filmed, monkeypatch):
-    monkeypatch.setattr(tracked_stream, "MAX_LATENESS_S", 1e9)  # on a busy machine, too
     monkeypatch.setattr(tracked_frames, "REVISED_FRAMES", 4)
     monkeypatch.setattr(MaskRefiner, "__call__", lambda *given: pytest.fail("a mask is refined"))
     revised = []
