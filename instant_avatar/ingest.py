@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from instant_avatar.cli.command_line import (
+    INTERRUPTED,
     exit_on_interrupt,
     fill_optional_value,
     parse_arguments,
@@ -72,11 +73,12 @@ def ingest(
             command=command, started_at=started_at, threads=threads,
             copy=None if arguments.json is None else (arguments.json, arguments.may_replace_json),
         )  # fmt: skip
-        run_session(
+        is_interrupted = run_session(
             arguments, observations, run, console, [*readers, report],  # its page takes seconds
             on_start=lambda: write_solved_cameras(before_fit, run, console),
         )  # fmt: skip
-        return report.exit_code()
+        code = report.exit_code()
+        return INTERRUPTED if is_interrupted else code
 
 
 def _load_trainer_code(arguments: IngestArguments, run: RunFolder, console: Console) -> int:

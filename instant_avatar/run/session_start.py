@@ -94,11 +94,11 @@ def run_session(
     readers: Sequence[EventReader],
     *,
     on_start: Callable[[], object] = lambda: None,
-) -> None:
+) -> bool:
     """Prepare trainer and viewer, and run a session to its end; console and `readers` read it.
 
     `on_start` is called once an older run has been removed. Ctrl-C asks the session to stop. A
-    viewer stays open until Ctrl-C.
+    viewer stays open until Ctrl-C. Returns whether Ctrl-C was pressed, even as the page was drawn.
     """
     capture = observations.capture
     with exit_on_interrupt(console, PROGRAM, run.release):
@@ -117,9 +117,11 @@ def run_session(
             watching = () if viewer is None else (viewer.watch(session),)
             shown = ConsoleReader(session, console, cleanup)
             _show_events(session, [shown, *watching, *readers])
-        if viewer is not None and not stop.is_set():
+        is_interrupted = stop.is_set()
+        if viewer is not None and not is_interrupted:
             console.info(f"The viewer stays open at {viewer.page.address}. Ctrl-C closes it.")
             viewer.serve_until_interrupt(session)
+        return is_interrupted
     except (OSError, KeyboardInterrupt) as error:
         error.add_note(run.describe_remaining_files())
         raise
