@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import threading
 
 import cv2
 import numpy as np
@@ -22,16 +23,17 @@ class Writer:
             0.0,
             PacingClock(clock=self.clock, wait=self.wait),
         )
-        self._plan = []
+        self._plan, self._lock = [], threading.Lock()
 
     def clock(self):
         return self.now_s
 
     def wait(self, seconds):
-        """Pass time; what is due meanwhile is done."""
-        self.now_s += seconds
-        while self._plan and self._plan[0][0] <= self.now_s:
-            self._plan.pop(0)[1]()
+        """Pass time; what is due meanwhile is done, whichever thread waits."""
+        with self._lock:
+            self.now_s += seconds
+            while self._plan and self._plan[0][0] <= self.now_s:
+                self._plan.pop(0)[1]()
 
     def at(self, seconds, work):
         self._plan.append((seconds, work))

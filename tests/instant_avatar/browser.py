@@ -31,6 +31,8 @@ os.dup2(says, 4)
 os.execv(sys.argv[3], sys.argv[3:])
 """
 """Chromium listens on descriptor 3 and answers on 4."""
+COMPLAINTS = ("Runtime.exceptionThrown", "Log.entryAdded", "Inspector.targetCrashed")
+"""Events that say why a page does not work."""
 
 
 def chromium() -> str | None:
@@ -61,6 +63,7 @@ class Browser:
         os.close(hears)
         os.close(says)
         self._session, self._held, self._numbers = "", b"", itertools.count(1)
+        self._complaints: list[dict[str, Any]] = []
 
     def __enter__(self) -> "Browser":
         until(self._pages, 60.0)
@@ -68,13 +71,22 @@ class Browser:
         attached = self._ask("Target.attachToTarget", targetId=target, flatten=True)
         self._session = attached["sessionId"]
         self._ask("Page.bringToFront")
+        self._ask("Runtime.enable")
+        self._ask("Log.enable")
         return self
 
     def _pages(self) -> list[str]:
         found = self._ask("Target.getTargets", whole=True)["targetInfos"]
         return [target["targetId"] for target in found if target["type"] == "page"]
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, kind: object, *error: object) -> None:
+        try:
+            if kind is not None:  # pytest shows it with the failed test
+                print(f"The page says:\n{self.text()}\nThe browser says:", *self._complaints)
+        finally:
+            self._close()
+
+    def _close(self) -> None:
         self._process.terminate()
         self._process.wait(timeout=20.0)
         os.close(self._says)
@@ -165,7 +177,10 @@ class Browser:
             assert part, "the browser has ended"
             self._held += part
         message, self._held = self._held.split(b"\0", 1)
-        return json.loads(message)
+        answer = json.loads(message)
+        if answer.get("method") in COMPLAINTS:
+            self._complaints.append(answer["params"])
+        return answer
 
 
 def until(condition: Any, seconds: float) -> None:
