@@ -1,5 +1,6 @@
 """Video files, written from images by PyAV."""
 
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -11,6 +12,8 @@ import av
 import numpy as np
 from av.video.reformatter import ColorRange, Colorspace
 from jaxtyping import UInt8
+
+from capture.input_error import InputError, quote_command
 
 Pixels = UInt8[np.ndarray, "height width channels"]
 
@@ -29,6 +32,16 @@ class VideoCodec:
     pixel_format: str
     options: dict[str, str] = field(default_factory=dict)
     description: str
+
+    def check_available(self) -> None:
+        """Refuse an encoder that this build of PyAV lacks, as those of some distributions do."""
+        if self.name not in av.codecs_available:
+            install = quote_command(sys.executable, "-m", "pip", "install", "--force-reinstall")
+            raise InputError(
+                f"PyAV {av.__version__} here cannot write {self.description.split(',')[0]}: it was "
+                f"built without {self.name}, which its wheels have: {install} --only-binary av av. "
+                "Other suffixes need other encoders (.mp4, .webm, .webp, .gif)."
+            )
 
 
 _VP9 = {"crf": "22", "b:v": "0", "deadline": "good", "cpu-used": "4", "row-mt": "1"}
@@ -80,6 +93,7 @@ def open_video_writer(
     path: Path, fps: float, codec: VideoCodec
 ) -> Iterator[Callable[[Pixels], None]]:
     """Open a video to write; yield the function that appends an image (see `write_video`)."""
+    codec.check_available()
     is_rgb = codec.pixel_format == "bgr0"
     container_options = {"movflags": "+faststart"} if path.suffix.lower() == ".mp4" else {}
     with av.open(str(path), "w", options=container_options) as container:

@@ -105,6 +105,7 @@ def clip_format(path: Path, *, transparent: bool) -> ClipFormat:
         )
     if suffix in (".mp4", ".webm"):
         codec = H264 if suffix == ".mp4" else VP9_ALPHA if transparent else VP9
+        codec.check_available()  # before anything is rendered
         return ClipFormat(description=codec.description, write=partial(write_video, codec=codec))
     if suffix == ".gif":
         description = "a GIF of 256 colors per frame" + ", binary transparency" * transparent

@@ -1,5 +1,8 @@
 """What is written of pictures, and with what."""
 
+import base64
+import json
+
 import av
 import cv2
 import numpy as np
@@ -7,7 +10,13 @@ import pytest
 from PIL import Image
 
 from capture.input_error import InputError
-from instant_avatar.animation.clip_file import background_compositor, check_clip_path, write_clip
+from instant_avatar.animation.clip_file import (
+    background_compositor,
+    check_clip_path,
+    clip_format,
+    write_clip,
+)
+from tests.instant_avatar.browser import Browser, chromium
 
 
 def disc(count, *, height=60, width=80):
@@ -69,6 +78,66 @@ def test_an_mp4_is_h264_and_a_webm_is_vp9(tmp_path):
             assert int(stream.codec_context.colorspace) == 1  # BT.709, as it is written
             first = next(file.decode(stream)).to_ndarray(format="rgb24")
         assert 255 - first[:8].mean() < 0.5
+
+
+def test_an_mp4_begins_with_its_index_so_that_it_plays_while_it_comes(tmp_path):
+    path = tmp_path / "a.mp4"
+    written(path, disc(3), blend=background_compositor("white"))
+    content = path.read_bytes()
+    assert 0 < content.index(b"moov") < content.index(b"mdat")
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".webm"])
+def test_a_build_without_the_encoder_says_so_before_anything_is_drawn(
+    tmp_path, monkeypatch, suffix
+):
+    monkeypatch.setattr(av, "codecs_available", {"mpeg4", "h264"})
+    with pytest.raises(InputError, match=r"PyAV .* built without lib(x264|vpx-vp9).*--only-binary"):
+        clip_format(tmp_path / f"a{suffix}", transparent=False)
+
+
+SHOWN_IN_A_PAGE = """(async (url, kind) => {
+  const clip = document.createElement(kind), canvas = document.createElement("canvas");
+  await new Promise((done, fail) => {
+    if (clip.requestVideoFrameCallback) clip.requestVideoFrameCallback(done);
+    else clip.onload = done;
+    clip.onerror = () => fail(new Error(clip.error?.message ?? "no picture"));
+    Object.assign(clip, { muted: true, src: url });
+    clip.play?.();
+  });
+  clip.pause?.();
+  canvas.width = clip.videoWidth ?? clip.naturalWidth;
+  canvas.height = clip.videoHeight ?? clip.naturalHeight;
+  const paint = canvas.getContext("2d");
+  paint.drawImage(clip, 0, 0);
+  return [canvas.width, canvas.height, clip.duration ?? 0,
+          [...paint.getImageData(30, 30, 1, 1).data], [...paint.getImageData(2, 2, 1, 1).data]];
+})"""
+"""Size, seconds, and two pixels: in the disc, and outside of it."""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(chromium() is None, reason="there is no Chromium here")
+def test_clips_play_in_a_browser_with_their_alpha(tmp_path):
+    white = background_compositor("white")
+    with Browser(tmp_path / "browser") as browser:
+        for name, blend in (
+            ("a.mp4", white),
+            ("a.webm", None),
+            ("b.webm", white),
+            ("a.webp", None),
+        ):
+            path = tmp_path / name
+            written(path, list(disc(1)) * 10, blend=blend)
+            kind = "img" if path.suffix == ".webp" else "video"
+            mime = {".webp": "image/webp"}.get(path.suffix, f"video/{path.suffix[1:]}")
+            url = f"data:{mime};base64,{base64.b64encode(path.read_bytes()).decode()}"
+            shown = browser.run(f"{SHOWN_IN_A_PAGE}({json.dumps(url)}, {json.dumps(kind)})")
+            width, height, seconds, inside, outside = shown
+            assert (width, height) == (80, 60)
+            assert seconds == pytest.approx(0.0 if kind == "img" else 10 / 25, abs=0.05)
+            np.testing.assert_allclose(inside, [230, 130, 40, 255], atol=8)
+            np.testing.assert_allclose(outside, [0] * 4 if blend is None else [255] * 4, atol=3)
 
 
 def test_a_webm_keeps_soft_alpha(tmp_path):
