@@ -35,14 +35,16 @@ class Inbox(Generic[Item]):
         paced: bool = False,
         live: bool = False,
         ends_run: bool = False,
+        all_came: Callable[[], bool] = lambda: False,
         on_drop: Callable[[Item], object] = lambda item: None,
     ) -> None:
         """Start the producer; at most `capacity` items wait.
 
+        `all_came` tells whether the producer is at its last items, though some are still to come.
         `on_drop` receives each item that is dropped, on the producer's thread.
         """
         self.paced, self.live, self.ends_run = paced, live, ends_run
-        self.dropped, self._on_drop = 0, on_drop
+        self.all_came, self.dropped, self._on_drop = all_came, 0, on_drop
         self._queue: queue.Queue[Item] = queue.Queue(maxsize=capacity)
         self._error: BaseException | None = None
         self._stop = threading.Event()

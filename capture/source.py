@@ -110,6 +110,7 @@ class FrameSource:
         paced: Whether frames come at times of their own, however fast they are taken.
         skippable: Whether a newer frame may replace one that was not taken in time, as both are
             filmed at this moment.
+        all_came: Whether every frame has come, and only such as were skipped are still to be taken.
         started_at: Time when the first frame of a live source was filmed, seconds since 1970.
         warnings: Problems so far; grows while `frames()` is read.
     """
@@ -123,6 +124,7 @@ class FrameSource:
     live: bool = False
     paced: bool = False
     skippable: bool = False
+    all_came: bool = False
     rotate: int = 0
     started_at: float = 0.0
 

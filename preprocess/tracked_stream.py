@@ -211,6 +211,7 @@ class TrackedStream(WrappedSource):
             else:
                 self._skipped.mark(frame.time_s)
                 yield frame, found
+        self.all_came = True
         in_time = LATER_S * self._taken / (time.perf_counter() - self._began)
         for frame in self._skipped.take(max(int(in_time), LEAST_FRAMES - self._taken)):
             self.tracked_later += 1

@@ -56,6 +56,8 @@ swings of the parameters leave their mean closer to the optimum."""
 CLOSING_S = 2.0
 """Time after the last frame of a paced source in which rates fall and surfaces become firm,
 seconds: a user waits."""
+LATE_FRAMES_S = 1.0
+"""Time for which frames are learnt that come while rates are falling, seconds."""
 LEAST_STEPS = 250
 """Steps that a paced source is trained for, however short it is; fewer make no surface."""
 EVALUATION_TIME_SHARE = 0.004
@@ -93,11 +95,12 @@ def train(
     """Trains on the frames that have arrived until the time, or the steps, are used up.
 
     The learning rate is constant while frames arrive and falls as a cosine after the last one; of a
-    paced source for `CLOSING_S`, if no more time is left. No frame of a recording is lost: if the
-    time is too short to read them all beside training, reading takes precedence and may overrun the
-    time. Frames of a paced source are not waited for, except for the first. A live source is left
-    when the time is up, and training closes with the last frame of a folder that grows. Where steps
-    are counted, one more frame of a recording is read before each step until all are read.
+    paced source for `CLOSING_S`, if no more time is left, while skipped frames still come. No frame
+    of a recording is lost: if the time is too short to read them all beside training, reading takes
+    precedence and may overrun the time. Frames of a paced source are not waited for, except for the
+    first. A live source is left when the time is up, and training closes with the last frame of a
+    folder that grows. Where steps are counted, one more frame of a recording is read before each
+    step until all are read.
 
     Held-out frames that arrive are appended to `held_out`. Events are yielded on the caller's
     thread; the time the caller spends on one counts as training time.
@@ -172,8 +175,9 @@ class _FrameIntake:
     ) -> None:
         self._trainer, self._inbox, self._held_out = trainer, inbox, held_out
         self._began = trainer.scheduled_seconds
+        self._closing_from: float | None = None
         self._ended_at: float | None = None
-        self._end, self._steps_before_end, self._least_steps = trainer.config.seconds, 0, 0
+        self._steps_before_closing = self._least_steps = 0
         self._last_frame_step: int | None = None
         self.clock = TrainingClock(trainer)
         self._started = len(trainer.replay) > 0  # a resumed run remembers frames
@@ -204,10 +208,10 @@ class _FrameIntake:
         too_late = self._inbox.live and self._started and now >= self._trainer.config.seconds
         if self._inbox.finished or too_late:
             self._ended_at = self.clock.read()
+        if self._closing_from is None and (self.ended or self._inbox.all_came()):
+            self._closing_from = self.clock.read()
             if self._inbox.paced:
-                least = 0.0 if self._inbox.ends_run else self._end
-                self._end = max(least, self._ended_at + CLOSING_S)
-                self._steps_before_end, self._least_steps = self._trainer.steps, LEAST_STEPS
+                self._steps_before_closing, self._least_steps = self._trainer.steps, LEAST_STEPS
 
     def _accept(self, item: StreamItem) -> Iterator[FrameArrived | FrameLeftOut]:
         if isinstance(item, DroppedFrame):
@@ -249,18 +253,27 @@ class _FrameIntake:
     def is_done(self, now: float) -> bool:
         """True if the schedule is over and every frame has been trained on."""
         config, admitted_at = self._trainer.config, self._last_frame_step
-        if not self.ended or now < self._end:
+        if not self.ended or now < self._end(now):
             return False
         farewell = 0 if config.steps or admitted_at is None else MIN_STEPS_AFTER_LAST_FRAME
         return self._trainer.steps >= max((admitted_at or 0) + farewell, self._least_steps)
 
+    def _end(self, now: float) -> float:
+        """The time at which training ends; it moves on while frames come."""
+        end = self._trainer.config.seconds
+        if self._closing_from is None or not self._inbox.paced:
+            return end
+        last = now if self._ended_at is None else self._ended_at
+        least = 0.0 if self._inbox.ends_run else end
+        return max(least, self._closing_from + CLOSING_S, last + LATE_FRAMES_S)
+
     def progress(self, now: float) -> float:
-        """Elapsed share of the time after the last frame, in [0, 1]; 0 before it."""
-        if self._ended_at is None:
+        """Elapsed share of the time in which rates fall, in [0, 1]; 0 before it."""
+        if self._closing_from is None:
             return 0.0
-        in_time = (now - self._ended_at) / max(self._end - self._ended_at, 1e-6)
-        left = self._least_steps - self._steps_before_end
-        made = self._trainer.steps - self._steps_before_end
+        in_time = (now - self._closing_from) / max(self._end(now) - self._closing_from, 1e-6)
+        left = self._least_steps - self._steps_before_closing
+        made = self._trainer.steps - self._steps_before_closing
         return in_time if left <= 0 else min(in_time, made / left)
 
     def share_done(self, now: float) -> float:

@@ -147,6 +147,7 @@ class TrainingSession:
         inbox = Inbox(
             self._frame_stream(),
             paced=source.paced, live=source.live, ends_run=self.meter.grows,
+            all_came=lambda: source.all_came,
         )  # fmt: skip
         try:
             restored = self._restore_frames(inbox, self._restore_count)

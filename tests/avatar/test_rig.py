@@ -5,7 +5,12 @@ import pytest
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from avatar.rig import PART_OF_JOINT, canonical_rotations
+from avatar.rig import (
+    DISTANCE_CELL_M,
+    PART_OF_JOINT,
+    SEARCHED_WITHIN_M,
+    canonical_rotations,
+)
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import PARENTS
 
@@ -131,10 +136,11 @@ def test_the_distance_is_that_to_the_nearest_vertex(rig, skin, rng):
     centers = rig.box_low + (cell + 0.5) / shape * (rig.box_high - rig.box_low)
     expected = np.sqrt(((centers[:, None] - skin[None]) ** 2).sum(axis=-1)).min(axis=1)
     found = rig.skin_distance[tuple(cell.T)]
-    near = expected < 0.18
+    near, within = expected < SEARCHED_WITHIN_M - DISTANCE_CELL_M, expected < 0.18
     assert near.any()
-    assert not near.all()
+    assert not within.all()
     np.testing.assert_allclose(found[near], expected[near], atol=1e-5)
+    np.testing.assert_allclose(found[within], expected[within], atol=DISTANCE_CELL_M)
     assert (found[expected > 0.2] == 1.0).all()
 
 

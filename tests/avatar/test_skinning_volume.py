@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from avatar.rig import (
     BLENDED_VERTICES,
     MIN_VERTEX_DISTANCE_M,
+    SEARCHED_WITHIN_M,
     skin_distance_volume,
     skinning_weight_volume,
     volume_shape,
@@ -108,6 +109,18 @@ def test_the_distance_to_a_single_vertex_is_exact(place):
     shape = np.array(distance.shape)
     index = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=-1)
     expected = np.linalg.norm(LOW + (index + 0.5) / shape * (HIGH - LOW) - vertex, axis=-1)
-    within = expected < 0.3 - 1e-6
-    np.testing.assert_allclose(distance[within], expected[within], atol=1e-6)
-    assert (distance[expected > 0.3 + 1e-6] == 1.0).all()
+    near, within = expected < SEARCHED_WITHIN_M - CELL_M, expected < 0.25
+    np.testing.assert_allclose(distance[near], expected[near], atol=1e-6)
+    np.testing.assert_allclose(distance[within], expected[within], atol=CELL_M)
+    assert (distance[expected > 0.35] == 1.0).all()
+
+
+def test_far_from_the_skin_distances_are_between_their_neighbors():
+    """Cells as small as those in use: off by millimetres, and none of a body with a gap nearby."""
+    vertices = np.random.default_rng(3).normal(size=(60, 3)) * [0.1, 0.08, 0.05]
+    distance, inside = skin_distance_volume(vertices, vertices, LOW, HIGH, 0.015, 0.3)
+    places = np.argwhere(distance < 0.3)[::37]
+    points = LOW + (places + 0.5) / distance.shape * (HIGH - LOW)
+    expected = np.linalg.norm(points[:, None] - vertices, axis=-1).min(axis=1)
+    np.testing.assert_allclose(distance[tuple(places.T)], expected, atol=0.012)
+    assert not inside[distance == 1.0].any()

@@ -79,10 +79,10 @@ class Browser:
         found = self._ask("Target.getTargets", whole=True)["targetInfos"]
         return [target["targetId"] for target in found if target["type"] == "page"]
 
-    def __exit__(self, kind: object, *error: object) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         try:
-            if kind is not None:  # pytest shows it with the failed test
-                print(f"The page says:\n{self.text()}\nThe browser says:", *self._complaints)
+            if error is not None:
+                error.add_note(f"The page: {self.text()}\nThe browser: {self._complaints}")
         finally:
             self._close()
 
