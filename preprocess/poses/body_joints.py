@@ -4,7 +4,7 @@ One table says where each body has our joints; whatever a program calls its arra
 brought into one order, and our body is fitted to them (`preprocess.fitting.joint_fitting`).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any, NamedTuple
@@ -206,6 +206,33 @@ def parse_joints(content: Any, prefer_world: bool = False) -> MotionByPerson | N
             last[name] = place
             people.setdefault(name, []).append(item)
     return {name: _join(rows, fps).fitted() for name, rows in people.items()}
+
+
+def fit_mhr(
+    places: Float[np.ndarray, "rows nodes 3"], nodes: Mapping[int, int], fps: float
+) -> Motion:
+    """Our body's motion by the joints of MHR in the world, in any unit.
+
+    Args:
+        places: Of all nodes of a file.
+        nodes: The node of each of MHR's joints by its number.
+        fps: Rows a second.
+
+    Raises:
+        ValueError: If joints are missing, or are not those of a person.
+    """
+    columns = _columns("MHR", None)
+    joints = {number: point for point, number in columns.items() if point in JOINT_NAMES}
+    missing = [f"{number:03d} ({joints[number]})" for number in joints if number not in nodes]
+    if missing:
+        raise ValueError(
+            f"its joints are numbered, but not as MHR's 127 are: {', '.join(missing)} are missing"
+        )
+    found = np.full((len(places), len(POINT_NAMES), 3), np.nan)
+    for point, number in columns.items():
+        if number in nodes:
+            found[:, POINT_NAMES.index(point)] = places[:, nodes[number]]
+    return JointTrack(body="MHR", places=found, fps=fps, program="SAM 3D Body").fitted()
 
 
 class _Item(NamedTuple):

@@ -5,6 +5,7 @@ animation, or None if the content is another's.
 """
 
 import json
+import re
 import struct
 from typing import Any
 
@@ -12,11 +13,14 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 
+from preprocess.poses.body_joints import fit_mhr
 from preprocess.poses.motion_builder import MotionByPerson
 from preprocess.poses.skeleton_motion import SkeletonMotion
 
 BVH_START, GLB_START = b"HIERARCHY", b"glTF"
 """First bytes by which the content of either file is recognised."""
+NUMBERED_JOINT = r"(?:bone|[Jj]oint)_(\d{3})"
+"""Names of joints in the files that ComfyUI's nodes write of SAM 3D Body's MHR."""
 GLTF_FPS = 30.0
 """Poses per second that are read of an animation whose keys lie farther apart."""
 MAX_KEY_STEP_S = 0.1
@@ -75,7 +79,7 @@ def parse_bvh(content: Any, prefer_world: bool = False) -> MotionByPerson | None
         translations=translations,
         times_s=np.arange(count) * frame_time,
     )
-    return {"0": skeleton.retarget()}
+    return _motions("0", skeleton)
 
 
 def _bvh_hierarchy(
@@ -146,11 +150,31 @@ def parse_gltf(content: Any, prefer_world: bool = False) -> MotionByPerson | Non
     animations = text.get("animations", [])
     if not animations:
         raise ValueError("it has no animation")
-    motions = {}
+    motions: MotionByPerson = {}
     for number, animation in enumerate(animations):
         skeleton = _gltf_motion(text, binary, names, animation)
-        motions[str(animation.get("name", number))] = skeleton.retarget()
+        motions |= _motions(str(animation.get("name", number)), skeleton)
     return motions
+
+
+def _motions(name: str, skeleton: SkeletonMotion) -> MotionByPerson:
+    """The motion of a skeleton, or those of several whose joints bear MHR's numbers (ComfyUI's)."""
+    people: dict[str, dict[int, int]] = {}
+    for joint, called in enumerate(skeleton.names):
+        numbered = re.fullmatch(NUMBERED_JOINT, called)
+        if numbered:
+            root = joint
+            while skeleton.parents[root] >= 0:
+                root = int(skeleton.parents[root])
+            joints = people.setdefault(skeleton.names[root], {1: root})  # BVH's root is `Hips`
+            joints[int(numbered[1])] = joint
+    if not people:
+        return {name: skeleton.retarget()}
+    places, step = skeleton.places(), float(np.median(np.diff(skeleton.times_s, prepend=-1.0)))
+    return {
+        name if len(people) == 1 else person: fit_mhr(places, joints, 1.0 / step)
+        for person, joints in people.items()
+    }
 
 
 def _glb_chunks(content: bytes) -> tuple[dict[str, Any], bytes]:

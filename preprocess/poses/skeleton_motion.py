@@ -40,6 +40,8 @@ ROOT_NAMES, HEAD_NAMES = ("hips", "pelvis", "hip", "root"), ("head", "chead", "n
 """Names of the joints on the body's axis; those between them are taken by their order."""
 MAX_CANDIDATES = 200
 """Most poses of a motion that are compared with SMPL's rest pose."""
+MAX_SIDE_RATIO, MAX_LIMB_RATIO = 1.5, 3.0
+"""Largest ratio of a bone's length to that on the other side, and of the two bones of a limb."""
 METRIC_LEGS_M = (0.5, 1.2)
 """Length of a leg, metres, of a skeleton of SMPL's own joints that is taken to be in metres."""
 
@@ -66,11 +68,16 @@ class SkeletonMotion:
     translations: Float[np.ndarray, "poses joints 3"]
     times_s: Float[np.ndarray, "poses"]
 
+    def places(self) -> Float[np.ndarray, "poses joints 3"]:
+        """Places of all joints in the world, in the file's unit."""
+        return _forward(self.parents, self.rotations, self.translations)[1]
+
     def retarget(self) -> Motion:
         """The motion as SMPL's: y up, metres by the length of the legs.
 
         Raises:
-            ValueError: If joints that are needed have no name that is known.
+            ValueError: If joints that are needed have no name that is known, or their bones are
+                not those of a person.
         """
         target = load_body_model().joints
         source = match_joints(self.names, self.parents)
@@ -88,6 +95,7 @@ class SkeletonMotion:
         up = find_upright(places[:-1, columns])
         turned, places = up @ turned, places @ up.T
         points = places[:, columns]
+        _check_limbs(points[-1])
         if is_smpl:
             reference, matched = len(turned) - 1, np.broadcast_to(np.eye(3), (24, 3, 3))
         else:
@@ -220,6 +228,27 @@ def find_upright(points: Float[np.ndarray, "poses 24 3"]) -> Float[np.ndarray, "
 def _leg_length(points: Float[np.ndarray, "24 3"]) -> float:
     joints = [JOINT_NAMES.index(f"left_{name}") for name in ("hip", "knee", "ankle")]
     return float(np.linalg.norm(np.diff(points[joints], axis=0), axis=1).sum())
+
+
+def _check_limbs(points: Float[np.ndarray, "24 3"]) -> None:
+    """Refuse bones of lengths that no person has: a program may give joints others' names."""
+    start, end = np.array(LIMBS).T
+    lengths = np.linalg.norm(points[end] - points[start], axis=-1).reshape(2, 2, 2)
+    lengths = np.maximum(lengths, 1e-9)
+    sides = np.abs(np.log(lengths[0] / lengths[1]))
+    halves = np.abs(np.log(lengths[..., 0] / lengths[..., 1]))
+    if not (sides.max() < np.log(MAX_SIDE_RATIO) and halves.max() < np.log(MAX_LIMB_RATIO)):
+        said = ", ".join(
+            f"{side} {limb} {length / lengths.max():.2f}"
+            for side, legs_and_arms in zip(("left", "right"), lengths, strict=True)
+            for limb, length in zip(
+                ("thigh", "shin", "upper arm", "forearm"), legs_and_arms.ravel(), strict=True
+            )
+        )
+        raise ValueError(
+            f"its bones are not those of a person, whatever they are called ({said} of the "
+            "longest): the program that wrote it has taken other joints for them"
+        )
 
 
 def _frames(points: Float[np.ndarray, "poses 24 3"]) -> Float[np.ndarray, "poses 3 3"]:

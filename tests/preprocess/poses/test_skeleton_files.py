@@ -10,6 +10,9 @@ from scipy.spatial.transform import Rotation
 from capture.input_error import InputError
 from preprocess.body.kinematics import JOINT_NAMES, PARENTS, body_from_rest, rotation_matrices
 from preprocess.body.parametric_body import load_body_model
+from preprocess.body.proportion_space import shape_for_motion
+from preprocess.fitting.clip_poses import ClipPoses
+from preprocess.poses.body_joints import BODIES, MIDDLE_JOINTS, SIDE_JOINTS
 from preprocess.poses.pose_format_registry import read_poses
 
 SIDED = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist")
@@ -50,6 +53,12 @@ MHR = named(
     "{s}_{limb}",
 )
 SMPL = {name: name for name in JOINT_NAMES}
+NUMBERS = {point: known[BODIES.index("MHR")] for point, known in MIDDLE_JOINTS.items()} | {
+    f"{side}_{point}": known[0][place]
+    for point, known in SIDE_JOINTS.items() if known[0]
+    for place, side in enumerate(("left", "right"))
+}  # fmt: skip
+"""MHR's numbers of SMPL's joints."""
 FRAMES = 12
 DEGREES = 180.0 / np.pi
 
@@ -221,6 +230,82 @@ def test_a_skeleton_of_any_names_units_and_axes_moves_as_the_truth(
     rate = {"bvh": 60.0, "glb": 25.0}[form]
     assert motion.times_s is not None
     np.testing.assert_allclose(motion.times_s, np.arange(FRAMES) / rate, atol=1e-5)
+
+
+def numbered(pattern):
+    return {name: pattern.format(NUMBERS[name]) for name in JOINT_NAMES if NUMBERS.get(name)}
+
+
+def test_comfyuis_bvh_of_mhr_is_read_by_the_numbers_of_its_joints(truth, tmp_path):
+    names = numbered("joint_{:03d}") | {"pelvis": "Hips"}
+    path = tmp_path / "sam3dbody.bvh"
+    path.write_bytes(Rig(names, unit=100.0, twist=0.7).bvh(*truth))
+    motion = read_poses(path)
+    assert motion.program == "SAM 3D Body"
+    assert "joints of MHR" in motion.note
+    assert motion.times_s[-1] == pytest.approx((FRAMES - 1) / 60.0)
+    assert fitted_m(motion, truth) < 0.005
+
+
+def fitted_m(motion, truth):
+    """Mean distance of limbs' joints, each body in its own proportions; floors differ."""
+    space = [shape_for_motion(load_body_model(), motion), load_body_model().with_shape()]
+    own = ClipPoses.of(motion, range(len(motion)))
+    turned = rotation_matrices(truth[0])
+    true = ClipPoses(rotations=turned, translations=truth[1] - space[1].joints[0])
+    ours, theirs = (
+        poses.joints(body.joints, np.array(PARENTS)).places
+        for poses, body in zip((own, true), space, strict=True)
+    )
+    limbs = [JOINT_NAMES.index(f"{side}_{name}") for side in ("left", "right")
+             for name in ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")]  # fmt: skip
+    return np.linalg.norm(ours - theirs, axis=-1)[:, limbs].mean()
+
+
+def test_people_of_comfyuis_glb_are_kept_apart(truth, tmp_path):
+    data = Rig(numbered("bone_{:03d}"), twist=0.7).glb(*truth)
+    size = struct.unpack_from("<I", data, 12)[0]
+    text = json.loads(data[20 : 20 + size])
+    nodes, (animation,) = text["nodes"], text["animations"]
+    count, channels = len(nodes), animation["channels"]
+    moved = json.loads(json.dumps(nodes))
+    for node in moved:
+        node["children"] = [child + count for child in node.get("children", [])]
+    nodes += [*moved, {"name": "track00", "children": [0]},
+              {"name": "track01", "children": [count], "translation": [2.0, 0.0, 0.0]}]  # fmt: skip
+    channels += [
+        each | {"target": each["target"] | {"node": each["target"]["node"] + count}}
+        for each in channels
+    ]
+    text = json.dumps(text).encode()
+    text += b" " * (-len(text) % 4)
+    path = tmp_path / "all_tracks.glb"
+    path.write_bytes(data[:12] + struct.pack("<I4s", len(text), b"JSON") + text + data[20 + size :])
+    rotations, places = truth
+    for person, aside in (("track00", 0.0), ("track01", 2.0)):
+        motion = read_poses(path, person=person)
+        assert fitted_m(motion, (rotations, places + np.array([aside, 0.0, 0.0]))) < 0.005
+
+
+def test_numbers_of_another_skeleton_are_named(truth, tmp_path):
+    names = numbered("Joint_{:03d}") | {"pelvis": "Hips", "head": "Joint_114"}
+    path = tmp_path / "other.bvh"
+    path.write_bytes(Rig(names).bvh(*truth))
+    with pytest.raises(InputError, match=r"other\.bvh.*not as MHR's 127.*113 \(head\)"):
+        read_poses(path)
+
+
+def test_joints_under_the_names_of_others_are_refused_by_their_bones(truth, tmp_path):
+    """As where MHR's joints are taken for SMPL's: the left knee is then a foot."""
+    rig = Rig(MIXAMO, unit=100.0)
+    knee, ankle = (rig.names.index(MIXAMO[f"left_{name}"]) for name in ("knee", "ankle"))
+    rig.offsets[knee], rig.offsets[ankle] = 2.0 * rig.offsets[knee], 0.2 * rig.offsets[ankle]
+    path = tmp_path / "wrong.bvh"
+    path.write_bytes(rig.bvh(*truth))
+    with pytest.raises(
+        InputError, match=r"not those of a person.*left thigh 1\.00, left shin 0\.1"
+    ):
+        read_poses(path)
 
 
 def test_a_gltf_whose_motion_holds_no_t_is_read_by_its_rest_pose(truth, tmp_path):
