@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.training import checkpoint
-from avatar.training.checkpoint import LAST_RUN_FILE, SavedFrames
+from avatar.training.checkpoint import LAST_RUN_FILE, load_frames
 from avatar.training.held_out_pose_fitting import fit_test_poses
 from avatar.training.pose_optimizer import PoseOptimizer
 from avatar.training.trainer import Trainer
@@ -72,9 +72,8 @@ def learnt_pose_error_deg(run: Path, capture: Path) -> float:
     trainer, _ = checkpoint.load(run / "checkpoint")
     truth = read_poses(capture / "truth" / "poses.npz")
     true_camera = _camera(capture / "truth" / "cameras.npz")
-    saved = SavedFrames.load(run / "checkpoint" / LAST_RUN_FILE)
     errors = []
-    for frame in saved.replay_frames:
+    for frame in load_frames(run / "checkpoint" / LAST_RUN_FILE):
         pose = corrected_pose(trainer, frame.index, frame.pose)
         errors.append(pose_error_deg((pose, frame.view.camera), (truth[frame.index], true_camera)))
     return float(np.mean(errors))

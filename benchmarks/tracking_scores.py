@@ -7,12 +7,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from avatar.evaluation.held_out import HeldOutFrame, score_frame
+from avatar.evaluation.held_out import HeldOutFrame, score_frame, subsample_evenly
 from avatar.training import checkpoint
-from avatar.training.checkpoint import LAST_RUN_FILE, SavedFrames
 from avatar.training.held_out_pose_fitting import fit_test_poses
 from benchmarks.real_scores import TRACKED_JOINTS
 from capture.input_error import InputError
+from instant_avatar.evaluation.evaluation_frames import held_out_frames
+from instant_avatar.run.run_folder import RunFolder
 from preprocess.alignment.silhouette_objective import spaced_indices
 from preprocess.body.body_surface import MeshSilhouette, soft_iou
 from preprocess.capture_inputs import CaptureInputs
@@ -24,6 +25,8 @@ SIDES = ((1, 2), (16, 17))
 """Left and right: hips, and shoulders."""
 COMPARED_FRAMES = 60
 """Most frames, evenly spread, whose masks are compared."""
+SCORED_FRAMES = 12
+"""Most held-out frames, evenly spread, that are scored."""
 
 Joints = Float[np.ndarray, "frames 24 3"]
 
@@ -162,12 +165,10 @@ def held_out_on_exact_masks(run: Path, truth: Path) -> float:
     Two runs with masks of their own are then compared with the same pictures.
     """
     trainer, _ = checkpoint.load(run / "checkpoint")
-    kept = SavedFrames.load(run / "checkpoint" / LAST_RUN_FILE).held_out
     masks = open_masks(truth / "masks")
     frames = []
-    for each in kept:
-        seen = each.observation
+    for seen in held_out_frames(RunFolder(path=run), None):
         alpha = masks.alpha(seen.frame.index, seen.camera.size_px)
         frames.append(HeldOutFrame(observation=dataclasses.replace(seen, alpha=alpha)))
-    fitted = fit_test_poses(trainer, frames)
+    fitted = fit_test_poses(trainer, subsample_evenly(frames, SCORED_FRAMES))
     return float(np.mean([score_frame(trainer.avatar, frame).psnr for frame in fitted]))

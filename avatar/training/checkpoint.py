@@ -2,33 +2,28 @@
 
 Frames are saved beside the state to train a finished avatar further with another video. Keyframes
 are saved as the replay buffer holds them, with 8-bit colors and their view; rays and
-correspondences are recomputed. A few held-out frames are saved to measure forgetting.
+correspondences are recomputed.
 """
 
 import copy
 import dataclasses
 import pickle
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 
 from avatar.config import TrainConfig
-from avatar.evaluation.held_out import HeldOutFrame, subsample_evenly
 from avatar.rig import Rig
-from avatar.training.frame_stream import TrainingFrame, rebuild_frame
-from avatar.training.replay_buffer import ReplayBuffer, ReplayFrame
+from avatar.training.replay_buffer import ReplayFrame
 from avatar.training.trainer import Trainer
 from avatar.training.training_pixels import RayView
 from capture.atomic_files import atomic_file
 from capture.camera import Camera
 from capture.input_error import InputError
-from capture.source import Frame
 from preprocess.body.body_pose import BodyPose
-from preprocess.observation import Observation
 
 CHECKPOINT_FORMAT = 3
 """Version of the checkpoint's layout; another version is refused."""
@@ -164,88 +159,38 @@ LAST_RUN_FILE = "frames.tensors"
 EARLIER_VIDEOS_FILE = "earlier.tensors"
 """File of the frames of all videos before the current one."""
 INDEX_SHIFT_PER_VIDEO = 1 << 32
-"""Offset by which the indices of each earlier video's frames are lowered, which keeps them unique;
-`number_in_video` removes it for display."""
-MAX_HELD_OUT_KEPT = 12
-"""Held-out frames that are saved."""
+"""Offset by which the indices of each earlier video's frames are lowered: they stay unique."""
 
 
-def number_in_video(index: int) -> int:
-    """A frame's number in its own video."""
-    return index % INDEX_SHIFT_PER_VIDEO
+def as_earlier_video(frames: Sequence[ReplayFrame]) -> list[ReplayFrame]:
+    """Key frames with their indices shifted to those of an earlier video."""
+    return [frame._replace(index=frame.index - INDEX_SHIFT_PER_VIDEO) for frame in frames]
 
 
-def video_age(index: int) -> int:
-    """Number of videos added since a frame's own; 0 for the current video."""
-    return -(index // INDEX_SHIFT_PER_VIDEO)
+def save_frames(frames: Sequence[ReplayFrame], path: Path) -> None:
+    """Writes key frames, whole or not at all."""
+    plain = [_to_plain(frame) for frame in frames]
+    save_atomically({"format": REPLAY_FILE_FORMAT, "replay": plain}, path)
 
 
-class SavedFrames(NamedTuple):
-    """The frames that are saved: those to train on, and held-out ones, only scored."""
-
-    replay_frames: list[ReplayFrame]
-    held_out: list[HeldOutFrame]
-
-    @classmethod
-    def of(cls, replay: ReplayBuffer, held_out: Sequence[HeldOutFrame]) -> "SavedFrames":
-        """All frames of the replay buffer, and a few of the held-out frames, evenly spaced."""
-        return cls(replay.replay_frames(), subsample_evenly(list(held_out), MAX_HELD_OUT_KEPT))
-
-    def as_earlier_video(self) -> "SavedFrames":
-        """The frames with their indices shifted to those of an earlier video."""
-        return SavedFrames(
-            [
-                frame._replace(index=frame.index - INDEX_SHIFT_PER_VIDEO)
-                for frame in self.replay_frames
-            ],
-            [_of_earlier_video(kept) for kept in self.held_out],
-        )
-
-    def training_frames(self, rig: Rig) -> list[TrainingFrame]:
-        """The key frames, ready to be learnt from again."""
-        return [rebuild_frame(*frame[:4], rig, head=frame.head) for frame in self.replay_frames]
-
-    def save(self, path: Path) -> None:
-        """Writes them, whole or not at all; of held-out frames only what scoring needs."""
-        held = []
-        for observation in (kept.observation for kept in self.held_out):
-            frame = observation.frame
-            frame = Frame(index=frame.index, time_s=frame.time_s, rgb=frame.rgb)
-            held.append(replace(observation, frame=frame, filmed_rgb=None))
-        replay, held = _to_plain(self.replay_frames), _to_plain(held)
-        save_atomically({"format": REPLAY_FILE_FORMAT, "replay": replay, "held_out": held}, path)
-
-    @classmethod
-    def load(cls, path: Path) -> "SavedFrames":
-        """Reads them; none if there is no such file."""
-        if not path.exists():
-            return cls([], [])
-        try:
-            state = torch.load(path, map_location="cpu", weights_only=True)
-            if state["format"] != REPLAY_FILE_FORMAT:
-                raise ValueError(f"format {state['format']} instead of {REPLAY_FILE_FORMAT}")
-            return cls(
-                [_from_plain(frame) for frame in state["replay"]],
-                [HeldOutFrame(observation=_from_plain(kept)) for kept in state["held_out"]],
-            )
-        except (OSError, RuntimeError, EOFError, KeyError, ValueError, TypeError,
-                pickle.UnpicklingError) as error:  # fmt: skip
-            raise InputError(
-                f"The frames {path} cannot be read ({error}). Expected those that ia-ingest wrote; "
-                "without the file the older video is no longer learnt from."
-            ) from error
+def load_frames(path: Path) -> list[ReplayFrame]:
+    """Reads key frames; none if there is no such file."""
+    if not path.exists():
+        return []
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        if state["format"] != REPLAY_FILE_FORMAT:
+            raise ValueError(f"format {state['format']} instead of {REPLAY_FILE_FORMAT}")
+        return [_from_plain(frame) for frame in state["replay"]]
+    except (OSError, RuntimeError, EOFError, KeyError, ValueError, TypeError,
+            pickle.UnpicklingError) as error:  # fmt: skip
+        raise InputError(
+            f"The frames {path} cannot be read ({error}). Expected those that ia-ingest wrote; "
+            "without the file the older video is no longer learnt from."
+        ) from error
 
 
-def _of_earlier_video(held_out: HeldOutFrame) -> HeldOutFrame:
-    frame = held_out.observation.frame
-    frame = replace(frame, index=frame.index - INDEX_SHIFT_PER_VIDEO)
-    return replace(held_out, observation=replace(held_out.observation, frame=frame))
-
-
-SAVED_RECORDS = {
-    record.__name__: record
-    for record in (ReplayFrame, RayView, Observation, Frame, Camera, BodyPose)
-}
+SAVED_RECORDS = {record.__name__: record for record in (ReplayFrame, RayView, Camera, BodyPose)}
 """Records that saved frames consist of, by name."""
 
 
@@ -256,8 +201,7 @@ def _to_plain(value: Any) -> Any:
     name = type(value).__name__
     if name in SAVED_RECORDS:
         fields = value._asdict() if hasattr(value, "_asdict") else vars(value)
-        kept = {k: _to_plain(v) for k, v in fields.items() if not isinstance(v, frozenset)}
-        return {"record": name} | kept
+        return {"record": name} | {key: _to_plain(part) for key, part in fields.items()}
     return [_to_plain(part) for part in value] if isinstance(value, tuple | list) else value
 
 

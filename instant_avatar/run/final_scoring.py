@@ -35,8 +35,11 @@ from avatar.training.checkpoint import (
     EARLIER_VIDEOS_FILE,
     INDEX_SHIFT_PER_VIDEO,
     LAST_RUN_FILE,
-    SavedFrames,
+    as_earlier_video,
+    load_frames,
+    save_frames,
 )
+from avatar.training.frame_stream import rebuild_frame
 from avatar.training.held_out_pose_fitting import fit_test_poses
 from avatar.training.trainer import Trainer
 from export.build import ExportReport
@@ -260,14 +263,12 @@ class EarlierVideos:
         """
         self._run, self._notes = run, notes
         began = "before" in notes  # otherwise the file is from a run that was killed at its start
-        self._kept = (
-            SavedFrames.load(run.checkpoint / EARLIER_VIDEOS_FILE) if began else SavedFrames([], [])
-        )
+        self._kept = load_frames(run.checkpoint / EARLIER_VIDEOS_FILE) if began else []
 
     def start_new_video(self, trainer: Trainer, console: Console) -> None:
         """Turn the previous video into an earlier one, whose key frames are replayed."""
-        self._kept = SavedFrames.load(self._run.checkpoint / LAST_RUN_FILE).as_earlier_video()
-        self._kept.save(self._run.checkpoint / EARLIER_VIDEOS_FILE)
+        self._kept = as_earlier_video(load_frames(self._run.checkpoint / LAST_RUN_FILE))
+        save_frames(self._kept, self._run.checkpoint / EARLIER_VIDEOS_FILE)
         trainer.pose_corrections = {
             index - INDEX_SHIFT_PER_VIDEO: correction
             for index, correction in trainer.pose_corrections.items()
@@ -276,7 +277,7 @@ class EarlierVideos:
         trainer.exposures.restore(
             {index - INDEX_SHIFT_PER_VIDEO: gain for index, gain in gains.items()}
         )
-        if not self._kept.replay_frames:
+        if not self._kept:
             console.warning(
                 "The previous video's run did not finish, so its key frames were not saved and "
                 "cannot be replayed."
@@ -291,16 +292,16 @@ class EarlierVideos:
 
     def restore_key_frames(self, trainer: Trainer, console: Console) -> None:
         """Put the key frames of earlier videos back into the replay buffer."""
-        if not self._kept.replay_frames:
+        if not self._kept:
             return
-        count = len(self._kept.replay_frames)
-        with console.status(f"preparing {count} frames of the earlier video"):
-            for frame in self._kept.training_frames(trainer.avatar.rig):
-                trainer.add_frame(frame, is_restored=True)
+        with console.status(f"preparing {len(self._kept)} frames of the earlier video"):
+            for frame in self._kept:
+                restored = rebuild_frame(*frame[:4], trainer.avatar.rig, head=frame.head)
+                trainer.add_frame(restored, is_restored=True)
 
-    def save_frames(self, trainer: Trainer, held_out: list[HeldOutFrame]) -> None:
+    def save_frames(self, trainer: Trainer) -> None:
         """Save the frames of this video for the next one."""
-        SavedFrames.of(trainer.replay, held_out).save(self._run.checkpoint / LAST_RUN_FILE)
+        save_frames(trainer.replay.replay_frames(), self._run.checkpoint / LAST_RUN_FILE)
 
     def stats(self) -> EarlierVideoStats | None:
         """Describe the earlier videos, if there are any."""
@@ -310,7 +311,7 @@ class EarlierVideos:
             videos=earlier_video_names(self._notes),
             frames_trained=self._notes["before"]["frames"],
             wall_seconds=self._notes["before"]["seconds"],
-            replayed_key_frames=len(self._kept.replay_frames),
+            replayed_key_frames=len(self._kept),
         )
 
     def _previous_video_name(self) -> str:

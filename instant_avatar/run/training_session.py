@@ -122,7 +122,7 @@ class TrainingSession:
         self._check_trained()
         self.trainer.replay.clear_correspondences()  # nothing is learnt from here on
         yield from self._write_packages()
-        EarlierVideos(self._run, self._notes).save_frames(self.trainer, self.held_out)
+        EarlierVideos(self._run, self._notes).save_frames(self.trainer)
         yield from self._score()
         yield Ended(result=self.result)
 

@@ -4,13 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.evaluation.held_out import HeldOutFrame
 from avatar.training.checkpoint import (
     INDEX_SHIFT_PER_VIDEO,
-    MAX_HELD_OUT_KEPT,
-    SavedFrames,
-    number_in_video,
-    video_age,
+    as_earlier_video,
+    load_frames,
+    save_frames,
 )
 from avatar.training.frame_stream import prepare_frame, rebuild_frame
 from avatar.training.replay_buffer import ReplayBuffer
@@ -23,11 +21,11 @@ def frames(rig, clip):
 
 
 @pytest.fixture
-def kept(frames, clip):
+def kept(frames):
     replay = ReplayBuffer(2)
     for frame in frames:
         replay.add(frame)
-    return SavedFrames.of(replay, [HeldOutFrame(observation=o) for o in clip.observations[3:5]])
+    return replay.replay_frames()
 
 
 def test_a_frame_is_rebuilt_from_its_colors_alone(frames, rig):
@@ -62,10 +60,10 @@ def test_replay_returns_the_colors_it_was_given(frames):
 
 
 def test_what_is_written_is_read(kept, tmp_path):
-    kept.save(tmp_path / "frames.tensors")
-    again = SavedFrames.load(tmp_path / "frames.tensors")
+    save_frames(kept, tmp_path / "frames.tensors")
+    again = load_frames(tmp_path / "frames.tensors")
     assert [file.name for file in tmp_path.iterdir()] == ["frames.tensors"]
-    for one, other in zip(kept.replay_frames, again.replay_frames, strict=True):
+    for one, other in zip(kept, again, strict=True):
         assert one.index == other.index
         np.testing.assert_array_equal(one.colors, other.colors)
         np.testing.assert_array_equal(one.view.near_person_bits, other.view.near_person_bits)
@@ -76,39 +74,23 @@ def test_what_is_written_is_read(kept, tmp_path):
         for name in ("focal_px", "center_px", "size_px", "distortion"):
             assert getattr(one.view.camera, name) == getattr(other.view.camera, name)
         np.testing.assert_array_equal(one.pose.joint_rotations, other.pose.joint_rotations)
-    for one, other in zip(kept.held_out, again.held_out, strict=True):
-        assert one.observation.frame.index == other.observation.frame.index
-        np.testing.assert_array_equal(one.observation.frame.rgb, other.observation.frame.rgb)
-        np.testing.assert_allclose(one.observation.alpha, other.observation.alpha, atol=1e-5)
 
 
 def test_frames_of_an_earlier_video_have_numbers_of_their_own(kept):
-    earlier = kept.as_earlier_video().as_earlier_video()
-    assert [frame.index + 2 * INDEX_SHIFT_PER_VIDEO for frame in earlier.replay_frames] == [
-        frame.index for frame in kept.replay_frames
+    earlier = as_earlier_video(as_earlier_video(kept))
+    assert all(frame.index < 0 for frame in earlier)
+    assert [frame.index + 2 * INDEX_SHIFT_PER_VIDEO for frame in earlier] == [
+        frame.index for frame in kept
     ]
-    indices = [h.observation.frame.index for h in earlier.held_out]
-    assert all(index < 0 for index in indices)
-    assert [number_in_video(index) for index in indices] == [3, 4]
-    assert [video_age(index) for index in indices] == [2, 2]
-    assert [video_age(h.observation.frame.index) for h in kept.held_out] == [0, 0]
-
-
-def test_few_held_out_frames_are_kept_of_many(clip):
-    held = [HeldOutFrame(observation=o) for o in clip.observations]
-    kept = SavedFrames.of(ReplayBuffer(1), held)
-    assert len(kept.held_out) == MAX_HELD_OUT_KEPT < len(held)
-    assert kept.held_out[0] is held[0]
-    assert kept.held_out[-1] is held[-1]
 
 
 def test_without_a_file_there_are_no_frames_and_a_damaged_one_is_refused(kept, tmp_path):
     path = tmp_path / "frames.tensors"
-    assert SavedFrames.load(path) == SavedFrames([], [])
-    kept.save(path)
+    assert load_frames(path) == []
+    save_frames(kept, path)
     path.write_bytes(path.read_bytes()[:2000])
     with pytest.raises(InputError, match="cannot be read"):
-        SavedFrames.load(path)
+        load_frames(path)
 
 
 def test_a_full_disk_leaves_the_older_file(kept, tmp_path, monkeypatch):
@@ -120,6 +102,6 @@ def test_a_full_disk_leaves_the_older_file(kept, tmp_path, monkeypatch):
 
     monkeypatch.setattr(torch, "save", full)
     with pytest.raises(OSError, match="No space"):
-        kept.save(path)
+        save_frames(kept, path)
     assert path.read_bytes() == b"older"
     assert [file.name for file in tmp_path.iterdir()] == ["frames.tensors"]

@@ -43,8 +43,8 @@ def test_another_video_is_added_and_both_are_learnt_from(
     assert after["frames"] == {**before["frames"], "dropped": []}  # of the new video alone
     assert after["training"]["steps"] == 2 * before["training"]["steps"]
     # both videos are learnt from, and an interrupted run finds both again
-    kept = checkpoint.SavedFrames.load(out / "checkpoint" / checkpoint.LAST_RUN_FILE)
-    numbers = [frame.index for frame in kept.replay_frames]
+    kept = checkpoint.load_frames(out / "checkpoint" / checkpoint.LAST_RUN_FILE)
+    numbers = [frame.index for frame in kept]
     assert sum(number < 0 for number in numbers) == sum(number >= 0 for number in numbers) == 9
     again = call_ingest(other, "--out", out, "--resume", "--frames", "12:24", GIVEN)
     assert again.code == 0
