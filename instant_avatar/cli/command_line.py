@@ -88,7 +88,6 @@ EXTRAS = {
     **dict.fromkeys(("ray", "fsspec"), "learn,cluster"),
     "viser": "viewer",
     **dict.fromkeys(("aiohttp", "cryptography", "segno"), "phone"),
-    "h5py": "datasets",
 }
 """Optional packages, and the extras that install them."""
 

@@ -3,8 +3,7 @@
 PeopleSnapshot, InstantAvatar's protocol (Jiang et al. 2023, Tab. 1), which follows Anim-NeRF (Chen
 et al. 2021): train on frames of one turn for a minute, score whole frames of another turn on white,
 in poses fitted to them with the avatar frozen. The data set is available from its authors on
-request. Subjects are read in the folders that InstantAvatar's preprocessing writes, or as they are
-distributed: camera.pkl, masks.hdf5, reconstructed_poses.hdf5 and a video.
+request. Subjects are read in the folders that InstantAvatar's preprocessing writes.
 
 NeuMan: frames of a moving camera. A subject (seattle, citron, parkinglot, bike, jogging, lab) has
 images/, COLMAP's sparse/, and segmentations/ (black on the person). Poses are those that HUGS
@@ -20,21 +19,17 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
-from jaxtyping import Float
 
 from capture.atomic_files import atomic_folder
 from capture.image_folder import list_images, write_png
 from capture.input_error import InputError
-from capture.source_opening import open_source
 from instant_avatar.cli.console import Console
 from preprocess.cameras.camera_file import CameraTrack, write_cameras
 from preprocess.cameras.colmap_model import find_colmap_model, read_colmap_model
 from preprocess.cameras.named_camera import NamedCamera
-from preprocess.file_content import read_npz, read_untrusted_file
+from preprocess.file_content import read_npz
 from preprocess.masks.mask_files import Masks, open_masks
 
 
@@ -127,10 +122,6 @@ LONGER_SIDE_PX = 540
 """Longer side of the paper's images: half of the video's."""
 TRAIN_POSES, TEST_POSES = Path("poses/anim_nerf_train.npz"), Path("poses/anim_nerf_test.npz")
 """Anim-NeRF's poses, one row per listed frame; the capture's own replace missing ones."""
-CAMERA_KEYS = ("camera_f", "camera_c", "camera_k", "width", "height")
-"""Keys read of camera.pkl: focal lengths, principal point, OpenCV's distortion, size."""
-Lens = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "k"]]
-"""Intrinsic matrix and OpenCV's distortion."""
 
 
 def find_people_snapshot(folder: Path) -> list[DatasetSubject]:
@@ -139,11 +130,10 @@ def find_people_snapshot(folder: Path) -> list[DatasetSubject]:
     for name in SPLITS:
         for place in (folder / name, folder):
             if place.resolve().name == name and place.is_dir():
-                opening = _open_raw if _is_raw(place) else _open_prepared
                 subjects.append(
                     DatasetSubject(
                         name=name,
-                        open_splits=partial(opening, name, place),
+                        open_splits=partial(_open_prepared, name, place),
                         size_px=LONGER_SIDE_PX,
                         paper=PAPER[name],
                     )
@@ -152,101 +142,21 @@ def find_people_snapshot(folder: Path) -> list[DatasetSubject]:
     return subjects
 
 
-def _is_raw(folder: Path) -> bool:
-    """True if a folder has the layout in which the data set is distributed."""
-    return (folder / "camera.pkl").is_file() and not (folder / "images").is_dir()
-
-
 def _open_prepared(
     name: str, place: Path, _into: Path, _console: Console
 ) -> tuple[SplitFrames, SplitFrames]:
     """Name the frames of a folder that InstantAvatar's preprocessing wrote."""
+    if not (place / "images").is_dir():
+        raise InputError(
+            f"{place} holds no images/. The data set's own files (a video, camera.pkl, HDF5) are "
+            "prepared first: python -m benchmarks.people_snapshot, in a checkout "
+            "(docs/evaluation.md)."
+        )
     train, test = (
         SplitFrames(folder=place, poses=_existing(place / poses), frames=frames)
         for poses, frames in zip((TRAIN_POSES, TEST_POSES), SPLITS[name], strict=True)
     )
     return train, test
-
-
-def _open_raw(
-    name: str, place: Path, into: Path, console: Console
-) -> tuple[SplitFrames, SplitFrames]:
-    """Write the protocol's frames of the original files: undistorted, at half the resolution."""
-    splits = {
-        split: range(*map(int, frames.split(":")))
-        for split, frames in zip(("train", "test"), SPLITS[name], strict=True)
-    }
-    return _write_splits(into / name, splits, partial(_write_raw_frames, place), console)
-
-
-def _write_raw_frames(place: Path, split: str, part: Path, numbers: Sequence[int]) -> Iterator[int]:
-    """Write evenly spaced frames with binary masks, poses and the camera; yield their numbers."""
-    camera, lens = _read_camera(place / "camera.pkl")
-    np.savez(part / "cameras.npz", **camera)
-    given = place / (TRAIN_POSES if split == "train" else TEST_POSES)
-    if not given.is_file():
-        path = place / "reconstructed_poses.hdf5"
-        with _open_hdf5(path, ("pose", "trans", "betas")) as stored:
-            poses = {key: stored[key][()] for key in ("pose", "trans", "betas")}
-        _require_rows(len(poses["pose"]), numbers, path, "poses")
-        rows = {"thetas": poses["pose"][numbers], "transl": poses["trans"][numbers]}
-        np.savez(part / "poses.npz", **rows, betas=poses["betas"].reshape(-1))
-    else:
-        (part / "poses.npz").write_bytes(given.read_bytes())
-    with _open_hdf5(place / "masks.hdf5", ("masks",)) as file:
-        _require_rows(len(file["masks"]), numbers, place / "masks.hdf5", "masks")
-        yield from _write_images(place, part, numbers, file["masks"], lens)
-
-
-def _write_images(
-    place: Path, part: Path, numbers: Sequence[int], masks: Any, lens: Lens
-) -> Iterator[int]:
-    """Write undistorted frames and masks of half the size; yield their numbers."""
-    wanted = slice(numbers[0], numbers[-1] + 1, numbers[1] - numbers[0])
-    for frame in open_source(place, frames=wanted).frames():
-        size = frame.size_px[0] // 2, frame.size_px[1] // 2
-        mask = np.asarray(masks[frame.index], dtype=np.float32)
-        if mask.shape != frame.rgb.shape[:2]:
-            raise InputError(
-                f"{place / 'masks.hdf5'} holds masks of {mask.shape[1]}x{mask.shape[0]} px, the "
-                f"video has {frame.size_px[0]}x{frame.size_px[1]}."
-            )
-        picture, mask = (cv2.undistort(each, *lens) for each in (frame.rgb, mask))
-        picture, mask = (cv2.resize(e, size, interpolation=cv2.INTER_AREA) for e in (picture, mask))
-        name = f"{frame.index:04d}.png"
-        write_png(part / "images" / name, picture)
-        write_png(part / "masks" / name, np.where(mask >= 0.5, 255, 0).astype(np.uint8))
-        yield frame.index
-
-
-def _read_camera(path: Path) -> tuple[dict[str, Any], Lens]:
-    """Read camera.pkl: contents of cameras.npz, and the matrix and distortion of the lens."""
-    stored = read_untrusted_file(path)
-    missing = [key for key in CAMERA_KEYS if not isinstance(stored, dict) or key not in stored]
-    if missing:
-        raise InputError(f"{path} lacks {', '.join(missing)}; expected PeopleSnapshot's camera.")
-    arrays = {key: np.asarray(value, dtype=np.float64).ravel() for key, value in stored.items()}
-    for key in ("camera_rt", "camera_t"):
-        if key in arrays and np.abs(arrays[key]).max(initial=0.0) > 1e-6:
-            raise InputError(f"`{key}` in {path} moves the camera; expected zeros.")
-    (fx, fy), (cx, cy) = arrays["camera_f"], arrays["camera_c"]
-    intrinsic = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    size = {key: int(arrays[key][0]) for key in ("width", "height")}
-    return {"intrinsic": intrinsic, "extrinsic": np.eye(4), **size}, (intrinsic, arrays["camera_k"])
-
-
-def _open_hdf5(path: Path, keys: tuple[str, ...]) -> Any:
-    """Open an HDF5 file of plain arrays."""
-    import h5py  # of the extra [datasets]
-
-    try:
-        file = h5py.File(path, "r")
-        missing = [key for key in keys if key not in file]
-    except OSError as cause:
-        raise InputError(f"{path} is missing, or no HDF5 file that can be read.") from cause
-    if missing:
-        raise InputError(f"{path} lacks {', '.join(missing)}; is it PeopleSnapshot's?")
-    return file
 
 
 def _existing(path: Path) -> Path | None:

@@ -25,10 +25,10 @@ class EvaluateArguments:
         ia-evaluate PeopleSnapshot --body SMPL_MALE.pkl
         ia-evaluate neuman/dataset --body SMPL_NEUTRAL.pkl
 
-    A dataset is a folder with subjects of PeopleSnapshot (as distributed, or in InstantAvatar's
-    layout: male-3-casual, …) or of NeuMan (seattle, …). Each subject is trained on the protocol's
-    training frames for --seconds and scored on its test frames, on white and black, next to the
-    paper's scores (docs/evaluation.md). Subjects that were trained before are not trained again.
+    A dataset is a folder with subjects of PeopleSnapshot (in InstantAvatar's layout:
+    male-3-casual, …) or of NeuMan (seattle, …). Each subject is trained on the protocol's training
+    frames for --seconds and scored on its test frames, on white and black, next to the paper's
+    scores (docs/evaluation.md). Subjects that were trained before are not trained again.
 
     Images are compared on white, in the capture's poses ("given" in a file, or "tracked") and in
     poses fitted to each frame with the avatar frozen ("fitted", as in the paper).
