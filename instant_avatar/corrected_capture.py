@@ -6,7 +6,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from capture.atomic_files import atomic_folder
 from capture.image_folder import list_images, write_png
@@ -23,6 +22,7 @@ from preprocess.alignment.capture_geometry import (
 )
 from preprocess.body.body_pose import Motion
 from preprocess.masks.mask_sources import StoredMasks
+from preprocess.poses.motion_builder import interpolate_rows
 from preprocess.poses.pose_file import write_motion
 
 INTEGER_TOLERANCE = 1e-6
@@ -149,21 +149,4 @@ def _interpolate_motion(geometry: CaptureGeometry, frames: int) -> Motion:
     near = places[right] - places[right - 1] <= 1.5 * frame_step(places)
     gaps = np.minimum(np.abs(places[right] - numbers), np.abs(places[right - 1] - numbers))
     near |= gaps < INTEGER_TOLERANCE  # this frame's own pose, which may lie beside a gap
-
-    def turned(vectors: np.ndarray) -> np.ndarray:
-        return Slerp(places, Rotation.from_rotvec(vectors[order]))(numbers).as_rotvec()
-
-    joints = [turned(motion.joint_rotations[:, joint]) for joint in range(23)]
-    moved = motion.root_translations[order]
-    return replace(
-        motion,
-        root_rotations=turned(motion.root_rotations),
-        root_translations=np.column_stack(
-            [np.interp(numbers, places, moved[:, axis]) for axis in range(3)]
-        ),
-        joint_rotations=np.stack(joints, axis=1),
-        valid=near,
-        frames=numbers,
-        times_s=None,
-        camera_from_world=None,
-    )
+    return replace(interpolate_rows(motion, order, places, numbers), valid=near)

@@ -17,7 +17,9 @@ from scipy.spatial import ConvexHull, KDTree
 from capture.camera import Camera
 from instant_avatar.studio.lighting import (
     LAMP_STRENGTH,
+    ClothingCut,
     bake_light,
+    fibonacci_directions,
     rasterize,
     shade_pixels,
 )
@@ -197,10 +199,7 @@ def _shoe(body: BodyModel, side: float) -> ClothingLayer:
 
 def _bun(body: BodyModel) -> ClothingLayer:
     """A knot of hair on the crown."""
-    angles = np.arange(256) * (np.pi * (3.0 - np.sqrt(5.0)))
-    height = 1.0 - (np.arange(256) + 0.5) / 128.0
-    ring = np.sqrt(1.0 - height**2)
-    ball = np.stack([ring * np.cos(angles), height, ring * np.sin(angles)], axis=1)
+    ball = fibonacci_directions(256)
     points = np.array([-0.002, 0.615, -0.035]) + ball * np.array([0.046, 0.042, 0.046])
     faces = ConvexHull(points).simplices
     scalp = np.flatnonzero(body.template[:, 1] > 0.56)
@@ -326,6 +325,11 @@ class Actor:
         """Skinning weights of all layers: those of the body vertices they hang from."""
         return self.shaped.body.weights[self.body_vertices].astype(np.float64)
 
+    @property
+    def cut(self) -> ClothingCut:
+        """Where the garments end."""
+        return ClothingCut(self.template_points, self.materials, self.outfit.measures)
+
     @cached_property
     def sole_vertices(self) -> Int[np.ndarray, "chosen"]:
         """Numbers of the vertices of the shoes."""
@@ -350,24 +354,15 @@ class Actor:
         self, pose: BodyPose, camera: Camera, supersampling: int = 4
     ) -> tuple[Float32[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]:
         """Return the color of each pixel's covered part, and the covered fraction, in [0, 1]."""
-        cut = self.outfit.measures
         seen = rasterize(
-            self.vertices(pose),
-            self.faces,
-            camera,
-            supersampling=supersampling,
-            template_points=self.template_points,
-            materials=self.materials,
-            measures=cut,
+            self.vertices(pose), self.faces, camera, supersampling=supersampling, cut=self.cut
         )
         return shade_pixels(
             seen,
             faces=self.faces,
-            materials=self.materials,
-            template_points=self.template_points,
+            cut=self.cut,
             light=self.baked_light,
             palette=self.palette,
-            measures=cut,
             checked=self.outfit.checked,
         )
 
@@ -375,13 +370,6 @@ class Actor:
         """Paint on the light of the A-pose; without the lamp the sky's light remains."""
         pose = replace(BodyPose.rest(), joint_rotations=A_POSE.reshape(23, 3))
         points = self.vertices(pose)
-        light = bake_light(
-            points,
-            vertex_normals(points, self.faces),
-            self.faces,
-            template_points=self.template_points,
-            materials=self.materials,
-            measures=self.outfit.measures,
-            lamp_strength=lamp_strength,
-        )
+        normals = vertex_normals(points, self.faces)
+        light = bake_light(points, normals, self.faces, self.cut, lamp_strength=lamp_strength)
         return replace(self, baked_light=light)

@@ -10,7 +10,7 @@ knows neither pose nor view. A pixel is the mean of its covered subsamples.
 """
 
 from dataclasses import dataclass
-from typing import final
+from typing import NamedTuple, final
 
 import numpy as np
 from jaxtyping import Float, Float32, Int32, UInt8
@@ -24,6 +24,23 @@ RenderedFrame = tuple[UInt8[np.ndarray, "height width 3"], Float32[np.ndarray, "
 """A picture of the actor before a background, and the exact soft mask."""
 
 NO_FACE = -1
+
+
+class ClothingCut(NamedTuple):
+    """Where garments end: which parts of triangles `is_visible` denies.
+
+    `template_points` are the vertices' positions on the undressed template.
+    """
+
+    template_points: Float32[np.ndarray, "vertices 3"]
+    materials: Int32[np.ndarray, "faces"]
+    measures: Float32[np.ndarray, "cuts"]
+
+
+UNCUT = ClothingCut(
+    np.zeros((1, 3), dtype=np.float32), np.zeros(0, dtype=np.int32), np.zeros(0, dtype=np.float32)
+)
+"""Triangles that are drawn as a whole."""
 
 
 @final
@@ -50,24 +67,18 @@ def rasterize(
     camera: Camera,
     *,
     supersampling: int = 4,
-    template_points: Float32[np.ndarray, "vertices 3"] | None = None,
-    materials: Int32[np.ndarray, "faces"] | None = None,
-    measures: Float32[np.ndarray, "cuts"] | None = None,
+    cut: ClothingCut = UNCUT,
 ) -> ZBuffer:
     """Draw triangles, seen from both sides, into a z-buffer.
 
     A bent lens bends the corners, not the edges between them; triangles with a corner nearer than 1
-    cm are left out, and so are parts that `is_visible` denies by the last three arguments.
+    cm are left out.
     """
     rotation, translation = camera.camera_from_world[:3, :3], camera.camera_from_world[:3, 3]
     depth = points_world @ rotation[2] + translation[2]
     screen = np.empty((len(points_world), 3), dtype=np.float32)
     screen[:, :2] = camera.project(points_world) * supersampling
     screen[:, 2] = depth
-    if template_points is None or materials is None or measures is None:
-        template_points = np.zeros((1, 3), dtype=np.float32)
-        materials = np.zeros(0, dtype=np.int32)
-        measures = np.zeros(0, dtype=np.float32)
     rows, columns = camera.size_px[1] * supersampling, camera.size_px[0] * supersampling
     seen = ZBuffer(
         face=np.full((rows, columns), NO_FACE, dtype=np.int32),
@@ -75,9 +86,7 @@ def rasterize(
         depth=np.full((rows, columns), np.inf, dtype=np.float32),
         supersampling=supersampling,
     )
-    _rasterize_faces(
-        screen, faces, template_points, materials, measures, seen.face, seen.barycentric, seen.depth
-    )
+    _rasterize_faces(screen, faces, *cut, seen.face, seen.barycentric, seen.depth)
     return seen
 
 
@@ -143,6 +152,8 @@ SKY_RGB = np.array([0.92, 0.97, 1.00])
 FLOOR_RGB = np.array([0.62, 0.56, 0.50])
 LAMP_STRENGTH = 0.42
 """Light of the lamp, as a factor of color."""
+SKY_DIRECTIONS = 32
+"""Directions from which light comes."""
 
 SHADOW_BIAS_M = 0.02
 """Depth behind another surface at which half of the light has gone; no surface shades itself."""
@@ -152,26 +163,16 @@ def bake_light(
     points: Float[np.ndarray, "vertices 3"],
     normals: Float[np.ndarray, "vertices 3"],
     faces: Int32[np.ndarray, "faces 3"],
+    cut: ClothingCut,
     *,
-    template_points: Float32[np.ndarray, "vertices 3"],
-    materials: Int32[np.ndarray, "faces"],
-    measures: Float32[np.ndarray, "cuts"],
-    directions: int = 32,
     lamp_strength: float = LAMP_STRENGTH,
 ) -> Float32[np.ndarray, "vertices 3"]:
     """Light on each vertex as a factor of its color, about 0.45 in folds to 1.15 in the lamp."""
     sky = np.zeros((len(points), 3))
     lamp = np.zeros(len(points))
     weight = lamp_weight = 0.0
-    for toward in _fibonacci_directions(directions):
-        free = lamp_visibility(
-            points,
-            faces,
-            toward,
-            template_points=template_points,
-            materials=materials,
-            measures=measures,
-        )
+    for toward in fibonacci_directions(SKY_DIRECTIONS):
+        free = lamp_visibility(points, faces, toward, cut)
         facing = np.maximum(normals @ toward, 0.0) * free
         up = 0.5 + 0.5 * toward[1]
         sky += facing[:, None] * (up * SKY_RGB + (1.0 - up) * FLOOR_RGB)
@@ -187,29 +188,18 @@ def lamp_visibility(
     points: Float[np.ndarray, "vertices 3"],
     faces: Int32[np.ndarray, "faces 3"],
     toward: Float[np.ndarray, "3"],
-    *,
-    template_points: Float32[np.ndarray, "vertices 3"],
-    materials: Int32[np.ndarray, "faces"],
-    measures: Float32[np.ndarray, "cuts"],
+    cut: ClothingCut,
 ) -> Float[np.ndarray, "vertices"]:
     """Return the light of a lamp far away that reaches each vertex past the others, in [0, 1].
 
-    `toward` is the unit vector to the lamp; the last three arguments are as of `rasterize`.
+    `toward` is the unit vector to the lamp.
     """
     camera = _directional_camera(points, toward)
-    seen = rasterize(
-        points,
-        faces,
-        camera,
-        supersampling=1,
-        template_points=template_points,
-        materials=materials,
-        measures=measures,
-    )
+    seen = rasterize(points, faces, camera, supersampling=1, cut=cut)
     return _visibility(points, camera, seen.depth)
 
 
-def _fibonacci_directions(count: int) -> Float[np.ndarray, "directions 3"]:
+def fibonacci_directions(count: int) -> Float[np.ndarray, "directions 3"]:
     """Directions spread evenly over the sphere (Fibonacci's lattice)."""
     height = 1.0 - 2.0 * (np.arange(count) + 0.5) / count
     angle = np.arange(count) * np.pi * (3.0 - np.sqrt(5.0))
@@ -259,16 +249,14 @@ def shade_pixels(
     zbuffer: ZBuffer,
     *,
     faces: Int32[np.ndarray, "faces 3"],
-    materials: Int32[np.ndarray, "faces"],
-    template_points: Float32[np.ndarray, "vertices 3"],
+    cut: ClothingCut,
     light: Float32[np.ndarray, "vertices 3"],
     palette: Float32[np.ndarray, "colors 3"],
-    measures: Float32[np.ndarray, "cuts"],
     checked: bool,
 ) -> tuple[Float32[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]:
     """Return the color of each pixel's covered part (sRGB in [0, 1]) and the covered fraction.
 
-    `template_points` lie on the undressed template; `light` is a factor of color.
+    `light` is a factor of color.
     """
     height, width = (
         zbuffer.face.shape[0] // zbuffer.supersampling,
@@ -277,8 +265,8 @@ def shade_pixels(
     rgb = np.zeros((height, width, 3), dtype=np.float32)
     alpha = np.zeros((height, width), dtype=np.float32)
     _shade(
-        zbuffer.face, zbuffer.barycentric, zbuffer.supersampling, faces, materials,
-        template_points, light, palette, measures, checked, rgb, alpha,
+        zbuffer.face, zbuffer.barycentric, zbuffer.supersampling, faces, cut.materials,
+        cut.template_points, light, palette, cut.measures, checked, rgb, alpha,
     )  # fmt: skip
     return rgb, alpha
 

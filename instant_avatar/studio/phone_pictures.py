@@ -83,14 +83,7 @@ class RoomLight:
         points = actor.vertices(pose)
         cosine = vertex_normals(points, actor.faces) @ WINDOW_FROM
         facing = np.maximum((cosine + WRAP) / (1.0 + WRAP), 0.0)
-        free = lamp_visibility(
-            points,
-            actor.faces,
-            WINDOW_FROM,
-            template_points=actor.template_points,
-            materials=actor.materials,
-            measures=actor.outfit.measures,
-        )
+        free = lamp_visibility(points, actor.faces, WINDOW_FROM, actor.cut)
         window = WINDOW_STRENGTH * (facing * (0.25 + 0.75 * free))[:, None] * LAMP_RGB
         return (self._ambient + window).astype(np.float32)
 

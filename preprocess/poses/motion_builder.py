@@ -9,14 +9,13 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 
 from capture.camera import Camera
 from preprocess.body.body_pose import Motion, PoseSpace, RelativeFocalLength, RootAnchor
 from preprocess.body.kinematics import (
     axis_angles_from_matrices,
     rotation_matrices,
-    slerp,
     stack_axis_angles,
 )
 from preprocess.body.parametric_body import ShapedBody
@@ -118,62 +117,68 @@ MAX_GAP_FRAMES = 12
 """Longest gap that is filled, frames: half a second at 24 Hz."""
 
 
-def fill_gaps(motion: Motion, max_gap: int = MAX_GAP_FRAMES) -> Motion:
+def fill_gaps(motion: Motion) -> Motion:
     """The motion with short gaps filled in: slerp for rotations, straight lines for places.
 
-    A gap is a run of at most `max_gap` frames without a valid row between two frames with one.
-    Motions without frame numbers are taken as one row a frame. Those with cameras of their own are
-    bridged only where each frame has its row, and so its camera.
+    A gap is a run of at most `MAX_GAP_FRAMES` frames without a valid row between two frames with
+    one. Motions without frame numbers are taken as one row a frame. Those with cameras of their own
+    are bridged only where each frame has its row, and so its camera.
     """
     if motion.camera_from_world is not None and motion.frames is not None:
         return motion  # the cameras of the missing frames are unknown
     numbers = motion.frames if motion.frames is not None else np.arange(len(motion))
     good = np.flatnonzero(motion.valid)
-    before = good[:-1][(np.diff(numbers[good]) > 1) & (np.diff(numbers[good]) <= max_gap + 1)]
-    if not len(before):
+    gaps = zip(numbers[good[:-1]] + 1, numbers[good[1:]], strict=True)
+    bridged = [np.arange(*gap) for gap in gaps if 0 < gap[1] - gap[0] <= MAX_GAP_FRAMES]
+    if not bridged:
         return motion
-    filled = [
-        _fill_gap(motion, numbers, int(row), int(good[np.searchsorted(good, row) + 1]))
-        for row in before
-    ]
-    new = np.concatenate([part[0] for part in filled])
+    new = np.concatenate(bridged)
+    between = interpolate_rows(motion, good, numbers[good], new)
     kept = ~np.isin(numbers, new)
     order = np.argsort(np.concatenate([numbers[kept], new]), kind="stable")
 
     def merged(old: np.ndarray, added: np.ndarray) -> np.ndarray:
         return np.concatenate([old[kept], added])[order]
 
-    rotations = np.concatenate([part[1] for part in filled])
     times_s = motion.times_s
     if times_s is not None:
         times_s = np.interp(merged(numbers, new), numbers[good], times_s[good])
     return replace(
         motion,
-        root_rotations=merged(motion.root_rotations, rotations[:, 0]),
-        root_translations=merged(
-            motion.root_translations, np.concatenate([part[2] for part in filled])
-        ),
-        joint_rotations=merged(motion.joint_rotations, rotations[:, 1:]),
-        valid=merged(motion.valid, np.ones(len(new), dtype=bool)),
+        root_rotations=merged(motion.root_rotations, between.root_rotations),
+        root_translations=merged(motion.root_translations, between.root_translations),
+        joint_rotations=merged(motion.joint_rotations, between.joint_rotations),
+        valid=merged(motion.valid, between.valid),
         frames=merged(numbers, new) if motion.frames is not None else None,
         times_s=times_s,
     )
 
 
-def _fill_gap(
-    motion: Motion, numbers: Int[np.ndarray, "poses"], row: int, after: int
-) -> tuple[Int[np.ndarray, "gap"], Float[np.ndarray, "gap 24 3"], Float[np.ndarray, "gap 3"]]:
-    """Frame numbers, rotations and places between two rows."""
-    new = np.arange(numbers[row] + 1, numbers[after])
-    shares = (new - numbers[row]) / (numbers[after] - numbers[row])
-    first, last = (
-        np.concatenate([motion.root_rotations[i][None], motion.joint_rotations[i]])
-        for i in (row, after)
+def interpolate_rows(
+    motion: Motion,
+    rows: Int[np.ndarray, "rows"],
+    places: Shaped[np.ndarray, "rows"],
+    numbers: Shaped[np.ndarray, "frames"],
+) -> Motion:
+    """Poses at `numbers` between some rows at ascending `places`, without times and cameras."""
+    from scipy.spatial.transform import Rotation, Slerp  # the player runs without scipy
+
+    vectors = np.concatenate([motion.root_rotations[:, None], motion.joint_rotations], axis=1)[rows]
+    turned = np.stack(
+        [Slerp(places, Rotation.from_rotvec(each))(numbers).as_rotvec()
+         for each in np.moveaxis(vectors, 1, 0)], axis=1,
+    )  # fmt: skip
+    moved = [np.interp(numbers, places, each) for each in motion.root_translations[rows].T]
+    return replace(
+        motion,
+        root_rotations=turned[:, 0],
+        root_translations=np.column_stack(moved),
+        joint_rotations=turned[:, 1:],
+        valid=np.ones(len(numbers), dtype=bool),
+        frames=numbers,
+        times_s=None,
+        camera_from_world=None,
     )
-    places = motion.root_translations[row] + shares[:, None] * (
-        motion.root_translations[after] - motion.root_translations[row]
-    )
-    return new, slerp(first, last, shares), places
 
 
 SMPLX_PELVIS = np.array([0.0031, -0.3514, 0.0120])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from instant_avatar import evaluate
+from instant_avatar.cli.console import Console
 from instant_avatar.evaluation.datasets import find_neuman, split_by_rule
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.open_capture import open_capture

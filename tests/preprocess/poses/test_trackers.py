@@ -17,7 +17,12 @@ from capture.input_error import InputError
 from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import rotation_matrices
 from preprocess.cameras.camera_file import CameraTrack, tracker_intrinsic_matrix
-from preprocess.poses.motion_builder import SMPLX_PELVIS, fill_gaps, place_in_camera_world
+from preprocess.poses.motion_builder import (
+    MAX_GAP_FRAMES,
+    SMPLX_PELVIS,
+    fill_gaps,
+    place_in_camera_world,
+)
 from preprocess.poses.pose_format_registry import read_poses
 
 SIZE = (640, 360)
@@ -476,7 +481,8 @@ def test_a_bridge_goes_the_shortest_way_at_even_speed(truth):
     turned = rotation_matrices(whole.root_rotations)
     np.testing.assert_allclose(turned, rotation_matrices(np.array(expected)), atol=1e-12)
     np.testing.assert_allclose(whole.root_translations[:, 2], [3, 4, 5, 6])
-    assert fill_gaps(motion, max_gap=1) is motion
+    far = replace(motion, frames=np.array([10, 11, 12 + MAX_GAP_FRAMES + 1]))
+    assert fill_gaps(far) is far
 
 
 # --- refused -----------------------------------------------------------------------------------
