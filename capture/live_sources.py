@@ -37,16 +37,15 @@ MAX_READ_FAILURES = 16
 """Consecutive failures that mean the end: the camera was unplugged, or the stream is over."""
 
 
-LOG_LEVEL_SILENT = 0
-"""OpenCV's log level that prints nothing: our messages explain what is wrong with a file."""
-
-
 @cache
 def silence_opencv() -> None:
-    """Silence OpenCV and its FFmpeg; to be called before a file is opened."""
+    """Silence OpenCV and its FFmpeg; to be called before a file is opened.
+
+    Our messages explain what is wrong with a file.
+    """
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # read when FFmpeg is first used
     set_level = getattr(cv2, "setLogLevel", None)  # OpenCV 4 has it here, OpenCV 5 there
-    (set_level or cv2.utils.logging.setLogLevel)(LOG_LEVEL_SILENT)
+    (set_level or cv2.utils.logging.setLogLevel)(0)
 
 
 def camera_address(path: Path) -> str | None:

@@ -48,8 +48,6 @@ CHECK_VIEWS = 4
 """Synthetic views that validate a package without frames."""
 VIEW_PX = 256
 """Width and height of a synthetic view."""
-UNKNOWN_AUTHOR = "unknown"
-"""Author of a VRM file, which must state one, where none is given."""
 SPLAT_ENCODERS = {".ply": encode_ply, ".spz": encode_spz}
 """Encoders of splats by the suffix of --out."""
 MIN_TRIANGLES = 500
@@ -192,7 +190,7 @@ def _build_mesh(
         if arguments.to == "glb":
             content = _encode_animated(mesh, package.manifest, motion, name)
         elif arguments.to == "vrm":
-            author = arguments.author or UNKNOWN_AUTHOR
+            author = arguments.author or "unknown"  # a VRM must state one
             content = encode_vrm(mesh, package.manifest, name=name, author=author)
         else:
             content = _encode_static(mesh, arguments.to)

@@ -20,9 +20,6 @@ from capture.source import FrameSource
 from preprocess.body.kinematics import rigid_transform
 from preprocess.cameras.named_camera import NamedCamera
 
-NUMBERING_HINT = "; or say which frame each belongs to (the keys `frame` or `time`)"
-"""End of a message about poses."""
-
 
 def associate_by_order(rows: int, source: FrameSource, things: str) -> Callable[[int], int]:
     """Map a frame's number to its row: one row a frame, of all frames or of the selected ones.
@@ -37,7 +34,11 @@ def associate_by_order(rows: int, source: FrameSource, things: str) -> Callable[
             return lambda index: index
         if rows == source.selection.count(count):
             return source.selection.position
-    hint = NUMBERING_HINT if things.startswith("poses") else ""
+    hint = (
+        "; or say which frame each belongs to (the keys `frame` or `time`)"
+        if things.startswith("poses")
+        else ""
+    )
     raise InputError(
         f"There are {rows} {things}, but {count} frames in {source.path}. Expected one for every "
         f"frame, in order{hint}.{_mismatch_hint(rows, count)}"

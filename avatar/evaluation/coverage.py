@@ -158,9 +158,7 @@ MIN_TOP_NORMAL_Y = 0.6
 """Upward component of the normals on top of head and shoulders."""
 NEARLY_COMPLETE = 0.95
 """Share of seen skin from which the capture counts as complete."""
-NOT_SEEN_YET = "No person has been seen yet."
 SEEN_COMPLETELY = "It was seen from all sides."
-SMALL_REGIONS_LEFT = "Nearly everything was seen; the {rest:.0%} that are missing are small pieces."
 PARTS_OF_LIMB = {
     "hand": ("hand",),
     "foot": ("foot",),
@@ -211,13 +209,14 @@ class UnseenRegion:
 def coverage_advice(coverage: Coverage) -> str:
     """Tell the person in one sentence what to do next: about the largest unseen region."""
     if not coverage.stages.any():
-        return NOT_SEEN_YET
+        return "No person has been seen yet."
     region = largest_unseen_region(coverage)
     if region is not None:
         return _advice_sentence(region)
     if coverage.seen_share >= NEARLY_COMPLETE:
         return SEEN_COMPLETELY
-    return SMALL_REGIONS_LEFT.format(rest=1.0 - coverage.seen_share)
+    rest = 1.0 - coverage.seen_share
+    return f"Nearly everything was seen; the {rest:.0%} that are missing are small pieces."
 
 
 def largest_unseen_region(coverage: Coverage) -> UnseenRegion | None:

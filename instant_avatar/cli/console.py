@@ -17,8 +17,6 @@ MAX_KEPT_WARNINGS = 500
 """Warnings, and notes, that are kept, so that memory stays bounded for any length of video."""
 LOG_INTERVAL_S = 10.0
 """Seconds between two progress lines in a log."""
-MIN_BAR_WIDTH = 8
-"""Least width of a bar next to a long note, characters."""
 MIN_ELAPSED_FOR_ESTIMATE_S = 2.0
 """Elapsed time before which the remaining time is not estimated, seconds."""
 MIN_SHARE_FOR_ESTIMATE = 0.15
@@ -142,7 +140,7 @@ class ProgressBar:
             return
         self._progress = Progress(
             TextColumn("[bold]{task.description}", table_column=_min_width_column(len(label))),
-            BarColumn(bar_width=28, table_column=_min_width_column(MIN_BAR_WIDTH)),
+            BarColumn(bar_width=28, table_column=_min_width_column(8)),
             TextColumn("{task.fields[note]}"),
             console=console,
             transient=True,

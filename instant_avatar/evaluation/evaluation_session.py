@@ -33,8 +33,6 @@ from instant_avatar.evaluation.score_table import AvatarEvaluation, ScoreRow
 from instant_avatar.run.run_folder import RunFolder
 from preprocess.observation import Observation
 
-BEST_TIER = "hq"
-"""Tier that every package has."""
 FIT_BATCH_FRAMES = 25
 """Number of frames whose poses are fitted together."""
 VOLUME_RENDERER = "renderer"
@@ -140,7 +138,7 @@ class EvaluationSession:
                 "The player renders pinhole images; this lens has distortion, so it is not scored."
             )
             return renderers
-        for tier in (BEST_TIER, *Player.load(package).manifest.tiers):
+        for tier in ("hq", *Player.load(package).manifest.tiers):
             if f"player {tier}" not in renderers:
                 renderers[f"player {tier}"] = partial(_play, Player.load(package, tier=tier))
         return renderers

@@ -105,8 +105,6 @@ def evaluations_to_json(
     return json.dumps(to_json_value(content), indent=1, allow_nan=False) + "\n"
 
 
-TEXT_COLUMNS = ("avatar", "drawn by", "poses", "on", "looks")
-"""Columns of the table that are left-aligned."""
 COLUMNS = {
     "psnr": ("PSNR", ".2f"),
     "psnr_box": ("in the box", ".2f"),
@@ -114,9 +112,6 @@ COLUMNS = {
     "ssim": ("SSIM", ".4f"),
 }
 """Heading and format of each metric in the table, but those of LPIPS and time."""
-PAPER_ROW_NAME = "InstantAvatar (paper)"
-"""Renderer of the rows with the paper's scores."""
-NOT_MEASURED = "n/a"
 
 
 def table_cells(evaluations: Sequence[AvatarEvaluation]) -> list[list[str]]:
@@ -145,7 +140,7 @@ def table_cells(evaluations: Sequence[AvatarEvaluation]) -> list[list[str]]:
             add(each.name, str(len(row.scores)), row.way, means_of(row))
             lines[-1].append(row.verdict or "")
         if each.paper:
-            add(each.name, "", (PAPER_ROW_NAME, "fitted", "white"), each.paper)
+            add(each.name, "", ("InstantAvatar (paper)", "fitted", "white"), each.paper)
             lines[-1].append("")
     is_dataset = len(evaluations) > 1 and all(each.paper is not None for each in evaluations)
     for first in evaluations[0].rows if is_dataset else ():
@@ -166,7 +161,7 @@ def markdown_table(evaluations: Sequence[AvatarEvaluation]) -> str:
     header, *lines = table_cells(evaluations)
     columns = list(zip(header, *lines, strict=True))
     widths = [max(3, *map(len, column)) for column in columns]
-    is_text = [name in TEXT_COLUMNS for name in header]
+    is_text = [name in ("avatar", "drawn by", "poses", "on", "looks") for name in header]
     rule = [
         "-" * width if text else "-" * (width - 1) + ":"
         for width, text in zip(widths, is_text, strict=True)
@@ -227,4 +222,4 @@ def _standard_error(values: Float[np.ndarray, "frames"]) -> float:
 def _format_cell(metric: str, value: float | None, form: str) -> str:
     if value is not None:
         return format(value, form)
-    return NOT_MEASURED if metric.startswith("lpips") else ""
+    return "n/a" if metric.startswith("lpips") else ""

@@ -88,10 +88,6 @@ DOT_SPACING_CM = 2.7
 """Distance of neighboring dots, centimeters."""
 MAX_PATCH_DISTANCE_CM = 3.2
 """Distance to the nearest visible patch beyond which a dot lies off the body, centimeters."""
-GAP_CM = 14.0
-"""Gap between two views, centimeters."""
-MARGIN_CM = 4.0
-"""Margin around the map, centimeters."""
 LEVELS = ("never", "slant", "well")
 """CSS classes of a dot: unseen, seen at a grazing angle, seen frontally."""
 
@@ -128,7 +124,7 @@ class CoverageMap:
             self._views[name] = _MapView(
                 positions_cm=(dots[on_body] + [left, 0.0]).round(1), patches=shown[nearest[on_body]]
             )
-            left += float(places[:, 0].max()) + GAP_CM
+            left += float(places[:, 0].max()) + 14.0  # and a gap
 
     def svg(self) -> Markup:
         """Draw the coverage in its current state; the CSS classes in `LEVELS` give the colors."""
@@ -146,9 +142,7 @@ class CoverageMap:
             )
             for name, view in self._views.items()
         ]
-        return render_template(
-            "body_map.svg", views=views, width=width, height=height, margin=MARGIN_CM
-        )
+        return render_template("body_map.svg", views=views, width=width, height=height, margin=4.0)
 
 
 def _hexagonal_grid(size_cm: Float[np.ndarray, "2"]) -> Float[np.ndarray, "grid 2"]:

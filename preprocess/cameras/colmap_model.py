@@ -33,9 +33,6 @@ CAMERA_MODELS = {
 DISTORTION_START = {"SIMPLE_RADIAL": 3, "RADIAL": 3, "OPENCV": 4, "FULL_OPENCV": 4}
 """First of OpenCV's distortion coefficients among the parameters, of the models that have some."""
 
-POINT_BYTES = 24
-"""Bytes of an observed point behind an image's name in images.bin."""
-
 Lens = tuple[str, tuple[int, int], list[float]]
 """A camera model's name, width and height, and its parameters."""
 
@@ -119,7 +116,7 @@ def _read_binary(folder: Path) -> tuple[dict[str, Lens], list[ImageRow]]:
     for _ in range(file.take("Q")[0]):
         _, *pose, lens = file.take("I7dI")
         images.append((file.take_text(), str(lens), pose))
-        file.skip(POINT_BYTES * file.take("Q")[0])
+        file.skip(24 * file.take("Q")[0])  # observed points
     return lenses, images
 
 

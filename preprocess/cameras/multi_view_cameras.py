@@ -43,9 +43,6 @@ EASYMOCAP_KEYS = (
 IMAGE_SIZE_PATTERN = re.compile(r"^([HW]_\w+):\s*([0-9.]+)\s*$", re.MULTILINE)
 """Width or height of a camera's images in OpenCV's YAML."""
 
-MM_PER_M = 1000.0
-"""Millimetres in a metre: the unit of ZJU-MoCap's translations."""
-
 MAX_PARENT_FOLDERS = 3
 """Number of folders above an image whose names may be its camera's."""
 
@@ -138,5 +135,6 @@ def _read_zju(path: Path) -> dict[str, StudioCamera]:
     cameras: dict[str, StudioCamera] = {}
     for row, image in enumerate(content["ims"][0]["ims"]):
         camera = {key: np.array(cams[key][row], dtype=np.float64, ndmin=2) for key in "KDRT"}
-        cameras[PurePosixPath(str(image)).parent.name] = {**camera, "T": camera["T"] / MM_PER_M}
+        camera["T"] /= 1000.0  # from millimetres
+        cameras[PurePosixPath(str(image)).parent.name] = camera
     return cameras

@@ -36,8 +36,6 @@ ROMP_PERSPECTIVE_FOCAL = RelativeFocalLength(ratio=443.4 / 512.0)
 ROMP_WEAK_PERSPECTIVE_FOCAL = RelativeFocalLength(ratio=1.0)
 """The camera in which z = 2 / s puts a point where weak perspective with the scale s does."""
 
-ROMP_VIDEO_RESULTS = "video_results.npz"
-"""Name of ROMP's file for a whole video."""
 
 MAX_LINK_STEP_M = 1.0
 """Largest step of one person between frames, metres; it separates people without track numbers."""
@@ -246,7 +244,7 @@ def parse_romp(content: Any, prefer_world: bool = False) -> MotionByPerson | Non
     """
     if not isinstance(content, dict):
         return None
-    content = content.get(ROMP_VIDEO_RESULTS, content)  # a folder with everything in it
+    content = content.get("video_results.npz", content)  # a folder with everything in it
     sequence = content.get("sequence_results")
     if isinstance(sequence, dict) and sequence:
         return {

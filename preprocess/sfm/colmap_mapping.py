@@ -140,17 +140,8 @@ def write_keyframes(keys: Iterator[SfmKeyframe], images: Path, masks: Path) -> l
     return kept
 
 
-MAX_FEATURES = 2048
-"""Most features per key frame."""
-
-SEQUENTIAL_OVERLAP = 10
-"""Number of following key frames that each is matched with, besides powers of two beyond."""
-
 MAX_EXHAUSTIVE_IMAGES = 40
 """Largest number of key frames of which every pair is matched, which closes loops."""
-
-MAX_MODELS = 2
-"""Most models that the incremental mapper starts."""
 
 MAX_INITIAL_PAIRS = 50
 """Most pairs that it tries to start with; without parallax it would try for minutes."""
@@ -212,7 +203,7 @@ def extract_features(workspace: ColmapWorkspace, report_progress: ProgressFn) ->
         reader.default_focal_length_factor = 0.85
     options.num_threads, options.use_gpu = workspace.threads, False
     options.max_image_size = max(width, height)
-    options.sift.max_num_features = MAX_FEATURES
+    options.sift.max_num_features = 2048
     names, step = list(workspace.names), IMAGES_PER_THREAD * workspace.threads
     with colmap.Database.open(workspace.database):  # makes it
         pass
@@ -241,7 +232,7 @@ def match_features(workspace: ColmapWorkspace, report_progress: ProgressFn) -> N
         )
         return
     pairing = colmap.SequentialPairingOptions()
-    pairing.overlap, pairing.num_threads = SEQUENTIAL_OVERLAP, 1
+    pairing.overlap, pairing.num_threads = 10, 1  # besides powers of two beyond
     colmap.match_sequential(
         workspace.database, matching_options=options, pairing_options=pairing,
         device=colmap.Device.cpu,
@@ -269,7 +260,7 @@ def map_incrementally(
     colmap = _colmap()
     options = colmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = 1, seed
-    options.min_model_size, options.max_num_models = 3, MAX_MODELS
+    options.min_model_size, options.max_num_models = 3, 2
     options.init_num_trials, options.extract_colors = MAX_INITIAL_PAIRS, False
     total, done = len(workspace.names), 0
 
