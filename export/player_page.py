@@ -11,7 +11,7 @@ import os
 import sys
 import tarfile
 import zlib
-from functools import cache
+from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 
@@ -105,10 +105,12 @@ PACKED_WASM_FILE = f"{WASM_FILE}.zlib"
 """The WebAssembly module as graph_worker.js reads it: not all hosts compress what they send."""
 
 
-@cache
 def pack_runtime(compression_level: int) -> bytes:
     """Pack the WebAssembly module, once a process."""
-    return zlib.compress(runtime_files()[WASM_FILE], compression_level)
+    return _compress(runtime_files()[WASM_FILE], compression_level)
+
+
+_compress = lru_cache(maxsize=1)(zlib.compress)
 
 
 def build_page(
