@@ -273,24 +273,28 @@ def _checked_package(
 ) -> AvatarPackage:
     """Check every tier, its graph unless `difference` is known; add scores, warnings, pictures."""
     manifest = package.manifest
-    others = {t: executor.submit(Player, package, tier=t) for t in manifest.tiers if t != "hq"}
-    hq, tiers = Player(package), {}
-    for tier, info in manifest.tiers.items():
-        player = hq if tier == "hq" else others[tier].result()
-        seen = slice(None) if tier == "hq" else slice(1)
-        worst = difference
+
+    def check(tier: str) -> tuple[Player, TierInfo]:
+        player, worst = Player(package, tier=tier), difference
         if worst is None:
             frames = manifest.golden[: GRAPH_CHECK_PICTURES[tier]]
             worst = check_graph(player, package, tier, frames)
+        seen = slice(None) if tier == "hq" else slice(1)
         score = mean_psnr_to_renderer(player, views[seen], exact[seen])
-        warnings = warnings + (quality_warnings(score) if tier == "hq" else [])
-        tiers[tier] = replace(info, psnr_to_renderer=score, largest_difference=worst)
-    metrics = {**manifest.metrics, "warnings": warnings}
+        info = replace(manifest.tiers[tier], psnr_to_renderer=score, largest_difference=worst)
+        return player, info
+
+    checked = dict(zip(manifest.tiers, executor.map(check, manifest.tiers), strict=True))
+    hq, info = checked["hq"]
+    warnings = warnings + quality_warnings(info.psnr_to_renderer)
+    shots = [views[0], *((frame.pose, frame.camera) for frame in manifest.golden)]
+    preview, *golden = executor.map(lambda shot: hq.render(*shot), shots)
+    tiers = {tier: info for tier, (_, info) in checked.items()}
     return replace(
         package,
-        manifest=replace(manifest, tiers=tiers, metrics=metrics),
-        golden=tuple(hq.render(frame.pose, frame.camera) for frame in manifest.golden),
-        preview=_encode_png(hq.render(*views[0])),
+        manifest=replace(manifest, tiers=tiers, metrics={**manifest.metrics, "warnings": warnings}),
+        golden=tuple(golden),
+        preview=_encode_png(preview),
     )
 
 

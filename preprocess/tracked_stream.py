@@ -53,7 +53,7 @@ START_FRAMES = 8
 MIN_INTERVAL_S = 0.06
 """Time between two frames that are tracked: more of them teach no more, and their poses would
 jitter, for the frames around a frame would span too short a time."""
-QUEUED_FRAMES = 8
+QUEUED_FRAMES = 2
 """Most tracked frames that wait for the fit of their poses; what is tracked meanwhile is only
 looked at, so that advice goes on while a trainer is being prepared."""
 LOOK_INTERVAL_S = 0.3
@@ -62,10 +62,8 @@ POLL_S = 0.01
 """Interval at which it looks for room, seconds."""
 KEPT_BYTES = 160 << 20
 """Memory for skipped frames."""
-LATER_S = 0.8
-"""Time after the last frame in which skipped ones are tracked, seconds: a user waits."""
 LEAST_FRAMES = 40
-"""Frames that are tracked in all before nothing more is, if there are as many."""
+"""Frames that are tracked; where fewer were in time, skipped ones follow, while a user waits."""
 FoundPerson = tuple[Frame, PersonKeypoints | None]
 """A frame and the person in it."""
 
@@ -140,7 +138,7 @@ class TrackedStream(WrappedSource):
         self._decoded: Inbox[Frame] | None = None
         self._tracked: Inbox[FoundPerson] | None = None
         self._waiting, self._skipped = deque[Frame](), SkippedFrames()
-        self._last_s, self._taken, self._began, self._waited_s = -np.inf, 0, 0.0, 0.0
+        self._last_s, self._taken, self._waited_s = -np.inf, 0, 0.0
         self.count = self.tracked_later = 0
         self.search: Callable[[Frame, bool], PersonKeypoints | None] = lambda frame, is_new: None
         self.on_frame: Callable[[Frame, PersonKeypoints | None], None] = lambda frame, found: None
@@ -175,10 +173,7 @@ class TrackedStream(WrappedSource):
 
     def _next_found(self) -> FoundPerson | None:
         if self._tracked is None:
-            self._tracked, self._began = (
-                Inbox(self._found(), capacity=QUEUED_FRAMES),
-                time.perf_counter(),
-            )
+            self._tracked = Inbox(self._found(), capacity=QUEUED_FRAMES)
         began = time.perf_counter()
         found = next(self._tracked.items(max_items=1), None)
         self._waited_s += time.perf_counter() - began
@@ -212,8 +207,7 @@ class TrackedStream(WrappedSource):
                 self._skipped.mark(frame.time_s)
                 yield frame, found
         self.all_came = True
-        in_time = LATER_S * self._taken / (time.perf_counter() - self._began)
-        for frame in self._skipped.take(max(int(in_time), LEAST_FRAMES - self._taken)):
+        for frame in self._skipped.take(max(0, LEAST_FRAMES - self._taken)):
             self.tracked_later += 1
             yield replace(frame, due_s=None), self.search(frame, False)
 

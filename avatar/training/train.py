@@ -56,7 +56,7 @@ swings of the parameters leave their mean closer to the optimum."""
 CLOSING_S = 2.0
 """Time after the last frame of a paced source in which rates fall and surfaces become firm,
 seconds: a user waits."""
-LATE_FRAMES_S = 1.0
+LATE_FRAMES_S = 0.5
 """Time for which frames are learnt that come while rates are falling, seconds."""
 LEAST_STEPS = 250
 """Steps that a paced source is trained for, however short it is; fewer make no surface."""
