@@ -157,20 +157,6 @@ VISIBLE_LOG_DENSITY = 2.0
 """Log density from which one point of a pair makes the pair's colors visible."""
 
 
-class OpacityWithSlope(NamedTuple):
-    """Opacity of one centimetre and its slope over log density."""
-
-    value: Float32[Tensor, "points"]
-    slope: Float32[Tensor, "points"]
-
-    @classmethod
-    def of(cls, raw: Float32[Tensor, "points 4"]) -> "OpacityWithSlope":
-        """Opacity and slope of a field's raw outputs."""
-        value, slope = torch.empty(2, len(raw))
-        numba_priors.opacities(raw.numpy(), value.numpy(), slope.numpy())
-        return cls(value, slope)
-
-
 def _gradient(
     add: Callable[..., None],
     raw: Float32[Tensor, "points 4"],

@@ -135,16 +135,9 @@ def _check(arguments: CheckArguments, read: Callable[[], ImportedCapture], conso
             check_result = check_capture(imported)
             grade = grade_capture(check_result.capture)
     except InputError as error:
-        if arguments.json is not None:
-            write_text_atomically(
-                arguments.json, json.dumps(unreadable_to_json(str(error)), indent=1) + "\n",
-                replace=arguments.overwrite,
-            )  # fmt: skip
+        _write_json(arguments, refused_to_json(str(error)))
         raise
-    if arguments.json is not None:
-        told = check_to_json(check_result) | {"tracking": grade and grade.as_json()}
-        text = json.dumps(told, indent=1) + "\n"
-        write_text_atomically(arguments.json, text, replace=arguments.overwrite)
+    _write_json(arguments, check_to_json(check_result) | {"tracking": grade and grade.as_json()})
     _print_findings(check_result, console)
     if grade is not None:
         print_doubts(grade, console)
@@ -162,6 +155,12 @@ def _check(arguments: CheckArguments, read: Callable[[], ImportedCapture], conso
         console.info(f"To correct it:  {check_command(imported.inputs)}")
     good = grade is None or grade.is_good_enough
     return DONE if good and check_result.verdict != "unusable" else BAD_INPUT
+
+
+def _write_json(arguments: CheckArguments, content: dict[str, Any]) -> None:
+    if arguments.json is not None:
+        text = json.dumps(content, indent=1) + "\n"
+        write_text_atomically(arguments.json, text, replace=arguments.overwrite)
 
 
 def _json_number(value: float | None) -> float | None:
@@ -188,8 +187,7 @@ def check_to_json(check_result: CaptureValidation) -> dict[str, Any]:
         chosen = (c for c in diagnosis.candidates if c.correction.is_of_video == of_video)
         return [entry(candidate) for candidate in chosen]
 
-    return {
-        "format": 1,
+    return refused_to_json(check_result.refusal) | {
         "verdict": check_result.verdict,
         "cause": check_result.causes[0] if check_result.causes else None,
         "iou": {
@@ -208,13 +206,11 @@ def check_to_json(check_result: CaptureValidation) -> dict[str, Any]:
             {"cause": cure.cause, "words": cure.description} for cure in diagnosis.corrections
         ],
         "anomalies": list(check_result.anomalies),
-        "refused": check_result.refusal,
-        "edges": None,
     }
 
 
-def unreadable_to_json(reason: str) -> dict[str, Any]:
-    """Return the JSON of a capture that could not be opened."""
+def refused_to_json(reason: str | None) -> dict[str, Any]:
+    """Return the JSON of a capture of which nothing but this is known."""
     return {
         "format": 1, "verdict": "unusable", "cause": None,
         "iou": {"now": None, "after_fix": None}, "tried": [], "corrections": [], "anomalies": [],

@@ -18,7 +18,7 @@ PART_NAMES = (
 """The 14 body parts of `avatar.rig.PART_OF_JOINT`; left is the person's left."""
 SIDE_NAMES = ("front", "back", "left", "right", "top", "under")
 """Directions of the patches in the T-pose; `under` is the underside."""
-ARM_PARTS, FOOT_PARTS = slice(8, 14), slice(5, 7)
+ARM_PARTS, FOOT_PARTS = slice(8, 14), (5, 6)
 PATCH_M = 0.022
 OCCLUSION_TOLERANCE_M = 0.01
 MAX_SOLE_NORMAL_Y = -0.5
@@ -69,7 +69,7 @@ class SkinPatches:
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
         points, parts, sides = mean(shaped.vertices), parts[first], sides[first]
         shown = _visible_from_anywhere(points, normals) & ~(
-            _is_foot(parts) & (normals[:, 1] < MAX_SOLE_NORMAL_Y)
+            np.isin(parts, FOOT_PARTS) & (normals[:, 1] < MAX_SOLE_NORMAL_Y)
         )
         return cls(
             points=points[shown],
@@ -90,10 +90,6 @@ def _side_of_vertex(
     across = np.where(is_arm, y, x)
     sideways = np.where(is_arm, np.where(y > 0.0, 4, 5), np.where(x > 0.0, 2, 3))
     return np.where(np.abs(z) >= np.abs(across), np.where(z > 0.0, 0, 1), sideways)
-
-
-def _is_foot(parts: Int[np.ndarray, "patches"]) -> Bool[np.ndarray, "patches"]:
-    return (parts >= FOOT_PARTS.start) & (parts < FOOT_PARTS.stop)
 
 
 def _visible_from_anywhere(

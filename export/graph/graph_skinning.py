@@ -26,11 +26,6 @@ class CameraValues:
     height: GraphValue
     width: GraphValue
 
-    @property
-    def num_pixels(self) -> GraphValue:
-        """Number of pixels, int64 scalar."""
-        return self.height * self.width
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class GraphContext:

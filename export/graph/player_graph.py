@@ -163,5 +163,5 @@ def _pack_rgba(
     row = pixel // width
     column = pixel - row * width + window.left.cast(np.int32)
     place = (row + window.top.cast(np.int32)) * view.width.cast(np.int32) + column
-    empty = graph.full(graph.shape(view.num_pixels), np.int32(0))
+    empty = graph.full(graph.shape(view.height * view.width), np.int32(0))
     return empty.scatter(place, packed)

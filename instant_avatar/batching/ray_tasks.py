@@ -37,7 +37,11 @@ def run_attempts(
         scratch = folder if arguments.ray == RAY_LOCAL else None
         _connect(ray, arguments.ray)
         try:
-            needs = {capture.name: _resources(capture, arguments) for capture in captures}
+            memory = int(1e9 * arguments.memory)
+            needs = {
+                capture.name: {"num_cpus": arguments.cores_of(capture), "memory": memory}
+                for capture in captures
+            }
             _check_room(ray, needs.values())
             once: dict[str, Any] = {"max_calls": 1}  # each attempt has a process of its own
             retries = {"max_retries": arguments.retries, "retry_exceptions": [AttemptFailure]}
@@ -71,11 +75,6 @@ def _connect(ray: Any, address: str) -> None:
             "--head; or omit --ray to use this machine alone."
         ) from error
     signal.signal(signal.SIGTERM, on_sigterm)  # Ray's own would print a stack and exit
-
-
-def _resources(capture: BatchCapture, arguments: BatchArguments) -> dict[str, int]:
-    """Return what a capture needs, as options of a Ray task."""
-    return {"num_cpus": arguments.cores_of(capture), "memory": int(1e9 * arguments.memory)}
 
 
 def _check_room(ray: Any, needs: Iterable[dict[str, int]]) -> None:

@@ -249,11 +249,6 @@ class Report:
         return json.dumps(to_json_value(content), indent=1, allow_nan=False) + "\n"
 
 
-def provisional_verdict(verdict: str | None) -> str | None:
-    """Return the word for a verdict during training, when nothing has failed yet."""
-    return "not converged yet" if verdict == "failed" else verdict
-
-
 def format_psnr(
     psnr: float | None, verdict: str | None, *, digits: int = 2, provisional: bool = False
 ) -> str:
@@ -263,7 +258,7 @@ def format_psnr(
     """
     if psnr is None:
         return "n/a"
-    word = provisional_verdict(verdict) if provisional else verdict
+    word = "not converged yet" if provisional and verdict == "failed" else verdict
     return f"{psnr:.{digits}f} dB" + (f" ({word})" if word else "")
 
 

@@ -283,8 +283,9 @@ class EarlierVideos:
                 "cannot be replayed."
             )
         self.restore_key_frames(trainer, console)
+        previous = self._notes.get("name") or Path(self._notes["video"]).name
         self._notes["before"] = {
-            "videos": [*earlier_video_names(self._notes), self._previous_video_name()],
+            "videos": [*earlier_video_names(self._notes), previous],
             "frames": trainer.frames_seen,
             "seconds": trainer.wall_seconds,
             "steps": trainer.steps,
@@ -313,10 +314,6 @@ class EarlierVideos:
             wall_seconds=self._notes["before"]["seconds"],
             replayed_key_frames=len(self._kept),
         )
-
-    def _previous_video_name(self) -> str:
-        """Return the file name of the previous video."""
-        return self._notes.get("name") or Path(self._notes["video"]).name
 
 
 def earlier_video_names(notes: dict[str, Any]) -> tuple[str, ...]:

@@ -192,8 +192,9 @@ class IngestArguments(CaptureArguments):
         )
 
     def longer_side_px(self, source: FrameSource) -> int:
-        """Return the longer side of the training images of a source."""
-        return self.size or trainable_longer_side_px(self.training_seconds(source))
+        """Return the longer side of images whose detail can be learned in the time, or --size."""
+        minutes = self.training_seconds(source) / DEFAULT_SECONDS
+        return self.size or max(256, round(REFERENCE_LONGER_SIDE_PX * minutes**0.5))
 
     def training_seconds(self, source: FrameSource) -> float:
         """Return the training time: as given, else the clip's duration, else a minute.
@@ -212,8 +213,3 @@ class IngestArguments(CaptureArguments):
             name: str(value) if isinstance(value, Path) else value
             for name, value in vars(self).items()
         }
-
-
-def trainable_longer_side_px(seconds: float) -> int:
-    """Return the longer side, in pixels, of images whose detail can be learned in `seconds`."""
-    return max(256, round(REFERENCE_LONGER_SIDE_PX * (seconds / 60.0) ** 0.5))

@@ -124,10 +124,6 @@ class RunFolder:
         top += (self.cameras, self.poses)
         return (*top, *(self.checkpoint / name for name in CHECKPOINT_FILES))
 
-    def has_run(self) -> bool:
-        """True if any file of a run exists."""
-        return any(path.exists() for path in self.files)
-
     def has_checkpoint(self) -> bool:
         """True if training can continue from here."""
         return (self.checkpoint / STATE_FILE).is_file()
@@ -169,7 +165,7 @@ class RunFolder:
             InputError: If a run exists and neither flag is given.
         """
         with claim_folder(self.path, console):
-            if self.has_run() and not (resume or overwrite):
+            if any(path.exists() for path in self.files) and not (resume or overwrite):
                 raise InputError(
                     f"{self.path} already holds a run. Continue it (--resume), replace it "
                     "(--overwrite), or choose another folder (--out)."

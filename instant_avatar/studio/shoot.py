@@ -280,16 +280,12 @@ def film_capture(
         overwrite: Whether an older capture in `out` gives way, if all of it was written by `shoot`.
     """
     config.validate()
-    _check_output(out, overwrite=overwrite)
-    with atomic_folder(out) as unfinished:
-        write = _write_phone_capture if config.like_a_phone else _write_capture
-        write(unfinished, config, progress or (lambda done, total: None))
-
-
-def _check_output(out: Path, *, overwrite: bool) -> None:
     check_replaceable_folder(out)
     if not overwrite and out.exists() and any(out.iterdir()):
         raise InputError(f"{out} already exists. Choose another OUT, or give --overwrite.")
+    with atomic_folder(out) as unfinished:
+        write = _write_phone_capture if config.like_a_phone else _write_capture
+        write(unfinished, config, progress or (lambda done, total: None))
 
 
 def _write_capture(folder: Path, config: ShootConfig, progress: ShootProgress) -> None:

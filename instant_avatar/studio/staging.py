@@ -339,11 +339,6 @@ def standing_camera(height_m: float, size: int) -> Camera:
     return _aim_handheld_camera(eye, np.zeros(2), height_m, size, np.zeros(3))
 
 
-def wide_image_size(size: int) -> tuple[int, int]:
-    """Width and height of the pictures whose longer side has `size` pixels."""
-    return size, max(1, round(size * WALK_ASPECT[1] / WALK_ASPECT[0]))
-
-
 def actor_height_m(actor: Actor) -> float:
     """Height of the standing actor, shoes and hair included."""
     pose = BodyPose.rest()
@@ -372,7 +367,7 @@ def _aim_handheld_camera(
     camera_from_world = np.eye(4)
     camera_from_world[:3, :3] = axes
     camera_from_world[:3, 3] = -axes @ eye
-    width, height = wide_image_size(size)
+    width, height = size, max(1, round(size * WALK_ASPECT[1] / WALK_ASPECT[0]))
     return Camera(
         focal_px=(FOCAL_SHARE * width, FOCAL_SHARE * width),
         center_px=(0.5 * width, 0.5 * height),

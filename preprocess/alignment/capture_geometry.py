@@ -217,8 +217,14 @@ def relative_change(before: CaptureGeometry, after: CaptureGeometry) -> float:
 
 def sanity_warnings(geometry: CaptureGeometry, frames: list[int]) -> Iterator[str]:
     """Describe implausible poses and cameras of the selected frames: gaps, jumps, ranges, views."""
-    yield from _missing_pose_warnings(geometry, frames)
-    yield from _range_warnings(geometry)
+    motion = geometry.motion
+    yield from lost_pose_warnings(motion)
+    bare = [frame for frame in frames if geometry.row_for_frame(frame) is None]
+    if len(bare) > int((~motion.valid).sum()):
+        yield f"{len(bare)} of {len(frames)} frames have no pose{_list_frames(bare)}."
+    yield from plausibility_warnings(motion)
+    if len(motion.betas) and np.abs(motion.betas).max() > MAX_BETA:
+        yield f"A shape coefficient is {np.abs(motion.betas).max():.1f}; people have -3 to 3."
     yield from _jump_warnings(geometry)
     seen = view_coverage(geometry)
     if seen < MIN_VIEW_COVERAGE:
@@ -242,20 +248,6 @@ def view_sector_share(to_cameras: Float[np.ndarray, "views 3"]) -> float:
     angle = np.arctan2(to_cameras[:, 0], to_cameras[:, 2]) / (2.0 * np.pi)
     sector = np.floor((angle + 0.5) * VIEW_SECTORS)
     return len(np.unique(sector.clip(0, VIEW_SECTORS - 1))) / VIEW_SECTORS
-
-
-def _missing_pose_warnings(geometry: CaptureGeometry, frames: list[int]) -> Iterator[str]:
-    yield from lost_pose_warnings(geometry.motion)
-    bare = [frame for frame in frames if geometry.row_for_frame(frame) is None]
-    if len(bare) > int((~geometry.motion.valid).sum()):
-        yield f"{len(bare)} of {len(frames)} frames have no pose{_list_frames(bare)}."
-
-
-def _range_warnings(geometry: CaptureGeometry) -> Iterator[str]:
-    motion = geometry.motion
-    yield from plausibility_warnings(motion)
-    if len(motion.betas) and np.abs(motion.betas).max() > MAX_BETA:
-        yield f"A shape coefficient is {np.abs(motion.betas).max():.1f}; people have -3 to 3."
 
 
 def find_jumps(geometry: CaptureGeometry) -> tuple[list[int], float]:

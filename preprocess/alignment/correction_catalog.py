@@ -127,7 +127,7 @@ def _camera_entries(geometry: CaptureGeometry) -> CatalogEntries:
             lambda e: OPENCV_FROM_OPENGL @ np.linalg.inv(e),
         ),
     ):
-        yield cause, words, partial(_change_cameras, change=change)
+        yield cause, words, lambda c, change=change: replace(c, extrinsics=change(c.extrinsics))
 
 
 def _turn_entries(geometry: CaptureGeometry) -> CatalogEntries:
@@ -201,12 +201,6 @@ def _frame_rate_entries(geometry: CaptureGeometry, frames: int) -> CatalogEntrie
 def _moves(change: Callable[[Motion], Motion]) -> GeometryChange:
     """Lifts a change of the motion to one of the geometry."""
     return lambda c: replace(c, motion=change(c.motion))
-
-
-def _change_cameras(
-    geometry: CaptureGeometry, change: Callable[[Float[np.ndarray, "n 4 4"]], np.ndarray]
-) -> CaptureGeometry:
-    return replace(geometry, extrinsics=change(geometry.extrinsics))
 
 
 def _cameras_at_origin(geometry: CaptureGeometry) -> bool:

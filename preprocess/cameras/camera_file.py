@@ -55,16 +55,12 @@ class CameraTrack:
         return replace(self, cameras=scaled)
 
 
-def resolve_camera_path(path: Path) -> Path:
-    """The cameras.npz of a capture folder, if `path` is one; else `path` itself."""
-    own = path / "cameras.npz"
-    return own if own.is_file() else path
-
-
 def read_cameras(
     path: Path, size_px: tuple[int, int] | None, source: FrameSource | None = None
 ) -> CameraTrack:
     """Read cameras: an .npz of ours, or a file of another program (`camera_registry`).
+
+    Of a capture folder, its cameras.npz is read.
 
     The .npz holds intrinsic (3, 3), extrinsic (4, 4) camera-from-world, or N of each; optional:
     height and width (of the images that the matrices belong to), distortion (OpenCV's
@@ -76,7 +72,8 @@ def read_cameras(
         source: The frames, whose names or number tell which camera is whose. Without it cameras
             of other programs are taken in order.
     """
-    path = resolve_camera_path(path)
+    own = path / "cameras.npz"
+    path = own if own.is_file() else path
     refuse_pipe(path)
     if path.suffix.lower() == ".npz":
         return _read_npz_cameras(path, size_px)

@@ -82,7 +82,8 @@ class CaptureFit:
 
     def describe(self) -> str:
         """Describe the changes, for people."""
-        turned = self._mean_turns_deg()
+        vectors = self.corrections[:, :72].reshape(-1, 24, 3)
+        turned = np.degrees(np.linalg.norm(vectors, axis=2)).mean(axis=0)
         return (
             "Body, poses and focal length were fitted to the masks: their outlines were "
             f"{self.error_before_cm:.1f} cm apart, and {self.error_after_cm:.1f} cm by the fit, of "
@@ -98,11 +99,6 @@ class CaptureFit:
             f" The given poses count by {1.0 - self.keypoint_share:.0%}, those that the built-in "
             "tracker's key points tell by the rest."
         )
-
-    def _mean_turns_deg(self) -> Float[np.ndarray, "24"]:
-        """Mean rotation of the root and of each joint, degrees."""
-        vectors = self.corrections[:, :72].reshape(-1, 24, 3)
-        return np.degrees(np.linalg.norm(vectors, axis=2)).mean(axis=0)
 
     def as_json(self) -> dict[str, float | bool]:
         """Figures for the report."""

@@ -201,6 +201,7 @@ def evaluate_gates(model: SparseModel, keys: int) -> list[QualityGate]:
     residual = float(np.mean(model.reprojection_errors_px())) if len(model.pixels) else np.inf
     focal = model.focal_px / max(model.size_px)
     largest = MAX_TURNING_ERROR * max(model.size_px) if model.only_turns else MAX_REPROJECTION_PX
+    angle = model.turn_deg() if model.only_turns else _median_angle(model)
     return [
         QualityGate(
             name="registered", value=registered, bound=MIN_REGISTERED_FRACTION,
@@ -222,25 +223,18 @@ def evaluate_gates(model: SparseModel, keys: int) -> list[QualityGate]:
             passed=FOCAL_RANGE[0] <= focal <= FOCAL_RANGE[1],
             failure_reason=f"the focal length came out as {focal:.2f} times the longer side",
         ),
-        _turn_gate(model) if model.only_turns else _angle_gate(model),
+        QualityGate(
+            name="turn_deg", value=angle, bound=MIN_TURN_DEG, passed=angle >= MIN_TURN_DEG,
+            failure_reason=f"the camera turns by {angle:.1f}° only, which tells no focal length",
+        )
+        if model.only_turns
+        else QualityGate(
+            name="angle_deg", value=angle, bound=MIN_TRIANGULATION_ANGLE_DEG,
+            passed=angle >= MIN_TRIANGULATION_ANGLE_DEG,
+            failure_reason="the camera hardly changes its place (points are seen under "
+            f"{angle:.1f}°)",
+        ),
     ]  # fmt: skip
-
-
-def _turn_gate(model: SparseModel) -> QualityGate:
-    turn = model.turn_deg()
-    return QualityGate(
-        name="turn_deg", value=turn, bound=MIN_TURN_DEG, passed=turn >= MIN_TURN_DEG,
-        failure_reason=f"the camera turns by {turn:.1f}° only, which tells no focal length",
-    )  # fmt: skip
-
-
-def _angle_gate(model: SparseModel) -> QualityGate:
-    angle = _median_angle(model)
-    return QualityGate(
-        name="angle_deg", value=angle, bound=MIN_TRIANGULATION_ANGLE_DEG,
-        passed=angle >= MIN_TRIANGULATION_ANGLE_DEG,
-        failure_reason=f"the camera hardly changes its place (points are seen under {angle:.1f}°)",
-    )  # fmt: skip
 
 
 def _rotation_jumps(model: SparseModel) -> Bool[np.ndarray, "cameras"]:

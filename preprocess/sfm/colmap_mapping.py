@@ -23,6 +23,7 @@ from jaxtyping import Bool, UInt8
 from capture.image_folder import write_png
 from capture.input_error import InputError, install_command
 from capture.source import Frame, FrameSource
+from preprocess.observation import shrink_to_longer_side
 from preprocess.sfm.camera_solution import SparseModel
 
 MAX_KEYFRAMES = 60
@@ -39,7 +40,7 @@ MIN_KEYFRAMES = 8
 """Fewest key frames that can be solved."""
 
 FEATURE_IMAGE_PX = 960
-"""Longer side of the images that features are detected in, pixels."""
+"""Longest side of the images that features are detected in, pixels."""
 
 PERSON_MARGIN = 0.015
 """Width of the ignored border around the person; a fraction of the image's width."""
@@ -60,12 +61,6 @@ class SfmKeyframe:
     def name(self) -> str:
         """Name of the image's file."""
         return f"{self.index:06d}.png"
-
-
-def feature_image_size(size_px: tuple[int, int]) -> tuple[int, int]:
-    """The size of images that are worked on: that of the frames, at most `FEATURE_IMAGE_PX`."""
-    scale = min(1.0, FEATURE_IMAGE_PX / max(size_px))
-    return max(1, round(size_px[0] * scale)), max(1, round(size_px[1] * scale))
 
 
 def to_grayscale(frame: Frame, size_px: tuple[int, int]) -> UInt8[np.ndarray, "height width"]:
@@ -89,7 +84,7 @@ def select_keyframes(
     """
     total = source.frame_count or source.frames_in_file
     stretches = min(max_keyframes, total, max(MIN_TARGET_KEYFRAMES, total // MIN_KEYFRAME_SPACING))
-    size_px = feature_image_size(source.size_px)
+    size_px = shrink_to_longer_side(source.size_px, FEATURE_IMAGE_PX)
     best: tuple[float, SfmKeyframe] | None = None
     at = 0
     for frame in source.frames():
