@@ -50,12 +50,14 @@ OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenGL's camera looks along -z, with y up."""
 NEAR_M, FAR_M = 0.1, 100.0
 """Depths at which OpenGL cuts."""
+SKINNING = Path(__file__).parents[1] / "examples" / "6_moving_splats.js"
+"""Moves splats by the mesh's skeleton."""
 FRAME_RATE = 30.0
 """Keys of the mesh's animation a second."""
 PAGE = """<!doctype html><meta charset="utf-8"><body>
 <script type="importmap">{"imports": {"three": "./three/build/three.module.js",
   "three/addons/": "./three/examples/jsm/",
-  "spark": "./@sparkjsdev/spark/dist/spark.module.js"}}</script>
+  "@sparkjsdev/spark": "./@sparkjsdev/spark/dist/spark.module.js"}}</script>
 <script type="module">
 import * as THREE from "three";
 import { GLTFLoader } from "./three/examples/jsm/loaders/GLTFLoader.js";
@@ -74,19 +76,30 @@ const draw = (scene, { view, projection, width, height }) => {
   renderer.render(scene, camera);
   return renderer.domElement.toDataURL();
 };
-window.meshes = async (file, shots) => {
+const load = async (file) => {
   const { scene, animations: [clip] } = await new GLTFLoader().loadAsync(file);
   scene.getObjectByName("floor").position.set(0, 0, 0);
   scene.traverse((node) => { node.frustumCulled = false; });
   const mixer = new THREE.AnimationMixer(scene);
   Object.assign(mixer.clipAction(clip), { loop: THREE.LoopOnce, clampWhenFinished: true }).play();
+  return { scene, mixer };
+};
+window.meshes = async (file, shots) => {
+  const { scene, mixer } = await load(file);
   return shots.map((shot) => { mixer.setTime(shot.time); return draw(scene, shot); });
 };
-window.splats = async (url, shot) => {
-  const { SparkRenderer, SplatMesh } = await import("spark");
+window.splats = async (url, shot, skeleton) => {
+  const { SparkRenderer, SplatMesh } = await import("@sparkjsdev/spark");
   const scene = new THREE.Scene(), splats = new SplatMesh({ url });
   await splats.initialized;
   scene.add(new SparkRenderer({ renderer }), splats);
+  if (skeleton) {
+    const { followSkeleton } = await import("./6_moving_splats.js");
+    const { scene: figure, mixer } = await load(skeleton);
+    mixer.setTime(shot.time);
+    figure.updateMatrixWorld();
+    followSkeleton(splats, figure.getObjectByProperty("isSkinnedMesh", true))();
+  }
   let picture, before;
   for (let same = 0, frame = 0; same < 2 && frame < 30; frame++) { // sorting takes its time
     picture = draw(scene, shot);
@@ -147,10 +160,13 @@ def measure(job: ExportJob) -> int:
     files = {f"{number}.ply": encode_ply(each) for number, each in enumerate(splats)}
     files |= {f"{number}.spz": encode_spz(each) for number, each in enumerate(splats)}
     files |= {"index.html": PAGE.encode(), "mesh.glb": mesh, **packages(job.node)}
+    files["rest.spz"] = encode_spz(build_splats(package.tables["hq"]))
+    files[SKINNING.name] = SKINNING.read_bytes()
     with serve(files) as browser:
         drawn[f"mesh of {job.triangles:,} triangles"] = draw_meshes(browser, package, views)
         for kind, axes in (("ply", np.diag([1.0, -1.0, -1.0, 1.0])), ("spz", np.eye(4))):
             drawn[f"splats, .{kind}"] = draw_splats(browser, kind, axes, views)
+        drawn["splats, .spz, moved"] = draw_moved_splats(browser, package, views)
     rows = [row for name, pictures in drawn.items() for row in marks(name, pictures, views)]
     if job.keep is not None:
         keep(job.keep, {"renderer": [view.rendered for view in views], **drawn})
@@ -220,14 +236,28 @@ def draw_meshes(
     browser: Browser, package: AvatarPackage, views: Sequence[ComparedView]
 ) -> list[Picture]:
     """The mesh in three.js, in the pose and by the camera of each view."""
+    return run(browser, f"meshes('mesh.glb', {json.dumps(animated_shots(package, views))})")
+
+
+def draw_moved_splats(
+    browser: Browser, package: AvatarPackage, views: Sequence[ComparedView]
+) -> list[Picture]:
+    """Splats of the canonical pose in Spark, moved by the mesh's skeleton."""
+    pictures = []
+    for each in animated_shots(package, views):
+        pictures += run(browser, f"splats('rest.spz', {json.dumps(each)}, 'mesh.glb')")
+    return pictures
+
+
+def animated_shots(package: AvatarPackage, views: Sequence[ComparedView]) -> list[dict[str, Any]]:
+    """Cameras in the world of the mesh's animation, and its times."""
     rest, first = package.manifest.rest_joints[0], views[0].pose
     # the animation starts upright at the rest joints; the page removes the floor's height
     from_animation = world_from_body(rest, first.root_rotation, first.root_translation)
-    shots = [
+    return [
         shot(view.camera, from_animation) | {"time": number / FRAME_RATE}
         for number, view in enumerate(views)
     ]
-    return run(browser, f"meshes('mesh.glb', {json.dumps(shots)})")
 
 
 def draw_splats(

@@ -1,15 +1,24 @@
 """The examples run as they stand, only shorter."""
 
+import functools
+import http.server
 import importlib.util
 import runpy
+import shutil
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from instant_avatar import export
+from tests.instant_avatar.browser import Browser, chromium, until
+
 EXAMPLES = Path(__file__).parents[2] / "examples"
+PACKAGES = EXAMPLES.parent / "build" / "npm" / "node_modules"
+"""Where `make test-all` has npm put three.js and Spark."""
 
 
 def load(name):
@@ -74,3 +83,67 @@ def test_an_avatar_is_drawn_from_all_sides(run, tmp_path, capsys):
     # arms are away from the body: from the side the person is much narrower than from the front
     assert widths[6] < 0.6 * widths[0]
     assert abs(widths[12] - widths[0]) < 8
+
+
+class QuietFiles(http.server.SimpleHTTPRequestHandler):
+    """A server that says nothing."""
+
+    def log_message(self, *_: object) -> None:
+        """Say nothing."""
+
+
+@pytest.fixture(scope="module")
+def site(run, film, tmp_path_factory):
+    """The address of the examples beside an avatar's exports, and a folder for browsers."""
+    folder = tmp_path_factory.mktemp("site")
+    for file in EXAMPLES.glob("[56]_*"):
+        shutil.copy(file, folder)
+    (folder / "node_modules").symlink_to(PACKAGES)
+    avatar, poses = run / "avatar.iavatar", film / "truth" / "novel" / "poses.npz"
+    for words in (
+        ["--to", "splats", "--out", folder / "avatar.spz"],
+        ["--to", "glb", "--triangles", "20000", "--poses", poses, "--out", folder / "dance.glb"],
+    ):
+        assert export.main([str(avatar), *map(str, words)]) == 0
+    files = functools.partial(QuietFiles, directory=str(folder))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), files) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}", folder
+        server.shutdown()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(chromium() is None, reason="there is no Chromium here")
+@pytest.mark.skipif(not PACKAGES.is_dir(), reason="`make test-all` fetches three.js and Spark")
+def test_mesh_in_three_and_splats_in_spark_are_one_figure_and_move(site):
+    """Both pages have the same camera; splats follow the skeleton of the mesh."""
+    address, folder = site
+    size = (300, 400)
+    shown = {}
+    with Browser(folder / "browser", size=size) as browser:
+
+        def settled():
+            before = picture()
+            until(lambda: (before == (now := picture())).all() and now.std() > 10.0, 60.0)
+            return before
+
+        def picture():
+            browser.run("new Promise((done) => setTimeout(done, 1000))")
+            return browser.picture().astype(float)
+
+        for page in ("5_avatar_in_three.html", "6_moving_splats.html"):
+            browser.emulate(scheme="light", size=size, motion="reduce")
+            browser.go(f"{address}/{page}")
+            until(lambda: browser.run("!!window.ready"), 60.0)
+            shown[page] = settled()
+            browser.emulate(scheme="light", size=size)
+            browser.go(f"{address}/{page}?moving")
+            until(lambda: browser.run("!!window.ready && location.search !== ''"), 60.0)
+            until(lambda: np.abs(picture() - shown[page]).mean() > 1.0, 60.0)  # noqa: B023
+    mesh, splats = shown.values()
+    figure = np.abs(mesh - mesh[0, 0]).max(axis=2) > 30.0
+    other = np.abs(splats - splats[0, 0]).max(axis=2) > 30.0
+    assert 0.02 < figure.mean() < 0.5
+    shared = (figure & other).sum() / (figure | other).sum()
+    assert shared > 0.8  # 0.84 of a film of 64 px, 0 where nothing moves the splats
+    assert np.abs(mesh - splats)[figure & other].mean() < 20.0
