@@ -15,7 +15,7 @@ export const followSkeleton = (splats, mesh) => {
     skinning.setSplatBones(index, new Vector4(...found.joints), new Vector4(...found.weights));
   });
   splats.skinning = skinning;
-  splats.updateGenerator(); // the shader is built anew, with the skin
+  splats.updateGenerator(); // its shader is built again, with the skin
   const moved = new Matrix4(), place = new Vector3(), turn = new Quaternion(), size = new Vector3();
   return () => {
     mesh.skeleton.bones.forEach((bone, joint) => {

@@ -369,6 +369,26 @@ def test_a_model_without_an_animation_is_named(truth, tmp_path):
         read_poses(path)
 
 
+def test_a_vrma_is_read_by_its_humanoid_bones_whatever_the_nodes_are_called(truth, tmp_path):
+    data = Rig(VRM, twist=1.0).glb(*truth)
+    size = struct.unpack_from("<I", data, 12)[0]
+    text = json.loads(data[20 : 20 + size])
+    bones = {node["name"]: {"node": number} for number, node in enumerate(text["nodes"])}
+    for number, node in enumerate(text["nodes"]):
+        node["name"] = f"Knochen {number}"
+    animation = {"specVersion": "1.0", "humanoid": {"humanBones": bones}}
+    text |= {"extensionsUsed": ["VRMC_vrm_animation"]}
+    text |= {"extensions": {"VRMC_vrm_animation": animation}}
+    whole = json.dumps(text).encode()
+    path = tmp_path / "walk.vrma"
+    path.write_bytes(
+        data[:12] + struct.pack("<I4s", len(whole), b"JSON") + whole + data[20 + size :]
+    )
+    metres, degrees = errors(read_poses(path), truth)
+    assert metres < 0.005
+    assert degrees < 0.5
+
+
 def test_nodes_that_are_their_own_ancestors_are_refused(truth, tmp_path):
     data = Rig(VRM).glb(*truth)
     size = struct.unpack_from("<I", data, 12)[0]
