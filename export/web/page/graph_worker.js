@@ -24,6 +24,8 @@ async function open({ tier }) {
   const tables = decodeTables({ ...streams, voxels }, layout, tiers[tier].settings.skinning_subdivision);
   sessions[tier] = await InferenceSession.create(graphs[tier], {
     executionProviders: ["wasm"],
+    graphOptimizationLevel: "basic",
+    executionMode: "parallel", // still one thread, but reuse of memory is not planned: 60 % of loading
     externalData: Object.entries(tables).map(([path, data]) => ({ path, data: new Uint8Array(data.buffer) })),
   });
 }
