@@ -1,5 +1,6 @@
 """A skinned mesh with its skeleton and a motion, as glTF 2.0 in one binary file (.glb, .vrm)."""
 
+import base64
 import json
 import struct
 from dataclasses import dataclass
@@ -312,6 +313,15 @@ class _GltfBuffer:
             "bufferViews": self._views,
             "accessors": self._accessors,
         }
+
+
+def text_of_glb(content: bytes) -> bytes:
+    """Convert a .glb file to a .gltf with the data inside, for programs that read text."""
+    (size,) = struct.unpack_from("<I", content, 12)
+    document = json.loads(content[20 : 20 + size])
+    data = base64.b64encode(content[28 + size :]).decode()  # after two headers
+    document["buffers"][0]["uri"] = f"data:application/octet-stream;base64,{data}"
+    return json.dumps(document, indent=1, allow_nan=False).encode()
 
 
 def _pack_glb(content: dict[str, Any], binary: bytes) -> bytes:

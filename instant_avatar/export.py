@@ -16,7 +16,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from capture.atomic_files import atomic_file
 from capture.camera import Camera
 from capture.input_error import InputError
-from export.gltf import SkeletonAnimation, encode_glb, encode_vrm
+from export.gltf import SkeletonAnimation, encode_glb, encode_vrm, text_of_glb
 from export.package.manifest import Manifest
 from export.package.package_file import AvatarPackage, read_package
 from export.player import Player
@@ -85,9 +85,9 @@ class ExportArguments:
     run: Annotated[Positional[Path], arg(metavar="RUN|AVATAR")]
     """Folder written by ia-ingest (--out), with checkpoint/; for meshes also a package."""
     to: Literal["iavatar", "glb", "vrm", "ply", "obj", "splats"] = "iavatar"
-    """Format: package for ia-play; binary glTF 2.0; VRM 1.0 (humanoid bones, resting in a T); a
-    static mesh with vertex colors as PLY or OBJ (canonical pose, no skeleton); or 3-D Gaussians in
-    one pose, as .ply or .spz."""
+    """Format: package for ia-play; glTF 2.0, binary or as text (.gltf); VRM 1.0 (humanoid bones,
+    resting in a T); a static mesh with vertex colors as PLY or OBJ (canonical pose, no skeleton);
+    or 3-D Gaussians in one pose, as .ply or .spz."""
     out: Annotated[Path, arg(metavar="FILE", help_behavior_hint="(required)")]
     """File to write, whole or not at all."""
     poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
@@ -113,7 +113,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def export(arguments: ExportArguments, console: Console) -> int:
     """Write a package or a mesh."""
-    suffixes = SPLAT_ENCODERS if arguments.to == "splats" else (f".{arguments.to}",)
+    several = {"splats": tuple(SPLAT_ENCODERS), "glb": (".glb", ".gltf")}
+    suffixes = several.get(arguments.to, (f".{arguments.to}",))
     if arguments.out.suffix.lower() not in suffixes:
         raise InputError(f"--out is {arguments.out}, but must end in {' or '.join(suffixes)}.")
     if not arguments.out.resolve().parent.is_dir():
@@ -189,6 +190,8 @@ def _build_mesh(
         )
         if arguments.to == "glb":
             content = _encode_animated(mesh, package.manifest, motion, name)
+            if arguments.out.suffix.lower() == ".gltf":
+                content = text_of_glb(content)
         elif arguments.to == "vrm":
             author = arguments.author or "unknown"  # a VRM must state one
             content = encode_vrm(mesh, package.manifest, name=name, author=author)

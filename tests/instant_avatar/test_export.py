@@ -99,9 +99,13 @@ def test_a_mesh_of_few_triangles_has_a_texture(run, call_export, tmp_path):
     code, said = call_export(run / "avatar.iavatar", *words)
     assert code == 0, said.err
     assert "2,000 triangles" in said.err
-    (mesh,) = trimesh.load(out).geometry.values()
-    assert mesh.visual.kind == "texture"
-    assert np.asarray(mesh.visual.material.baseColorTexture)[..., :3].std() > 20.0
+    code, said = call_export(run / "avatar.iavatar", *words[:-1], out.with_suffix(".gltf"))
+    assert code == 0, said.err
+    for file in (out, out.with_suffix(".gltf")):
+        (mesh,) = trimesh.load(file).geometry.values()
+        assert len(mesh.faces) == 2000
+        assert mesh.visual.kind == "texture"
+        assert np.asarray(mesh.visual.material.baseColorTexture)[..., :3].std() > 20.0
 
 
 def test_without_xatlas_a_mesh_of_few_triangles_has_colors(run, call_export, tmp_path, monkeypatch):
