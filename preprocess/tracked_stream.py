@@ -119,8 +119,8 @@ class TrackedStream(WrappedSource):
     """A source of frames of which the tracker takes the newest one whenever it is free.
 
     Where frames are not `skippable`, they wait instead. Frames are handed over `LAG_FRAMES` after
-    they came, so that their poses are fitted together with those of later frames. After the last
-    one some that were skipped follow, from the first on again.
+    they came, so that their poses are fitted together with those of later frames. If fewer than
+    `LEAST_FRAMES` were tracked, some that were skipped follow, from the first on again.
 
     Attributes:
         count: Number of frames that came.

@@ -40,7 +40,7 @@ MIN_KEYFRAMES = 8
 """Fewest key frames that can be solved."""
 
 FEATURE_IMAGE_PX = 960
-"""Longest side of the images that features are detected in, pixels."""
+"""Longer side of the images that features are detected in, pixels."""
 
 PERSON_MARGIN = 0.015
 """Width of the ignored border around the person; a fraction of the image's width."""

@@ -247,11 +247,12 @@ def arriving_at(rig, clip, *, gate):
     yield from frames[1:]
 
 
-def rates_by_frames(rig, clip, *, paced, seconds, opens_after_s):
+def rates_by_frames(rig, clip, *, paced, seconds, opens_after_s, all_came=False):
     """The learning rates of the steps after each number of frames."""
     gate = threading.Event()
     trainer = Trainer(rig, dataclasses.replace(QUICK, seconds=seconds))
-    inbox = Inbox(arriving_at(rig, clip, gate=gate), paced=paced)
+    frames = arriving_at(rig, clip, gate=gate)
+    inbox = Inbox(frames, paced=paced, all_came=lambda: all_came)
     rates = {1: [], 2: [], 3: []}
     for event in train(trainer, inbox, []):
         if isinstance(event, Stepped):
@@ -274,6 +275,21 @@ def test_after_the_last_frame_of_a_film_that_comes_rates_fall_for_a_while(
     assert len(rates[3]) >= train_module.MIN_STEPS_AFTER_LAST_FRAME
     assert trainer.steps >= 60  # however short the film is
     assert trainer.wall_seconds > 0.9  # the last frame came after the time that was given
+
+
+def test_rates_fall_from_the_end_of_the_film_on_while_its_frames_still_come(
+    rig, clip, ticking, monkeypatch
+):
+    """The last frame comes late: it is learnt for a while, too."""
+    monkeypatch.setattr(train_module, "LEAST_STEPS", 0)
+    monkeypatch.setattr(train_module, "CLOSING_S", 0.1)
+    monkeypatch.setattr(train_module, "LATE_FRAMES_S", 0.3)
+    rates, _ = rates_by_frames(rig, clip, paced=True, seconds=0.4, opens_after_s=0.8, all_came=True)
+    before = np.array(rates[1] + rates[2])
+    assert 0.0 < before[-1] < 0.9 * before[0]
+    assert (np.diff(before) <= 0.0).all()
+    assert rates[3][-1] < 0.1 * QUICK.learning_rate
+    assert len(rates[3]) >= train_module.MIN_STEPS_AFTER_LAST_FRAME
 
 
 def test_seconds_left_after_the_last_frame_are_the_cosines(rig, clip, ticking):
