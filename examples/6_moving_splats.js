@@ -50,12 +50,21 @@ const nearbyWeights = ({ geometry, skeleton }) => {
         add(sums, near.vertex, Math.max(0, 1 - squared / REACH ** 2) ** 4);
       }
     }
-    if (nearest === null) throw new Error("the mesh has no vertex near a splat: another avatar's?");
+    if (nearest === null) nearest = nearestOfAll(x, y, z); // a splat away from the surface
     add(sums, nearest, 1e-6); // if none lies within reach
     const order = [...sums.keys()].sort((a, b) => sums[b] - sums[a]).slice(0, JOINTS);
     const total = order.reduce((sum, joint) => sum + sums[joint], 0);
     return { joints: order, weights: order.map((joint) => sums[joint] / total) };
   };
+  function nearestOfAll(x, y, z) {
+    let nearest = 0, least = Infinity;
+    for (let vertex = 0; vertex < position.count; vertex++) {
+      const aside = position.getX(vertex) - x, above = position.getY(vertex) - y;
+      const squared = aside ** 2 + above ** 2 + (position.getZ(vertex) - z) ** 2;
+      if (squared < least) [nearest, least] = [vertex, squared];
+    }
+    return nearest;
+  }
   function add(sums, vertex, share) {
     for (let slot = 0; slot < JOINTS; slot++) {
       sums[skinIndex.getComponent(vertex, slot)] += share * skinWeight.getComponent(vertex, slot);

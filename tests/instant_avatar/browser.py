@@ -63,7 +63,7 @@ class Browser:
         os.close(hears)
         os.close(says)
         self._session, self._held, self._numbers = "", b"", itertools.count(1)
-        self._complaints: list[dict[str, Any]] = []
+        self.complaints: list[dict[str, Any]] = []
 
     def __enter__(self) -> "Browser":
         until(self._pages, 60.0)
@@ -82,7 +82,7 @@ class Browser:
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         try:
             if error is not None:
-                error.add_note(f"The page: {self.text()}\nThe browser: {self._complaints}")
+                error.add_note(f"The page: {self.text()}\nThe browser: {self.complaints}")
         finally:
             self._close()
 
@@ -179,7 +179,7 @@ class Browser:
         message, self._held = self._held.split(b"\0", 1)
         answer = json.loads(message)
         if answer.get("method") in COMPLAINTS:
-            self._complaints.append(answer["params"])
+            self.complaints.append(answer["params"])
         return answer
 
 

@@ -122,6 +122,11 @@ def test_mesh_in_three_and_splats_in_spark_are_one_figure_and_move(site):
     shown = {}
     with Browser(folder / "browser", size=size) as browser:
 
+        def ready(query):
+            thrown = [said for said in browser.complaints if "exceptionDetails" in said]
+            assert not thrown
+            return browser.run(f"!!window.ready && location.search === '{query}'")
+
         def settled():
             before = picture()
             until(lambda: (before == (now := picture())).all() and now.std() > 10.0, 180.0)
@@ -134,11 +139,11 @@ def test_mesh_in_three_and_splats_in_spark_are_one_figure_and_move(site):
         for page in ("5_avatar_in_three.html", "6_moving_splats.html"):
             browser.emulate(scheme="light", size=size, motion="reduce")
             browser.go(f"{address}/{page}")
-            until(lambda: browser.run("!!window.ready"), 180.0)
+            until(lambda: ready(""), 180.0)
             shown[page] = settled()
             browser.emulate(scheme="light", size=size)
             browser.go(f"{address}/{page}?moving")
-            until(lambda: browser.run("!!window.ready && location.search !== ''"), 180.0)
+            until(lambda: ready("?moving"), 180.0)
             until(lambda: np.abs(picture() - shown[page]).mean() > 1.0, 180.0)  # noqa: B023
     mesh, splats = shown.values()
     figure = np.abs(mesh - mesh[0, 0]).max(axis=2) > 30.0

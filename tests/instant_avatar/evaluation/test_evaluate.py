@@ -9,6 +9,8 @@ import pytest
 
 from avatar.evaluation.image_metrics import ground_truth_on_white, ground_truth_over
 from avatar.evaluation.perceptual import Lpips
+from capture.image_folder import write_png
+from capture.source_opening import open_source
 from instant_avatar import evaluate
 from instant_avatar.cli.command_line import INTERRUPTED
 from instant_avatar.evaluation import datasets
@@ -89,6 +91,10 @@ def dataset(film, call_ingest, tmp_path, monkeypatch):
             timed = {key: kept[key][rows] for key in ("global_orient", "body_pose", "transl")}
             np.savez(place / path, **(kept | timed))
         (place / "poses.npz").unlink()
+        (place / "images").mkdir()
+        for frame in open_source(film).frames():
+            write_png(place / "images" / f"{frame.index:04d}.png", frame.rgb)
+        (place / "video.mp4").unlink()
     return tmp_path / "PeopleSnapshot"
 
 
