@@ -9,7 +9,13 @@ from jaxtyping import Bool, Float32, Int, Int32, Shaped, UInt8
 
 from capture.camera import Camera
 from capture.input_error import InputError
-from export.package.player_tables import BRICK_NODES, PlayerTables, RenderSettings, SkinningGrid
+from export.package.player_tables import (
+    BRICK_NODES,
+    PlayerTables,
+    RenderSettings,
+    SkinningGrid,
+    SurfelTable,
+)
 from preprocess.body.body_pose import BodyPose
 from preprocess.poses.plausibility import MAX_JOINT_ANGLE_RAD, exceeds_joint_limits
 
@@ -144,7 +150,50 @@ def graph_initializers(
         columns[f"node_{letter}"] = np.ascontiguousarray(nodes.positions[:, axis])
         columns[f"position_{letter}"] = np.ascontiguousarray(surfels.positions[:, axis])
         columns[f"normal_{letter}"] = np.ascontiguousarray(surfels.normals[:, axis])
-    return columns
+    return columns | _surfel_cells(nodes, surfels)
+
+
+def _surfel_cells(nodes: SkinningNodes, surfels: SurfelTable) -> dict[str, np.ndarray]:
+    """Return where surfels lie between skinning nodes, as columns.
+
+    `cell_0` to `cell_3`: rows of the four lower nodes along z of the cell about each surfel, in C
+    order; `fraction_x`, …: its position in the cell, from 0 to 1. A cell is cut into six tetrahedra
+    along its diagonal; the one that holds the surfel is walked from the cell's lower to its upper
+    corner along the axes in the order of their fractions: `tetrahedron_1` to `tetrahedron_3`, rows
+    of its corners after `cell_0`; `share_0` to `share_3`, all corners' weights; `edge_normal_0` to
+    `edge_normal_2`, the surfel's normal along its edges, per step between nodes.
+    """
+    counts = np.array(nodes.index.shape)
+    place = (surfels.positions.astype(np.float64) - nodes.low) / nodes.step_m
+    place = np.clip(place, 0.0, counts - 1 - 1e-3)
+    below = place.astype(np.int32)
+    fraction = place - below
+    walk = np.argsort(-fraction, axis=1, kind="stable")
+    along = np.take_along_axis(fraction, walk, axis=1)
+    strides = np.array([counts[1] * counts[2], counts[2], 1])
+    number, index = below @ strides, nodes.index.ravel()
+    cell = [index[number + step] for step in (0, strides[1], strides[0], strides[0] + strides[1])]
+    # rows of lower nodes by C order of x and y; a step along z adds 1
+    corner, tetrahedron = np.zeros(len(number), dtype=np.intp), []
+    for axis in walk.T:
+        corner += np.array([4, 2, 1])[axis]
+        tetrahedron.append(np.choose(corner >> 1, cell) + (corner & 1).astype(np.int32))
+    bounds = np.pad(along, [(0, 0), (1, 1)], constant_values=[(0, 0), (1.0, 0.0)])
+    normals = np.take_along_axis(surfels.normals * nodes.step_m, walk, axis=1)
+    return {
+        **{f"cell_{i}": rows for i, rows in enumerate(cell)},
+        **{f"tetrahedron_{i}": rows for i, rows in enumerate(tetrahedron, 1)},
+        **_float_columns("fraction_", "xyz", fraction),
+        **_float_columns("share_", "0123", bounds[:, :-1] - bounds[:, 1:]),
+        **_float_columns("edge_normal_", "012", normals),
+    }
+
+
+def _float_columns(
+    name: str, endings: str, table: Shaped[np.ndarray, "rows columns"]
+) -> dict[str, np.ndarray]:
+    columns = zip(endings, table.T.astype(np.float32), strict=True)
+    return {name + ending: np.ascontiguousarray(column) for ending, column in columns}
 
 
 MAX_SAMPLES = 256

@@ -6,9 +6,8 @@ import numpy as np
 
 from export.graph.graph_skinning import (
     GraphContext,
-    VectorValue,
+    column,
     dot,
-    gather_vector,
     invert_jacobian,
     locate_skinning_cell,
     skin_points,
@@ -28,7 +27,7 @@ MIN_REMAINING_M = 1e-5
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BrickTetrahedra:
-    """Tetrahedra that contain some points: values of the graph, one entry a point.
+    """Tetrahedra that contain some points: values of the graph, one entry a point each.
 
     A cell is cut into six tetrahedra along its diagonal. The one that holds a point is walked
     from the cell's lower to its upper corner along the axes in the order of their fractions.
@@ -39,14 +38,14 @@ class BrickTetrahedra:
     """
 
     corners: list[GraphValue]
-    fractions: VectorValue
+    fractions: list[GraphValue]
 
 
-def locate_tetrahedra(context: GraphContext, lattice: VectorValue) -> BrickTetrahedra:
-    """Find the tetrahedra about lattice coordinates, (point - low) / voxel_m."""
+def locate_tetrahedra(context: GraphContext, lattice: GraphValue) -> BrickTetrahedra:
+    """Find the tetrahedra about lattice coordinates, (point - low) / voxel_m (3 × points)."""
     graph, bricks = context.graph, context.tables.bricks
     packed, fraction = None, []
-    for axis, coordinate in enumerate(lattice):
+    for axis, coordinate in enumerate(lattice.row(axis) for axis in range(3)):
         inside = coordinate.clip(0.0, bricks.index.shape[axis] * BRICK_SIZE - 1e-3)
         voxel = inside.cast(np.int32)
         fraction.append(inside - voxel.cast(np.float32))
@@ -59,7 +58,7 @@ def locate_tetrahedra(context: GraphContext, lattice: VectorValue) -> BrickTetra
     x, y, z = fraction
     largest, smallest = x.maximum(y, z), x.minimum(y, z)
     middle = (x + y + z) - largest - smallest
-    corners = _tetrahedron_corners(graph, base, fraction, largest, smallest)
+    corners = _tetrahedron_corners(graph, base, (x, y), largest, smallest)
     return BrickTetrahedra(corners=corners, fractions=[largest, middle, smallest])
 
 
@@ -83,7 +82,7 @@ def _brick_offsets(context: GraphContext) -> GraphValue:
 def _tetrahedron_corners(
     graph: GraphBuilder,
     base: GraphValue,
-    fraction: VectorValue,
+    fraction: tuple[GraphValue, GraphValue],
     largest: GraphValue,
     smallest: GraphValue,
 ) -> list[GraphValue]:
@@ -91,7 +90,7 @@ def _tetrahedron_corners(
 
     Where two fractions are equal, the corner between them has weight 0.
     """
-    x, y, _ = fraction
+    x, y = fraction
     sx, sy, sz = VOXEL_STRIDES
 
     def chosen(here: GraphValue, yes: GraphValue | int, no: GraphValue | int) -> GraphValue:
@@ -115,8 +114,8 @@ def interpolate_density(context: GraphContext, cell: BrickTetrahedra) -> GraphVa
     return context.graph.where(code > 0.5, density, 0.0)
 
 
-def interpolate_color(context: GraphContext, cell: BrickTetrahedra) -> VectorValue:
-    """Return red, green and blue in [0, 1], linear in each tetrahedron."""
+def interpolate_color(context: GraphContext, cell: BrickTetrahedra) -> GraphValue:
+    """Return red, green and blue in [0, 1], linear in each tetrahedron (3 × points)."""
     parts = [(part * float(COLOR_WEIGHT_SCALE) + 0.5).cast(np.int32) for part in cell.fractions]
     a, b, c = parts
     red_blue = green = None
@@ -128,18 +127,14 @@ def interpolate_color(context: GraphContext, cell: BrickTetrahedra) -> VectorVal
     assert red_blue is not None
     assert green is not None
     scale = 1.0 / (255.0 * COLOR_WEIGHT_SCALE)
-    blue = red_blue.shift_right(16)
-    red = red_blue - blue.cast(np.int32) * (1 << 16)
-    return [
-        red.cast(np.float32) * scale,
-        green.cast(np.float32) * (scale / 256.0),
-        blue.cast(np.float32) * scale,
-    ]
+    blue = red_blue.shift_right(16).cast(np.int32)
+    sums = context.graph.stack([red_blue - blue * (1 << 16), green, blue])
+    return sums.cast(np.float32) * column([scale, scale / 256.0, scale])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SegmentValues:
-    """Segments of rays: values of the graph, one entry a ray.
+    """Segments of rays: values of the graph, one entry or column a ray.
 
     Attributes:
         direction_camera: Unit directions in the camera's frame.
@@ -148,16 +143,16 @@ class SegmentValues:
         direction_canonical: Canonical metres per metre along the ray, at `begin`.
     """
 
-    direction_camera: VectorValue
+    direction_camera: GraphValue
     begin: GraphValue
     end: GraphValue
-    start_canonical: VectorValue
-    direction_canonical: VectorValue
+    start_canonical: GraphValue
+    direction_canonical: GraphValue
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class BlockValues:
-    """Result of a block of samples: values of the graph, one entry a ray.
+    """Result of a block of samples: values of the graph, one entry or column a ray.
 
     Attributes:
         end: End of the block along the ray, metres.
@@ -166,17 +161,17 @@ class BlockValues:
     """
 
     end: GraphValue
-    end_canonical: VectorValue
+    end_canonical: GraphValue
     transmittance: GraphValue
-    color: VectorValue
+    color: GraphValue
 
 
 def march_segments(
     context: GraphContext,
-    posed: VectorValue,
+    posed: GraphValue,
     segment: SegmentValues,
     close_up: GraphValue,
-) -> tuple[VectorValue, GraphValue]:
+) -> tuple[GraphValue, GraphValue]:
     """Composite rays front to back; return premultiplied color and transmittance, in [0, 1].
 
     After each block of samples, rays that have ended are dropped; a Newton step moves the others
@@ -194,10 +189,10 @@ def march_segments(
         context, segment, segment.begin * 0.0 + 1.0, settings.block_samples, usual * shortened
     )
     number = graph.range(graph.size(segment.begin).cast(np.int32))
-    start = [block.transmittance, *block.color, *_unfinished_rays(context, number, segment, block)]
+    start = [block.transmittance, block.color, *_unfinished_rays(context, number, segment, block)]
 
     def once(turn: GraphValue, state: list[GraphValue]) -> tuple[GraphValue, list[GraphValue]]:
-        (light, *color), number, before, values = state[:4], state[4], state[5], state[6:]
+        light, color, number, before, *values = state
         segment = _newton_step(context, posed, _unpack_segment(values))
         doublings = (turn + 2 - steady).maximum(0).cast(np.float32)
         last = turn > blocks - 3
@@ -205,18 +200,15 @@ def march_segments(
         longest = graph.where(last, settings.max_segment_m, usual * doublings.exp2() * shortened)
         block = composite_samples(context, segment, before, settings.block_samples, longest)
         light = light.scatter(number, block.transmittance)
-        color = [
-            c.scatter(number, added, reduction="add")
-            for c, added in zip(color, block.color, strict=True)
-        ]
+        color = color.scatter(number.repeat_rows(3), block.color, reduction="add", axis=1)
         left = _unfinished_rays(context, number, segment, block)
-        return graph.size(left[0]) > 0, [light, *color, *left]
+        return graph.size(left[0]) > 0, [light, color, *left]
 
-    light, *color = graph.loop_while(blocks - 1, start, once)[:4]
+    light, color = graph.loop_while(blocks - 1, start, once)[:2]
     return color, light
 
 
-def compression_scale(context: GraphContext, direction: VectorValue) -> GraphValue:
+def compression_scale(context: GraphContext, direction: GraphValue) -> GraphValue:
     """Return the factor, at most 1, by which lengths shrink where the pose compresses space."""
     return (context.settings.max_compression / dot(direction, direction).sqrt()).minimum(1.0)
 
@@ -224,37 +216,31 @@ def compression_scale(context: GraphContext, direction: VectorValue) -> GraphVal
 def _unfinished_rays(
     context: GraphContext, number: GraphValue, segment: SegmentValues, block: BlockValues
 ) -> list[GraphValue]:
-    """Return numbers, transmittances and packed remainders (`_pack_segment`) of unfinished rays."""
+    """Return numbers, transmittances and remainders (`_unpack_segment`) of unfinished rays."""
     graph = context.graph
     on = (block.transmittance > context.settings.min_transmittance) & (
         block.end < segment.end - MIN_REMAINING_M
     )
     chosen = graph.range(graph.size(on).cast(np.int32)).compress(on)
-    rest = SegmentValues(
-        direction_camera=segment.direction_camera,
-        begin=block.end,
-        end=segment.end,
-        start_canonical=block.end_canonical,
-        direction_canonical=segment.direction_canonical,
-    )
-    return gather_vector([number, block.transmittance, *_pack_segment(rest)], chosen)
+    vectors = chosen.repeat_rows(3)
+    return [
+        *(v.gather(chosen) for v in (number, block.transmittance, block.end, segment.end)),
+        *(
+            v.gather_columns(vectors)
+            for v in (segment.direction_camera, block.end_canonical, segment.direction_canonical)
+        ),
+    ]
 
 
 def _unpack_segment(values: list[GraphValue]) -> SegmentValues:
+    begin, end, direction_camera, start_canonical, direction_canonical = values
     return SegmentValues(
-        direction_camera=values[:3],
-        begin=values[3],
-        end=values[4],
-        start_canonical=values[5:8],
-        direction_canonical=values[8:],
+        direction_camera=direction_camera,
+        begin=begin,
+        end=end,
+        start_canonical=start_canonical,
+        direction_canonical=direction_canonical,
     )
-
-
-def _pack_segment(segment: SegmentValues) -> list[GraphValue]:
-    directions = segment.direction_camera, segment.direction_canonical
-    return [
-        *directions[0], segment.begin, segment.end, *segment.start_canonical, *directions[1]
-    ]  # fmt: skip
 
 
 def composite_samples(
@@ -268,71 +254,42 @@ def composite_samples(
     graph, bricks = context.graph, context.tables.bricks
     step = ((segment.end - segment.begin) * (1.0 / num_samples)).minimum(max_spacing)
     scale = 1.0 / bricks.voxel_m
-    start = [
-        p * scale - float(low) * scale
-        for p, low in zip(segment.start_canonical, bricks.low, strict=True)
-    ]
-    along_step = step * scale
-    slope = [d * along_step for d in segment.direction_canonical]
-    middles = graph.constant((np.arange(num_samples, dtype=np.float32) + 0.5)[:, None])
-    lattice = [
-        (middles * b.reshape(1, -1) + a.reshape(1, -1)).reshape(-1)
-        for a, b in zip(start, slope, strict=True)
-    ]
-    density = interpolate_density(context, locate_tetrahedra(context, lattice)).reshape(
-        num_samples, -1
-    )
-    passed = graph.split((density * -step.reshape(1, -1)).exp(), num_samples)
-    weight = mean = None
-    before = light
-    for turn, share in enumerate(passed):
-        light = before * share
-        seen = before - light
-        part = seen * (turn + 0.5)
-        weight = seen if weight is None else weight + seen
-        mean = part if mean is None else mean + part
-        before = light
-    assert weight is not None
-    assert mean is not None
+    start = segment.start_canonical * scale - column(bricks.low * scale)
+    slope = segment.direction_canonical * (step * scale)
+    middles = np.arange(num_samples) + 0.5
+    lattice = slope.reshape(3, 1, -1) * column(middles) + start.reshape(3, 1, -1)
+    density = interpolate_density(context, locate_tetrahedra(context, lattice.reshape(3, -1)))
+    depth = density.reshape(num_samples, -1) * -step
+    after = graph.node("CumSum", depth, graph.constant(np.int64(0))).exp() * light
+    passed = after.row(num_samples - 1)
+    # the sum of what samples absorb, times their numbers and a half, by parts
+    shares = np.where(middles < middles[-1], 1.0, -middles[-1])
+    weight, mean = light - passed, after.weighted_sum(shares) + light * 0.5
     middle = mean / weight.maximum(1e-9)
-    seen = interpolate_color(
-        context,
-        locate_tetrahedra(context, [a + middle * b for a, b in zip(start, slope, strict=True)]),
-    )
+    seen = interpolate_color(context, locate_tetrahedra(context, start + slope * middle))
     way = step * float(num_samples)
     return BlockValues(
         end=segment.begin + way,
-        end_canonical=[
-            p + d * way
-            for p, d in zip(segment.start_canonical, segment.direction_canonical, strict=True)
-        ],
-        transmittance=light,
-        color=[c * weight for c in seen],
+        end_canonical=segment.start_canonical + segment.direction_canonical * way,
+        transmittance=passed,
+        color=seen * weight,
     )
 
 
-def _newton_step(
-    context: GraphContext, posed: VectorValue, segment: SegmentValues
-) -> SegmentValues:
+def _newton_step(context: GraphContext, posed: GraphValue, segment: SegmentValues) -> SegmentValues:
     """Move canonical positions onto their camera rays where skinning is invertible."""
     graph, settings = context.graph, context.settings
     camera, derivative = skin_points(
         context, posed, locate_skinning_cell(context, segment.start_canonical)
     )
     inverse = invert_jacobian(context, derivative, segment.direction_camera)
-    off = [segment.begin * r - c for r, c in zip(segment.direction_camera, camera, strict=True)]
-    shift = inverse.apply(off)
+    shift = inverse.apply(segment.direction_camera * segment.begin - camera)
     length = (dot(shift, shift) + 1e-20).sqrt()
     share = graph.where(inverse.trusted, (settings.max_correction_m / length).minimum(1.0), 0.0)
     return SegmentValues(
         direction_camera=segment.direction_camera,
         begin=segment.begin,
         end=segment.end,
-        start_canonical=[
-            p + s * share for p, s in zip(segment.start_canonical, shift, strict=True)
-        ],
-        direction_canonical=[
-            graph.where(inverse.trusted, a, b)
-            for a, b in zip(inverse.ray, segment.direction_canonical, strict=True)
-        ],
+        start_canonical=segment.start_canonical + shift * share,
+        direction_canonical=graph.where(inverse.trusted, inverse.ray, segment.direction_canonical),
     )

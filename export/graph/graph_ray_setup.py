@@ -18,11 +18,10 @@ from export.graph.graph_skinning import (
     GraphContext,
     PosedSurfels,
     SkinningCell,
-    VectorValue,
     dot,
-    gather_vector,
     invert_jacobian,
     skin_points,
+    vector_table,
 )
 from export.graph.graph_zbuffer import SplatWindow, SurfelSplats
 from export.graph.onnx_builder import GraphValue
@@ -37,7 +36,7 @@ from export.package.player_tables import (
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DepthLayer:
-    """One depth layer: values of the graph, one entry a ray.
+    """One depth layer: values of the graph, one entry or column a ray.
 
     Attributes:
         ray: Unit directions in the camera's frame.
@@ -50,11 +49,11 @@ class DepthLayer:
             canonical space) or seen from behind.
     """
 
-    ray: VectorValue
+    ray: GraphValue
     surfel: GraphValue
-    canonical_position: VectorValue
-    camera_position: VectorValue
-    color: VectorValue
+    canonical_position: GraphValue
+    camera_position: GraphValue
+    color: GraphValue
     transmittance: GraphValue
     enter: GraphValue
     end: GraphValue
@@ -66,11 +65,11 @@ class PosedProxySurface:
     """Surfels and skinning nodes in the camera's frame; whether it is near (`MIN_FOOTPRINT_PX`)."""
 
     surfels: PosedSurfels
-    posed: VectorValue
+    posed: GraphValue
     close_up: GraphValue
 
 
-def pixel_rays(view: CameraValues, window: SplatWindow, pixel: GraphValue) -> VectorValue:
+def pixel_rays(view: CameraValues, window: SplatWindow, pixel: GraphValue) -> GraphValue:
     """Return unit directions through the centers of some of the window's pixels (int32)."""
     width = window.width.cast(np.int32)
     row = pixel // width
@@ -79,14 +78,14 @@ def pixel_rays(view: CameraValues, window: SplatWindow, pixel: GraphValue) -> Ve
     y = row.cast(np.float32) + (window.top.cast(np.float32) + 0.5 - view.center[1])
     x, y = x / view.focal[0], y / view.focal[1]
     scale = (x * x + y * y + 1.0).sqrt().reciprocal()
-    return [x * scale, y * scale, scale]
+    return scale.graph.stack([x * scale, y * scale, scale])
 
 
 def trace_depth_layer(
     context: GraphContext,
     surface: PosedProxySurface,
     keys: GraphValue,
-    ray: VectorValue,
+    ray: GraphValue,
     front: DepthLayer | None,
 ) -> DepthLayer:
     """Trace unit rays of the camera's frame through one depth layer.
@@ -95,27 +94,25 @@ def trace_depth_layer(
     where it enters the surface. Where the skin is folded or compressed, look along its normal.
     `front` is the layer in front of the same rays; None for the first layer.
     """
-    graph, surfel = context.graph, keys.bitwise_and(SURFEL_MASK)
-    cells = surface.surfels.cell
+    graph, surfel, surfels = context.graph, keys.bitwise_and(SURFEL_MASK), surface.surfels
     cell = SkinningCell(
-        rows=gather_vector(cells.rows, surfel), fraction=gather_vector(cells.fraction, surfel)
+        rows=[rows.gather(surfel) for rows in surfels.cell.rows],
+        fraction=[fraction.gather(surfel) for fraction in surfels.cell.fraction],
     )
     camera, derivative = skin_points(context, surface.posed, cell)
     inverse = invert_jacobian(context, derivative, ray)
-    normal = gather_vector(_vector_table(context, "normal"), surfel)
+    normal = vector_table(context, "normal", surfel)
     far = dot(inverse.ray, inverse.ray) > MAX_TRUSTED_COMPRESSION**2
     trusted = inverse.trusted & (surface.close_up & far).logical_not()
-    direction = [graph.where(trusted, d, -n) for d, n in zip(inverse.ray, normal, strict=True)]
+    direction = graph.where(trusted, inverse.ray, -normal)
     along = dot(camera, ray)
-    beside = inverse.apply([along * r - c for r, c in zip(ray, camera, strict=True)])
-    beside = [graph.where(trusted, b, 0.0) for b in beside]
+    beside = graph.where(trusted, inverse.apply(ray * along - camera), 0.0)
     thickness = context.table_values["thickness"].gather(surfel)
     enter, begin, end = _segment_bounds(context, normal, thickness, direction, beside, along)
-    canonical = gather_vector(_vector_table(context, "position"), surfel)
+    canonical = vector_table(context, "position", surfel)
     if front is not None:
         begin = _begin_behind_front_layer(context, front, canonical, camera, begin, end)
-    way = begin - along
-    start = [p + b + way * d for p, b, d in zip(canonical, beside, direction, strict=True)]
+    start = canonical + beside + direction * (begin - along)
     segment = SegmentValues(
         direction_camera=ray, begin=begin, end=end,
         start_canonical=start, direction_canonical=direction,
@@ -137,13 +134,9 @@ def trace_depth_layer(
     )
 
 
-def _vector_table(context: GraphContext, name: str) -> VectorValue:
-    return [context.table_values[f"{name}_{letter}"] for letter in "xyz"]
-
-
 def _composite_in_one_block(
     context: GraphContext, segment: SegmentValues
-) -> tuple[VectorValue, GraphValue]:
+) -> tuple[GraphValue, GraphValue]:
     """Composite the segments of a further layer; return premultiplied color and transmittance."""
     settings, ones = context.settings, segment.begin * 0.0 + 1.0
     block = composite_samples(
@@ -154,10 +147,10 @@ def _composite_in_one_block(
 
 def _segment_bounds(
     context: GraphContext,
-    normal: VectorValue,
+    normal: GraphValue,
     thickness: GraphValue,
-    direction: VectorValue,
-    beside: VectorValue,
+    direction: GraphValue,
+    beside: GraphValue,
     along: GraphValue,
 ) -> tuple[GraphValue, GraphValue, GraphValue]:
     """Return the distances at which rays enter the tangent plane, begin and end.
@@ -190,16 +183,16 @@ def _segment_bounds(
 def _begin_behind_front_layer(
     context: GraphContext,
     before: DepthLayer,
-    canonical: VectorValue,
-    camera: VectorValue,
+    canonical: GraphValue,
+    camera: GraphValue,
     begin: GraphValue,
     end: GraphValue,
 ) -> GraphValue:
     """Begin rays at the end of the front layer where both layers see one sheet."""
     settings = context.settings
 
-    def apart(here: VectorValue, first: VectorValue) -> GraphValue:
-        between = [a - b for a, b in zip(here, first, strict=True)]
+    def apart(here: GraphValue, first: GraphValue) -> GraphValue:
+        between = here - first
         return dot(between, between).sqrt()
 
     one_sheet = (
@@ -219,8 +212,8 @@ def filter_specks(
     splats: SurfelSplats,
     cell: GraphValue,
     first: DepthLayer,
-    channels: list[GraphValue],
-) -> list[GraphValue]:
+    channels: GraphValue,
+) -> GraphValue:
     """Replace doubtful pixels, and specks behind the first layer, by the median about them.
 
     A pixel is doubtful where the pose folds the skin about its surfel, compresses it along the ray,
@@ -241,30 +234,18 @@ def filter_specks(
     numbers = (graph.full(graph.shape(window.cells), np.int32(0)) + empty).scatter(cell, covered)
     around = cell.gather(suspect).reshape(1, -1) + steps.reshape(-1, 1)
     around = numbers.gather(around.reshape(-1))
-    nothing = graph.constant(np.zeros(1, dtype=np.float32))
-    *color, light = channels
-    values = [*color, 1.0 - light]
-    taps = [
-        graph.concatenate([value, nothing]).gather(around).reshape(len(TAPS), -1)
-        for value in values
-    ]
-    nine = graph.split(graph.concatenate(taps, axis=1), len(TAPS))
+    nothing = graph.constant(np.zeros((4, 1), dtype=np.float32))
+    taps = graph.concatenate([channels, nothing], axis=1).gather_columns(around.repeat_rows(4))
+    nine = graph.split(taps.reshape(4, len(TAPS), -1), len(TAPS), axis=1)
     median = _median_of_nine(nine)
     apart = median - nine[len(TAPS) // 2]
-    medians, apart = (
-        [part.reshape(-1) for part in graph.split(value.reshape(len(values), -1), len(values))]
-        for value in (median, apart.maximum(-apart))
-    )
-    differs = apart[0].maximum(*apart[1:]) > MAX_MEDIAN_DIFFERENCE
+    apart, median = apart.maximum(-apart).reshape(4, -1), median.reshape(4, -1)
+    differs = apart.row(0).maximum(*(apart.row(k) for k in (1, 2, 3))) > MAX_MEDIAN_DIFFERENCE
     fine = splats.footprint_px > MIN_FOOTPRINT_PX - 1
-    speck = (medians[-1] > MIN_MEDIAN_ALPHA) & differs & fine
+    speck = (median.row(3) > MIN_MEDIAN_ALPHA) & differs & fine
     chosen = first.doubtful.gather(suspect) | speck
-    there = suspect.compress(chosen)
-    *color, alpha = (
-        value.scatter(there, part.compress(chosen))
-        for value, part in zip(values, medians, strict=True)
-    )
-    return [*color, 1.0 - alpha]
+    there = suspect.compress(chosen).repeat_rows(4)
+    return channels.scatter(there, median.compress_columns(chosen), axis=1)
 
 
 def _median_of_nine(values: list[GraphValue]) -> GraphValue:

@@ -7,8 +7,6 @@ import numpy as np
 from export.graph.graph_skinning import (
     GraphContext,
     PosedSurfels,
-    VectorValue,
-    dot,
     faces_camera,
 )
 from export.graph.onnx_builder import GraphValue
@@ -211,7 +209,7 @@ def depth_limits(
 
 def hidden_splats(
     context: GraphContext,
-    posed: VectorValue,
+    posed: GraphValue,
     surfels: PosedSurfels,
     splats: SurfelSplats,
     limits: GraphValue,
@@ -279,9 +277,10 @@ def _same_sheet(
     """Tell which pairs of surfels are about as close in canonical space as they are posed."""
     settings = context.settings
 
-    def apart(columns: VectorValue) -> GraphValue:
+    def apart(columns: list[GraphValue]) -> GraphValue:
         between = [column.gather(one) - column.gather(other) for column in columns]
-        return dot(between, between).sqrt()
+        squares = [part * part for part in between]
+        return (squares[0] + squares[1] + squares[2]).sqrt()
 
     canonical = [context.table_values[f"position_{letter}"] for letter in "xyz"]
     return (

@@ -107,9 +107,30 @@ class GraphValue:
         along = self.graph.constant(np.array([axis], dtype=np.int64))
         return self.graph.node("ReduceSum", self, along, keepdims=0)
 
+    def weighted_sum(self, weights: Shaped[np.ndarray, "rows"]) -> "GraphValue":
+        """The sum of the rows times their weights (of floats; a matrix product is fastest)."""
+        return self.graph.constant(weights.astype(self.dtype)).matmul(self)
+
     def row(self, index: int) -> "GraphValue":
         """`self[index]`."""
         return self.gather_rows(self.graph.constant(np.int64(index)))
+
+    def take(self, indices: Sequence[int], axis: int = 0) -> "GraphValue":
+        """`self[indices]`, or along another axis."""
+        places = self.graph.constant(np.array(indices, dtype=np.int64))
+        return self.graph.node("Gather", self, places, axis=axis)
+
+    def repeat_rows(self, rows: int) -> "GraphValue":
+        """A 1D value as each of `rows` rows."""
+        return self.graph.node("Expand", self, self.graph.shape(rows, 1))
+
+    def gather_columns(self, places: "GraphValue") -> "GraphValue":
+        """`self[i, places[i]]` of each row i: one column for all rows of `repeat_rows`."""
+        return self.graph.node("GatherElements", self, places, axis=1)
+
+    def compress_columns(self, condition: "GraphValue") -> "GraphValue":
+        """`self[:, condition]`."""
+        return self.graph.node("Compress", self, condition, axis=1)
 
     def transpose(self, *order: int) -> "GraphValue":
         """Axes in another order."""
@@ -126,11 +147,11 @@ class GraphValue:
         return self.graph.node("Slice", self, *bounds, axes)
 
     def scatter(
-        self, places: "GraphValue", updates: "GraphValue", reduction: str = "none"
+        self, places: "GraphValue", updates: "GraphValue", reduction: str = "none", axis: int = 0
     ) -> "GraphValue":
-        """A copy with `updates` written (or reduced) into one-dimensional `places`."""
+        """A copy with `updates` written (or reduced) into `places` along an axis."""
         operands = (self, places, updates)
-        return self.graph.node("ScatterElements", *operands, axis=0, reduction=reduction)
+        return self.graph.node("ScatterElements", *operands, axis=axis, reduction=reduction)
 
 
 @final
@@ -258,8 +279,8 @@ class GraphBuilder:
         inner = helper.make_graph(
             self._nodes,
             prefix,
-            [_scalar_info(turn), _scalar_info(go), *(_vector_info(value) for value in held)],
-            [_scalar_info(results[0]), *(_vector_info(value) for value in results[1:])],
+            [_scalar_info(turn), _scalar_info(go), *(_tensor_info(value) for value in held)],
+            [_scalar_info(results[0]), *(_tensor_info(value) for value in results[1:])],
         )
         self._nodes = before
         outputs = [GraphValue(self, f"{prefix}_result_{i}", s.dtype) for i, s in enumerate(states)]
@@ -268,14 +289,27 @@ class GraphBuilder:
         self._nodes.append(helper.make_node("Loop", inputs, names, name=prefix, body=inner))
         return outputs
 
+    def stack(self, rows: Sequence[GraphValue]) -> GraphValue:
+        """1D values as the rows of a matrix."""
+        return self.concatenate([row.reshape(1, -1) for row in rows])
+
     def split(self, value: GraphValue, parts: int, axis: int = 0) -> list[GraphValue]:
-        """Split along an axis of length `parts`, which goes away."""
+        """Split along an axis of length `parts`, which stays, of length 1."""
+        return self._split([value], parts, axis=axis, num_outputs=parts)
+
+    def halve_columns(self, value: GraphValue, width: GraphValue) -> list[GraphValue]:
+        """Split a matrix of 2 × `width` columns, an int64 scalar, which may be 0."""
+        both = width * self.constant(np.ones(2, dtype=np.int64))
+        return self._split([value, both], 2, axis=1)
+
+    def _split(
+        self, operands: Sequence[GraphValue], parts: int, **attributes: Any
+    ) -> list[GraphValue]:
         self._count += 1
         names = [f"split_{self._count}_{i}" for i in range(parts)]
-        self._nodes.append(
-            helper.make_node("Split", [value.name], names, axis=axis, num_outputs=parts)
-        )
-        return [GraphValue(self, name, value.dtype).reshape(-1) for name in names]
+        inputs = [operand.name for operand in operands]
+        self._nodes.append(helper.make_node("Split", inputs, names, **attributes))
+        return [GraphValue(self, name, operands[0].dtype) for name in names]
 
     def model(self) -> onnx.ModelProto:
         """Return the model; its tables are passed to the runtime separately."""
@@ -292,8 +326,9 @@ def _scalar_info(value: GraphValue) -> onnx.ValueInfoProto:
     return helper.make_tensor_value_info(value.name, ONNX_TYPES[value.dtype], [])
 
 
-def _vector_info(value: GraphValue) -> onnx.ValueInfoProto:
-    return helper.make_tensor_value_info(value.name, ONNX_TYPES[value.dtype], [None])
+def _tensor_info(value: GraphValue) -> onnx.ValueInfoProto:
+    # of no rank: for values of a known one onnxruntime plans reuse, a search quadratic in nodes
+    return helper.make_tensor_value_info(value.name, ONNX_TYPES[value.dtype], None)
 
 
 Operand = GraphValue | float | int | np.generic | np.ndarray

@@ -15,7 +15,6 @@ from export.graph.graph_ray_setup import (
 from export.graph.graph_skinning import (
     CameraValues,
     GraphContext,
-    gather_vector,
     pose_nodes,
     pose_surfels,
 )
@@ -72,9 +71,10 @@ def _draw_picture(context: GraphContext) -> GraphValue:
     pixel = graph.range((window.width * window.height).cast(np.int32)).compress(covered)
     ray = pixel_rays(context.camera, window, pixel)
     first = trace_depth_layer(context, surface, keys.gather(pixel), ray, None)
-    channels = [*first.color, first.transmittance]
+    color, light = first.color, first.transmittance
     if context.settings.layers > 1:
-        channels = _add_further_layers(context, surface, splats, pixel, first)
+        color, light = _add_further_layers(context, surface, splats, pixel, first)
+    channels = graph.concatenate([color, (1.0 - light).reshape(1, -1)])
     channels = filter_specks(context, splats, _window_cells(window, pixel), first, channels)
     return _pack_rgba(context, window, pixel, channels)
 
@@ -97,8 +97,8 @@ def _add_further_layers(
     splats: SurfelSplats,
     pixel: GraphValue,
     first: DepthLayer,
-) -> list[GraphValue]:
-    """Return color and transmittance after all layers, one entry a ray of the first."""
+) -> tuple[GraphValue, GraphValue]:
+    """Return color and transmittance after all layers, one column a ray of the first."""
     graph, window, hidden = context.graph, splats.window, None
     color, light, before = first.color, first.transmittance, first
     number = graph.range(graph.size(pixel).cast(np.int32))
@@ -106,7 +106,7 @@ def _add_further_layers(
         wanted = before.transmittance > context.settings.layer_min_transmittance
         kept = graph.range(graph.size(number).cast(np.int32)).compress(wanted)
         cell = _window_cells(window, pixel.gather(number.gather(kept)))
-        depth = (before.enter * before.ray[2]).gather(kept) + context.settings.layer_gap_m
+        depth = (before.enter * before.ray.row(2)).gather(kept) + context.settings.layer_gap_m
         limits = depth_limits(context, window, cell, depth)
         hidden = hidden or hidden_splats(context, surface.posed, surface.surfels, splats, limits)
         keys = keys_behind_limits(
@@ -115,11 +115,12 @@ def _add_further_layers(
         there = keys < EMPTY_KEY
         keys, kept = keys.compress(there), kept.compress(there)
         number = number.gather(kept)
+        vectors = kept.repeat_rows(3)
         seen_from = DepthLayer(
-            ray=gather_vector(before.ray, kept),
+            ray=before.ray.gather_columns(vectors),
             surfel=before.surfel.gather(kept),
-            canonical_position=gather_vector(before.canonical_position, kept),
-            camera_position=gather_vector(before.camera_position, kept),
+            canonical_position=before.canonical_position.gather_columns(vectors),
+            camera_position=before.camera_position.gather_columns(vectors),
             color=before.color,
             transmittance=before.transmittance.gather(kept),
             enter=before.enter,
@@ -127,13 +128,11 @@ def _add_further_layers(
             doubtful=before.doubtful,
         )
         layer = trace_depth_layer(context, surface, keys, seen_from.ray, seen_from)
-        color = [
-            c.scatter(number, behind * seen_from.transmittance, reduction="add")
-            for c, behind in zip(color, layer.color, strict=True)
-        ]
+        added = layer.color * seen_from.transmittance
+        color = color.scatter(number.repeat_rows(3), added, reduction="add", axis=1)
         before = replace(layer, transmittance=seen_from.transmittance * layer.transmittance)
         light = light.scatter(number, before.transmittance)
-    return [*color, light]
+    return color, light
 
 
 def _window_cells(window: SplatWindow, pixel: GraphValue) -> GraphValue:
@@ -145,18 +144,16 @@ def _window_cells(window: SplatWindow, pixel: GraphValue) -> GraphValue:
 
 
 def _pack_rgba(
-    context: GraphContext, window: SplatWindow, pixel: GraphValue, channels: list[GraphValue]
+    context: GraphContext, window: SplatWindow, pixel: GraphValue, channels: GraphValue
 ) -> GraphValue:
     """Pack the whole picture into one int32 a pixel, straight alpha: divide color by alpha."""
     graph, view = context.graph, context.camera
-    *color, light = channels
-    alpha = 1.0 - light
-    inverse = 255.0 / alpha.maximum(1e-6)
-    bytes_ = [
+    alpha = channels.row(3)
+    scaled = channels * (255.0 / alpha.maximum(1e-6))
+    red, green, blue, alpha = (
         (value + 0.5).clip(0.0, 255.0).cast(np.int32)
-        for value in [*(channel * inverse for channel in color), alpha * 255.0]
-    ]
-    red, green, blue, alpha = bytes_
+        for value in [*(scaled.row(channel) for channel in range(3)), alpha * 255.0]
+    )
     alpha = graph.where(alpha > 127, alpha - 256, alpha)  # the highest byte has the sign bit
     packed = red + green * (1 << 8) + blue * (1 << 16) + alpha * (1 << 24)
     width = window.width.cast(np.int32)

@@ -15,8 +15,10 @@ from export.package.table_codec import TableLayout
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import JOINT_NAMES
 
-FORMAT_VERSION = 5
-"""Version of the package format; readers refuse all others."""
+FORMAT_VERSION = 6
+"""Version of the package format that is written."""
+READABLE_FORMATS = (5, 6)
+"""Versions that are read; all others are refused. Graphs of 5 use fewer tables."""
 MAX_GOLDEN_PX = 128
 """Longest side of a golden frame, pixels."""
 CONVENTIONS = {
@@ -137,11 +139,11 @@ def _parse_json(text: bytes) -> dict[str, Any]:
         content = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise InputError("The package's manifest is not JSON; the file is damaged.") from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT_VERSION:
+    if not isinstance(content, dict) or content.get("format") not in READABLE_FORMATS:
         found = content.get("format") if isinstance(content, dict) else None
         newer = isinstance(found, int) and found > FORMAT_VERSION
         raise InputError(
-            f"The package has format {found!r}; this version reads format {FORMAT_VERSION}. "
+            f"The package has format {found!r}; this version reads format 5 and {FORMAT_VERSION}. "
             + ("Update instant-avatar-stream, " if newer else "Export the avatar again, ")
             + "or use the version that wrote it."
         )

@@ -1,14 +1,15 @@
 // Draws pictures in a worker, which runs the package's ONNX graph on the CPU.
 
-export class Engine {
-  /** onProgress: called with {total} and {arrived} bytes, and {preparing: true} as a tier is opened. */
-  constructor(avatar, { streams, graphs }, onProgress) {
-    this.avatar = avatar;
+import { fetched } from "./package.js";
+
+/** A worker whose functions are called by name. onNews: called with what it posts in between. */
+class Remote {
+  constructor(url, onNews) {
     this.waiting = new Map();
     this.next = 0;
-    this.worker = new Worker(new URL("./graph_worker.js", import.meta.url), { type: "module" });
+    this.worker = new Worker(url, { type: "module" });
     this.worker.onmessage = ({ data }) => {
-      if (data.number === undefined) return onProgress(data);
+      if (data.number === undefined) return onNews(data);
       const { resolve, reject } = this.waiting.get(data.number);
       this.waiting.delete(data.number);
       return data.failed ? reject(new Error(data.failed)) : resolve(data);
@@ -18,30 +19,64 @@ export class Engine {
       for (const { reject } of this.waiting.values()) reject(error);
       this.waiting.clear();
     };
-    this.loaded = this.ask("load", { streams, graphs, tiers: avatar.tiers });
   }
 
-  async open(tier) {
-    await this.loaded;
-    await this.ask("open", { tier });
+  ask(kind, content, transferred = []) {
+    const number = this.next++;
+    return new Promise((resolve, reject) => {
+      this.waiting.set(number, { resolve, reject });
+      this.worker.postMessage({ number, kind, ...content }, transferred);
+    });
+  }
+}
+
+export class Engine {
+  /** onProgress: called with {total} and {arrived} bytes, and {preparing: true} as a tier is opened. */
+  constructor(onProgress) {
+    this.onProgress = onProgress;
+    this.graphs = new Remote(new URL("./graph_worker.js", import.meta.url), onProgress);
+    this.tables = new Remote(new URL("./tables_worker.js", import.meta.url), onProgress);
+    this.opened = {};
+    this.loaded = this.start(); // before there is a package: the runtime takes longest
+    this.loaded.catch(() => {}); // awaited when a tier is opened
+  }
+
+  async start() {
+    const wasm = await fetched(new URL("./runtime/ort.wasm.zlib", import.meta.url), this.onProgress, "deflate");
+    await this.graphs.ask("load", { wasm }, [wasm]);
+  }
+
+  /** Take a package's file, its graphs and its tiers; the promise of the avatar's heights (`heights`). */
+  take({ buffer, graphs, tiers }) {
+    Object.assign(this, { tiers, graphOf: graphs });
+    this.taken = this.tables.ask("take", { buffer });
+    return this.taken;
+  }
+
+  open(tier) {
+    this.opened[tier] ??= this.prepare(tier).catch((error) => {
+      delete this.opened[tier];
+      throw error;
+    });
+    return this.opened[tier];
+  }
+
+  async prepare(tier) {
+    this.onProgress({ preparing: true });
+    const decoded = this.taken.then(() => this.tables.ask("decode", { tier }));
+    const [{ tables }] = await Promise.all([decoded, this.loaded]);
+    const held = Object.values(tables).map((table) => table.buffer);
+    await this.graphs.ask("open", { tier, graph: this.graphOf[tier], tables }, held);
   }
 
   close() {
-    this.worker.terminate();
+    for (const { worker } of [this.graphs, this.tables]) worker.terminate();
   }
 
   /** Draw straight-alpha RGBA of width × height: {rgba, ms}. */
   async draw(tier, shot) {
-    const samples = shot.samples ?? this.avatar.tiers[tier].settings.samples;
-    const { rgba, ms } = await this.ask("draw", { tier, ...shot, samples });
+    const samples = shot.samples ?? this.tiers[tier].settings.samples;
+    const { rgba, ms } = await this.graphs.ask("draw", { tier, ...shot, samples });
     return { rgba: new Uint8ClampedArray(rgba), ms };
-  }
-
-  ask(kind, content) {
-    const number = this.next++;
-    return new Promise((resolve, reject) => {
-      this.waiting.set(number, { resolve, reject });
-      this.worker.postMessage({ number, kind, ...content });
-    });
   }
 }

@@ -8,8 +8,11 @@ const NPY = {
   f4: Float32Array, f8: Float64Array, i4: Int32Array, i8: BigInt64Array, u1: Uint8Array, b1: Uint8Array,
 };
 
-/** Fetch a file. arrived: called with bytes that arrived, and with {total} once it is known. */
-export async function fetched(url, arrived = () => {}) {
+/**
+ * Fetch a file, compressed if `format` is one of DecompressionStream's.
+ * arrived: called with bytes that arrived, and with {total} once it is known.
+ */
+export async function fetched(url, arrived = () => {}, format = "") {
   const name = String(url).split("/").pop();
   const answer = await fetch(url).catch(() => {
     throw new Error(`${name} could not be loaded: the server does not answer. Is it still running?`);
@@ -19,12 +22,13 @@ export async function fetched(url, arrived = () => {}) {
   const counted = answer.body.pipeThrough(new TransformStream({
     transform(chunk, out) { arrived({ arrived: chunk.length }); out.enqueue(chunk); },
   }));
-  return new Response(counted).arrayBuffer().catch(() => {
+  const whole = format ? counted.pipeThrough(new DecompressionStream(format)) : counted;
+  return new Response(whole).arrayBuffer().catch(() => {
     throw new Error(`${name} arrived damaged or incomplete. Load the page again.`);
   });
 }
 
-export async function inflated(bytes, format) {
+async function inflated(bytes, format) {
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream(format));
   return new Uint8Array(await new Response(stream).arrayBuffer().catch(() => {
     throw new Error("it is damaged or incomplete.");
@@ -93,10 +97,18 @@ export async function readMotion(buffer) {
   return { poses, fps: rate ? rate.data[0] : span > 0 ? (count - 1) / span : 30 };
 }
 
+const STREAMS = ["blocks", "voxels", "positions", "normals", "thickness", "skin_nodes", "skin_weights"];
+
+/** What the tables are decoded from: bytes by name. */
+export async function readStreams(entries) {
+  return Object.fromEntries(await Promise.all(STREAMS.map(async (name) => [name, await entries[`hq/${name}.bin`]()])));
+}
+
 /** The player's tables by name, as its graph takes them. */
 export function decodeTables(streams, layout, subdivision) {
-  const nodes = subdivision === 2 ? subdivided(streams, layout) : stored(streams, layout);
-  return { ...bricks(streams, layout), ...surfels(streams, layout), ...nodes };
+  const { low, step, counts, ...nodes } = subdivision === 2 ? subdivided(streams, layout) : stored(streams, layout);
+  const found = surfels(streams, layout);
+  return { ...bricks(streams, layout), ...found, ...nodes, ...surfelCells(found, nodes.node, low, step, counts) };
 }
 
 /** Heights of the standing avatar above its pelvis: {low, high}, metres. */
@@ -118,17 +130,25 @@ function numbered(bits, counts) {
   return found;
 }
 
+/** Sums of four bytes each, modulo 256. */
+const added = (a, b) => ((a & 0x7f7f7f7f) + (b & 0x7f7f7f7f)) ^ ((a ^ b) & 0x80808080);
+
 function bricks({ blocks, voxels }, { bricks: count, brick_counts }) {
   const index = numbered(blocks, brick_counts), own = SIDE ** 3, whole = NODES ** 3;
-  for (let base = 0; base < voxels.length; base += own) {
-    for (let bits = 6; bits >= 0; bits -= 3) { // along x, y and z
-      const step = 1 << bits;
-      for (let i = base + step; i < base + own; i++) if ((i >> bits) & 7) voxels[i] += voxels[i - step];
-    }
+  const words = new Uint32Array(voxels.buffer, voxels.byteOffset, voxels.length >> 2); // four voxels along z
+  for (let base = 0; base < words.length; base += own >> 2) { // sums along x, then y
+    for (let i = base + 16; i < base + 128; i++) words[i] = added(words[i], words[i - 16]);
+    for (let i = base + 2; i < base + 128; i++) if (i & 14) words[i] = added(words[i], words[i - 2]);
   }
+  for (let i = 1; i < voxels.length; i++) if (i & 7) voxels[i] += voxels[i - 1];
   const voxel_color = new Int32Array((count + 1) * whole), voxel_density = new Uint8Array((count + 1) * whole);
   const channel = (number) => voxels.subarray(number * count * own, (number + 1) * count * own);
   const [red, green, blue, density] = [0, 1, 2, 3].map(channel); // red and blue as differences from green
+  const colors = new Int32Array(green.length);
+  for (let i = 0; i < colors.length; i++) {
+    const g = green[i];
+    colors[i] = ((red[i] + g) & 255) | (g << 8) | (((blue[i] + g) & 255) << 16);
+  }
   const [nx, ny, nz] = brick_counts;
   const places = [...Array(whole).keys()].map((node) => [Math.floor(node / NODES ** 2), Math.floor(node / NODES) % NODES, node % NODES]);
   const corner = Uint8Array.from(places, ([i, j, k]) => ((i >> 3) << 2) | ((j >> 3) << 1) | (k >> 3)); // whose voxel a node is
@@ -140,8 +160,8 @@ function bricks({ blocks, voxels }, { bricks: count, brick_counts }) {
     for (let node = 0, to = index[place] * whole; node < whole; node++, to++) {
       const brick = near[corner[node]];
       if (!brick) continue;
-      const from = (brick - 1) * own + inside[node], g = green[from];
-      voxel_color[to] = ((red[from] + g) & 255) | (g << 8) | (((blue[from] + g) & 255) << 16);
+      const from = (brick - 1) * own + inside[node];
+      voxel_color[to] = colors[from];
       voxel_density[to] = density[from];
     }
   }
@@ -160,10 +180,48 @@ function surfels({ positions, normals, thickness }, { surfels: count, surfel_low
   return found;
 }
 
+/** Where surfels lie between skinning nodes (export/player_inputs.py). */
+function surfelCells(surfels, node, low, step, counts) {
+  const count = surfels.position_x.length, [, ny, nz] = counts;
+  const ints = (length) => Array.from({ length }, () => new Int32Array(count));
+  const floats = (length) => Array.from({ length }, () => new Float32Array(count));
+  const [cell, tetrahedron, fraction, share, edge_normal] = [ints(4), [null, ...ints(3)], floats(3), floats(4), floats(3)];
+  const of = (name) => [..."xyz"].map((letter) => surfels[`${name}_${letter}`]);
+  const positions = of("position"), normals = of("normal");
+  const strides = [ny * nz, nz, 1], steps = [0, nz, ny * nz, ny * nz + nz], part = new Float64Array(3), walk = new Uint8Array(3);
+  for (let i = 0; i < count; i++) {
+    let number = 0;
+    for (let axis = 0; axis < 3; axis++) {
+      const place = Math.min(Math.max((positions[axis][i] - low[axis]) / step[axis], 0), counts[axis] - 1 - 1e-3);
+      const below = Math.floor(place);
+      fraction[axis][i] = part[axis] = place - below;
+      number += below * strides[axis];
+    }
+    for (let corner = 0; corner < 4; corner++) cell[corner][i] = node[number + steps[corner]];
+    const first = part[0] >= part[1] && part[0] >= part[2] ? 0 : part[1] >= part[2] ? 1 : 2;
+    const others = first === 0 ? 1 : 0, rest = 3 - first - others;
+    walk[0] = first; walk[1] = part[others] >= part[rest] ? others : rest; walk[2] = 3 - first - walk[1];
+    let corner = 0, before = 1;
+    for (let turn = 0; turn < 3; turn++) {
+      const axis = walk[turn];
+      corner += 4 >> axis;
+      tetrahedron[turn + 1][i] = cell[corner >> 1][i] + (corner & 1);
+      share[turn][i] = before - part[axis];
+      before = part[axis];
+      edge_normal[turn][i] = normals[axis][i] * step[axis];
+    }
+    share[3][i] = before;
+  }
+  const named = Object.entries({ cell, tetrahedron, share, edge_normal }).flatMap(([name, columns]) => (
+    columns.map((values, number) => [`${name}_${number}`, values])
+  ));
+  return Object.fromEntries([...named.filter(([, values]) => values), ...[..."xyz"].map((letter, axis) => [`fraction_${letter}`, fraction[axis]])]);
+}
+
 /** Nodes of the skinning grid (export/player_inputs.py). weigh(x, y, z, shares): sets joints' weights. */
 function nodesOf(index, counts, low, step, weigh) {
   const rows = index.reduce((sum, number) => sum + (number > 0), 0) + 2, [, ny, nz] = counts;
-  const found = { node: new Int32Array(index.length), node_weights: new Float32Array(24 * rows) };
+  const found = { low, step, counts, node: new Int32Array(index.length), node_weights: new Float32Array(24 * rows) };
   const axes = [..."xyz"].map((letter) => (found[`node_${letter}`] = new Float32Array(rows).fill(UNSTORED_M)));
   const shares = new Float64Array(24);
   found.node_weights[0] = found.node_weights[rows - 1] = 1;

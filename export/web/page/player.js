@@ -3,13 +3,11 @@
 import { Engine } from "./engine.js";
 import { Skeleton, bones, moved, rigid } from "./kinematics.js";
 import { Orbit, coarser, nearestOf, windowOf } from "./orbit.js";
-import { fetched, heights, readMotion, unzip } from "./package.js";
+import { fetched, readMotion, unzip } from "./package.js";
 
 const CLOSE = 2; // largest difference of a premultiplied channel between close pixels, in 1/255
 const ALIKE = 0.999; // least fraction of close pixels in pictures that count as the same
 const POSE = 75; // numbers in a pose: root rotation, root translation, 23 axis-angles
-
-const STREAMS = ["blocks", "voxels", "positions", "normals", "thickness", "skin_nodes", "skin_weights"];
 
 export class Player {
   /**
@@ -17,29 +15,39 @@ export class Player {
    * onProgress: as of Engine. onPreview: called with a small picture (Blob) before all else is there.
    */
   static async load(src, motion, onProgress, onPreview = () => {}) {
+    const engine = new Engine(onProgress);
+    return Player.read(src, motion, engine, onPreview).catch((error) => {
+      engine.close();
+      throw error;
+    });
+  }
+
+  static async read(src, motion, engine, onPreview) {
     const read = async (url, parse) => {
-      const buffer = await fetched(url, onProgress);
+      const buffer = await fetched(url, engine.onProgress);
       return Promise.resolve(buffer).then(parse).catch((error) => {
         throw new Error(`${String(url).split("/").pop()} cannot be read: ${error.message}`);
       });
     };
     const reading = motion ? read(motion, readMotion) : undefined;
     reading?.catch(() => {}); // awaited below
-    const entries = await read(src, unzip);
+    const { buffer, entries } = await read(src, (held) => ({ buffer: held, entries: unzip(held) }));
     if (!entries["manifest.json"]) throw new Error(`${src} is no .iavatar file.`);
     const avatar = JSON.parse(new TextDecoder().decode(await entries["manifest.json"]()));
+    const graphs = {};
+    const taken = engine.take({ buffer, graphs, tiers: avatar.tiers });
     onPreview(new Blob([await entries["preview.png"]()], { type: "image/png" }));
-    const all = (names) => Promise.all(names.map(async ([name, entry]) => [name, await entries[entry]()])).then(Object.fromEntries);
-    const streams = await all(STREAMS.map((name) => [name, `hq/${name}.bin`]));
-    const graphs = await all(Object.keys(avatar.tiers).map((tier) => [tier, tier === "hq" ? "player.onnx" : `${tier}/player.onnx`]));
+    await Promise.all(Object.keys(avatar.tiers).map(async (tier) => {
+      graphs[tier] = await entries[tier === "hq" ? "player.onnx" : `${tier}/player.onnx`]();
+    }));
     const standing = new Float32Array(POSE);
     standing.set(avatar.canonical_rotations.flat(), 6);
     const { poses, fps } = (await reading) || { poses: standing, fps: 30 };
-    const { low, high } = heights(streams, avatar.tiers.hq.layout);
+    const { low, high } = await taken;
     const front = rigid(poses.slice(0, 3)); // the first pose is upright
     const axes = [1, -1, -1].map((sign, axis) => [0, 4, 8].map((row) => sign * front[row + axis]));
     avatar.look = { axes, pelvis: avatar.rest_joints[0], height_m: high - low, middle_m: (high + low) / 2 };
-    return new Player(avatar, entries, new Engine(avatar, { streams, graphs }, onProgress), poses, fps);
+    return new Player(avatar, entries, engine, poses, fps);
   }
 
   constructor(avatar, entries, engine, poses, fps) {

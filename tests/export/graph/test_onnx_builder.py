@@ -103,7 +103,7 @@ def test_pieces_of_a_split_make_up_its_sum_again():
     x = graph.input("x", np.float32, [3, 5])
     a, b, c = graph.split(x, 3)
     numbers = np.random.default_rng(2).normal(size=(3, 5)).astype(np.float32)
-    result = run(graph, a + b + c - x.reduce_sum(0), x=numbers)
+    result = run(graph, (a + b + c).reshape(-1) - x.reduce_sum(0), x=numbers)
     np.testing.assert_allclose(result, np.zeros(5), atol=1e-6)
 
 
@@ -115,3 +115,15 @@ def test_smallest_and_largest_are_scalars():
     )
     assert result.shape == ()
     assert result == 7.0
+
+
+def test_columns_are_chosen_for_all_rows_and_weighed():
+    graph = GraphBuilder()
+    x = graph.input("x", np.float32, [3, 5])
+    places = graph.input("places", np.int32, [2])
+    numbers = np.random.default_rng(3).normal(size=(3, 5)).astype(np.float32)
+    chosen = np.array([4, 1], dtype=np.int32)
+    turned = x.gather_columns(places.repeat_rows(3)).take((1, 2, 0))
+    result = run(graph, turned.weighted_sum(np.array([1.0, -2.0, 0.5])), x=numbers, places=chosen)
+    some = numbers[:, chosen]
+    np.testing.assert_allclose(result, some[1] - 2.0 * some[2] + 0.5 * some[0], atol=1e-6)

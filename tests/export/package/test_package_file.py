@@ -136,7 +136,7 @@ def test_sizes_that_are_not_those_of_the_entries_are_refused(exported, tmp_path,
     ("change", "message"),
     [
         ({"format": 3}, "format 3"),
-        ({"format": 6}, "x.iavatar: .*format 6"),
+        ({"format": 7}, "x.iavatar: .*format 7"),
         ({"tiers": {"hq": {}}}, "x.iavatar: .*damaged: it has no 'layout'"),
         ({"rest_joints": [[float("nan")] * 3] * 24}, "damaged"),
         ({"parents": [-1] + [23] * 23}, "damaged"),

