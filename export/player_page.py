@@ -102,7 +102,7 @@ application/octet-stream, which browsers do not run."""
 PACKAGE_FILE, MOTION_FILE = "avatar.iavatar", "motion.npz"
 """The package and its motion, as index.html names them."""
 PACKED_WASM_FILE = f"{WASM_FILE}.zlib"
-"""The WebAssembly module as graph_worker.js reads it: not all hosts compress what they send."""
+"""The WebAssembly module as engine.js reads it: not all hosts compress what they send."""
 
 
 def pack_runtime(compression_level: int) -> bytes:
