@@ -101,7 +101,9 @@ def draw_texture(
     directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-6)
     image = np.zeros((mesh.side_px, mesh.side_px, 3), dtype=np.uint8)
     image[rows, columns] = color_at(points, directions)
-    return Texture(image=_fill_gutters(image, face_at >= 0), coordinates=mesh.coordinates)
+    # single texels may see a voxel that no picture shows: in small concave places, lips and eyelids
+    image = cv2.medianBlur(_fill_gutters(image, face_at >= 0), 3)
+    return Texture(image=image, coordinates=mesh.coordinates)
 
 
 def _draw_faces(
