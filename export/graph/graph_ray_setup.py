@@ -221,7 +221,7 @@ def filter_specks(
     of the cloth. A speck is a pixel whose ray passed the first layer, which should have stopped it:
     it lies inside of the avatar and differs from what is about it. Both are smaller than a
     footprint. The reference is `export.bake.reference_player.filter_specks`. Covered pixels have a
-    z-buffer `cell` each, and `channels` premultiplied color and transmittance.
+    z-buffer `cell` each, and `channels` premultiplied color and alpha.
     """
     graph, window = context.graph, splats.window
     passed = first.transmittance > context.settings.layer_min_transmittance

@@ -143,7 +143,8 @@ def _parse_json(text: bytes) -> dict[str, Any]:
         found = content.get("format") if isinstance(content, dict) else None
         newer = isinstance(found, int) and found > FORMAT_VERSION
         raise InputError(
-            f"The package has format {found!r}; this version reads format 5 and {FORMAT_VERSION}. "
+            f"The package has format {found!r}; this version reads formats "
+            f"{' and '.join(map(str, READABLE_FORMATS))}. "
             + ("Update instant-avatar-stream, " if newer else "Export the avatar again, ")
             + "or use the version that wrote it."
         )

@@ -2,14 +2,13 @@
 
 import { fetched } from "./package.js";
 
-/** A worker whose functions are called by name. onNews: called with what it posts in between. */
-class Remote {
-  constructor(url, onNews) {
+/** Calls functions of a worker by name (worker_calls.js). */
+class WorkerClient {
+  constructor(url) {
     this.waiting = new Map();
     this.next = 0;
     this.worker = new Worker(url, { type: "module" });
     this.worker.onmessage = ({ data }) => {
-      if (data.number === undefined) return onNews(data);
       const { resolve, reject } = this.waiting.get(data.number);
       this.waiting.delete(data.number);
       return data.failed ? reject(new Error(data.failed)) : resolve(data);
@@ -34,8 +33,8 @@ export class Engine {
   /** onProgress: called with {total} and {arrived} bytes, and {preparing: true} as a tier is opened. */
   constructor(onProgress) {
     this.onProgress = onProgress;
-    this.graphs = new Remote(new URL("./graph_worker.js", import.meta.url), onProgress);
-    this.tables = new Remote(new URL("./tables_worker.js", import.meta.url), onProgress);
+    this.graphs = new WorkerClient(new URL("./graph_worker.js", import.meta.url));
+    this.tables = new WorkerClient(new URL("./tables_worker.js", import.meta.url));
     this.opened = {};
     this.loaded = this.start(); // before there is a package: the runtime takes longest
     this.loaded.catch(() => {}); // awaited when a tier is opened

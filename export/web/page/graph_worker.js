@@ -17,7 +17,7 @@ async function load({ wasm }) {
 async function open({ tier, graph, tables }) {
   sessions[tier] = await InferenceSession.create(graph, {
     executionProviders: ["wasm"],
-    graphOptimizationLevel: "disabled", // half of the time until the first picture; pictures cost some per cent more
+    graphOptimizationLevel: "disabled", // they take longer than they win: half of loading, 2 % of a picture
     executionMode: "parallel", // still one thread, but reuse of memory is not planned: 60 % of loading
     externalData: Object.entries(tables).map(([path, data]) => ({ path, data: new Uint8Array(data.buffer) })),
   });

@@ -1,4 +1,4 @@
-// What the page asks of a worker (engine.js) and the worker's answers.
+// The worker's side of WorkerClient (engine.js).
 
 /** Answer calls by name, one after the other; a function returns [answer, transferred buffers] or nothing. */
 export function answer(functions) {

@@ -132,6 +132,11 @@ def test_sizes_that_are_not_those_of_the_entries_are_refused(exported, tmp_path,
         read_package(path)
 
 
+def test_a_package_of_the_format_before_is_read(exported, tmp_path):
+    path = rewritten(exported.path, tmp_path / "x.iavatar", with_manifest(format=5))
+    assert set(read_package(path).manifest.tiers) == set(read_package(exported.path).manifest.tiers)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
