@@ -34,7 +34,7 @@ test: install # on one thread: these tests are small, a second thread costs more
 
 test-all: install # the slow ones, too: long trainings, the browser, a fresh installation
 	-$(BIN)/python -m instant_avatar.animation.web_server # without it the browser's tests are skipped
-	-npm install --silent --no-save --prefix build/npm three@0.187 @sparkjsdev/spark@2.2 # three.js and Spark, for the test of the examples
+	-npm install --silent --no-save --prefix build/npm three@0.187 @sparkjsdev/spark@2.2 @pixiv/three-vrm@3.5 gltf-validator@2.0.0-dev.3.10 # for tests of the examples and of exported files
 	$(BIN)/python -m pytest -q
 
 check: install

@@ -1,5 +1,10 @@
 """ia-export: a package at any second, from what is on the disk."""
 
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
@@ -8,6 +13,29 @@ from export.package.package_file import read_package
 from export.player import Player, compare_golden_frames
 from instant_avatar import export
 from preprocess.poses.pose_format_registry import read_poses
+
+NODE = shutil.which("node")
+PACKAGES = Path(__file__).parents[2] / "build" / "npm"
+"""Where `make test-all` has npm put Khronos' validator, three.js and three-vrm."""
+VALIDATE = """
+import { readFileSync } from "node:fs";
+import { validateBytes } from "gltf-validator";
+import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
+import { VRMLoaderPlugin } from "@pixiv/three-vrm";
+globalThis.self = globalThis; // as browsers have it
+const complaints = [], files = [];
+console.warn = console.error = (...said) => complaints.push(said.join(" "));
+for (const file of process.argv.slice(1)) {
+  const bytes = new Uint8Array(readFileSync(file));
+  const { issues } = await validateBytes(bytes, { ignoredIssues: ["UNSUPPORTED_EXTENSION"] });
+  files.push(issues.messages.map(({ code, message, pointer }) => `${code} ${message} ${pointer}`));
+}
+const loader = new GLTFLoader().register((parser) => new VRMLoaderPlugin(parser));
+const { buffer } = new Uint8Array(readFileSync(process.argv[1]));
+const { vrm } = (await loader.parseAsync(buffer, "")).userData;
+const bones = Object.keys(vrm.humanoid.humanBones).length;
+console.log(JSON.stringify({ files, complaints, bones, meta: vrm.meta }));
+"""
 
 
 @pytest.fixture
@@ -117,6 +145,36 @@ def test_without_xatlas_a_mesh_of_few_triangles_has_colors(run, call_export, tmp
     assert code == 0, said.err
     assert "colors of vertices" in said.err
     assert b"COLOR_0" in out.read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(NODE is None, reason="there is no Node.js here")
+@pytest.mark.skipif(
+    not all((PACKAGES / "node_modules" / name).exists() for name in ("gltf-validator", "@pixiv")),
+    reason="`make test-all` fetches Khronos' validator and three-vrm",
+)
+def test_validators_and_three_vrm_have_nothing_to_say(run, film, call_export, tmp_path):
+    """Of VRM's extension Khronos' validator says that it does not know it; npm has no other."""
+    poses = ("--poses", film / "truth" / "novel" / "poses.npz")
+    few = ("--triangles", 2000)
+    wanted = {
+        "a.vrm": ("--to", "vrm", "--author", "Anna"),
+        "few.vrm": ("--to", "vrm", "--author", "Anna", *few),
+        "a.glb": ("--to", "glb", *poses),
+        "few.glb": ("--to", "glb", *few),
+        "few.gltf": ("--to", "glb", *few),
+    }
+    for name, words in wanted.items():
+        code, said = call_export(run / "avatar.iavatar", *words, "--out", tmp_path / name)
+        assert code == 0, said.err
+    command = [NODE, "--input-type=module", "--eval", VALIDATE]
+    command += [str(tmp_path / name) for name in wanted]
+    done = subprocess.run(command, cwd=PACKAGES, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["files"] == [[]] * len(wanted)
+    assert found["complaints"] == []
+    assert (found["bones"], found["meta"]["authors"]) == (22, ["Anna"])
 
 
 @pytest.mark.parametrize("name", ["A.PLY", pytest.param("a.OBJ", marks=pytest.mark.slow)])
