@@ -1,12 +1,15 @@
 """A package's avatar as 3-D Gaussians in one pose, for splat viewers: .ply and .spz.
 
-Each vertex of a fine mesh becomes a flat Gaussian along the surface (SuGaR, Guédon and Lepetit
-2024).
+Gaussians lie in shells under the surface, at the vertices of meshes (SuGaR, Guédon and Lepetit
+2024). Viewers widen each by half a pixel, and where the surface turns away many add up to a rim
+that grows with the distance. So the outer shell is thin fog, as soft as the field's own edge, and
+what makes the figure opaque lies too deep for a rim.
 """
 
 import gzip
 import struct
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
@@ -16,20 +19,35 @@ from scipy.spatial.transform import Rotation
 from export.package.player_tables import PlayerTables
 from export.skinned_mesh import extract_mesh
 
-SPACING_M = 0.0045
-"""Distance between Gaussians, about, metres."""
-DENSITY = 50.0
-"""Density of the surface on which they lie, 1/m."""
+
+class Shell(NamedTuple):
+    """A layer of Gaussians; lengths in metres.
+
+    Attributes:
+        spacing_m: Distance between them, about.
+        depth_m: Under the surface.
+        clear_m: Least distance from the surface, also from that of another side or fold.
+        thickness_m: Standard deviation along the normal.
+        opacity: At their centers.
+    """
+
+    spacing_m: float
+    depth_m: float
+    clear_m: float
+    thickness_m: float
+    opacity: float
+
+
+SHELLS = (
+    Shell(0.0055, 0.005, 0.0, 0.003, 0.15),
+    Shell(0.008, 0.008, 0.0064, 0.0005, 0.5),
+    Shell(0.012, 0.02, 0.016, 0.0005, 0.95),
+)
+"""From the outermost, chosen by pictures from 1.4 to 7 mm a pixel (dev/log/player.md)."""
 SPREAD = 0.6
 """Standard deviation along the surface, in distances of neighbors: less shows gaps."""
-THICKNESS_M = 0.0001
-"""Standard deviation along the normal, metres: thicker ones add up to a rim about the figure."""
-INSET_M = 0.003
-"""Depth of the Gaussians under the surface, metres: viewers widen each by half a pixel."""
 VIEWER_BLUR_M = 0.003
-"""Standard deviation of that blur on a figure of some 400 px, metres."""
-OPACITY = 0.95
-"""Of every Gaussian at its center."""
+"""Standard deviation of viewers' blur on a figure of some 400 px, metres."""
 NEAREST, NEIGHBORS = 6, 24
 """Neighbors whose mean distance sets a Gaussian's size; neighbors that blend with it."""
 MIN_FACING = 0.3
@@ -66,28 +84,37 @@ def build_splats(
     tables: PlayerTables, bones: Float[np.ndarray, "24 4 4"] | None = None
 ) -> GaussianSplats:
     """Lay Gaussians under the surface of baked bricks, moved by world-from-canonical matrices."""
-    mesh = extract_mesh(tables, spacing_m=SPACING_M, density=DENSITY)
-    found = KDTree(mesh.positions).query(mesh.positions, 1 + NEIGHBORS)
-    distances, neighbors = np.asarray(found[0]), np.asarray(found[1])
-    sizes = SPREAD * distances[:, 1 : 1 + NEAREST].mean(axis=1)
-    shares = np.exp(-0.5 * (distances / np.hypot(sizes, VIEWER_BLUR_M)[neighbors]) ** 2)
-    facing = np.einsum("vnx,vx->vn", mesh.normals[neighbors], mesh.normals)
-    shares *= facing > MIN_FACING
-    axes = _tangents(mesh.normals)
-    axes[..., :2] *= sizes[:, None, None]
-    axes[..., 2] *= THICKNESS_M
-    positions = mesh.positions - INSET_M * mesh.normals.astype(np.float64)
-    if bones is not None:
-        moved = np.einsum("vi,viab->vab", mesh.weights / 255.0, bones[mesh.joints])
-        positions = np.einsum("vab,vb->va", moved[:, :3, :3], positions) + moved[:, :3, 3]
-        axes = moved[:, :3, :3] @ axes
+    parts: list[tuple[np.ndarray, ...]] = []
+    surface = None
+    for shell in SHELLS:
+        mesh = extract_mesh(tables, spacing_m=shell.spacing_m)
+        surface = surface or KDTree(mesh.positions)
+        found = KDTree(mesh.positions).query(mesh.positions, 1 + NEIGHBORS)
+        distances, neighbors = np.asarray(found[0]), np.asarray(found[1])
+        sizes = SPREAD * distances[:, 1 : 1 + NEAREST].mean(axis=1)
+        shares = np.exp(-0.5 * (distances / np.hypot(sizes, VIEWER_BLUR_M)[neighbors]) ** 2)
+        facing = np.einsum("vnx,vx->vn", mesh.normals[neighbors], mesh.normals)
+        shares *= facing > MIN_FACING
+        axes = _tangents(mesh.normals)
+        axes[..., :2] *= sizes[:, None, None]
+        axes[..., 2] *= shell.thickness_m
+        positions = mesh.positions - shell.depth_m * mesh.normals.astype(np.float64)
+        clear = np.asarray(surface.query(positions)[0]) >= shell.clear_m
+        if bones is not None:
+            moved = np.einsum("vi,viab->vab", mesh.weights / 255.0, bones[mesh.joints])
+            positions = np.einsum("vab,vb->va", moved[:, :3, :3], positions) + moved[:, :3, 3]
+            axes = moved[:, :3, :3] @ axes
+        colors = _sharpen(mesh.colors / 255.0, neighbors, shares)
+        opacities = np.full(len(positions), shell.opacity)
+        parts.append(tuple(each[clear] for each in (positions, axes, colors, opacities)))
+    positions, axes, colors, opacities = (np.concatenate(each) for each in zip(*parts, strict=True))
     turned, scales, _ = np.linalg.svd(axes)
     turned[np.linalg.det(turned) < 0.0, :, 2] *= -1.0
     rotations = Rotation.from_matrix(turned).as_quat(canonical=True, scalar_first=True)
     return GaussianSplats(
         positions=positions.astype(np.float32),
-        colors=_sharpen(mesh.colors / 255.0, neighbors, shares).astype(np.float32),
-        opacities=np.full(len(positions), OPACITY, dtype=np.float32),
+        colors=colors.astype(np.float32),
+        opacities=opacities.astype(np.float32),
         scales=scales.astype(np.float32),
         rotations=rotations.astype(np.float32),
     )

@@ -5,12 +5,13 @@ import struct
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from export.package.package_file import read_package
 from export.player import Player, picture_on_white, premultiply
 from export.skinned_mesh import extract_mesh
-from export.splats import DENSITY, SPACING_M, build_splats, encode_ply, encode_spz
+from export.splats import SHELLS, build_splats, encode_ply, encode_spz
 
 
 @pytest.fixture(scope="module")
@@ -113,15 +114,19 @@ def test_an_spz_holds_the_same_gaussians_in_few_bytes(splats):
     assert np.median((found * given.inv()).magnitude()) < np.deg2rad(1.0)
 
 
-def test_they_lie_flat_under_the_surface(package, splats):
-    mesh = extract_mesh(package.tables["hq"], spacing_m=SPACING_M, density=DENSITY)
-    inward = np.sum((mesh.positions - splats.positions) * mesh.normals, axis=1)
-    np.testing.assert_allclose(inward, inward[0], atol=1e-6)
-    assert 0.0 < inward[0] < 0.005
-    across = np.einsum(
-        "sa,sab,sb->s", mesh.normals, covariances(splats.scales, splats.rotations), mesh.normals
-    )
-    np.testing.assert_allclose(np.sqrt(across), splats.scales.min(axis=1), rtol=0.02)
+def test_they_lie_in_shells_under_the_surface_and_clear_of_it(package, splats):
+    mesh = extract_mesh(package.tables["hq"], spacing_m=SHELLS[0].spacing_m)
+    surface = KDTree(mesh.positions)
+    far, nearest = surface.query(splats.positions)
+    inward = np.sum((mesh.positions[nearest] - splats.positions) * mesh.normals[nearest], axis=1)
+    for shell in SHELLS:
+        chosen = splats.opacities == np.float32(shell.opacity)
+        assert chosen.sum() > 0.1 * (splats.opacities == np.float32(SHELLS[0].opacity)).sum()
+        assert np.median(inward[chosen]) == pytest.approx(shell.depth_m, rel=0.1)
+        assert far[chosen].min() >= 0.999 * shell.clear_m
+        thinnest = splats.scales[chosen].min(axis=1)
+        assert np.median(thinnest) == pytest.approx(shell.thickness_m, rel=0.15)
+    assert len(mesh.positions) == (splats.opacities == np.float32(SHELLS[0].opacity)).sum()
 
 
 @pytest.mark.slow
@@ -132,4 +137,4 @@ def test_they_look_like_the_avatar(package, stand_in, camera, bent, pose):
     drawn = rasterize(build_splats(package.tables["hq"], player.world_from_canonical(pose)), view)
     expected = picture_on_white(premultiply(player.render(pose, view)))
     error = ((drawn - expected) ** 2).mean()
-    assert -10.0 * np.log10(error) > 28.0  # 29 were measured
+    assert -10.0 * np.log10(error) > 33.5  # 34.7 and 35.7 were measured
