@@ -11,9 +11,16 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
+from scipy.sparse import coo_array, diags_array
+from scipy.sparse.linalg import splu
+
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.parametric_body import ShapedBody
+
+
+MAX_COTANGENT = 10.0
+"""Bound of a corner's cotangent: slivers would dominate."""
 
 
 def vertex_normals(
@@ -36,6 +43,32 @@ def vertex_areas(
     """Each vertex's share of the surface, m²: a third of every triangle around it."""
     thirds = np.linalg.norm(_doubled_area_vectors(vertices, faces), axis=1) / 6.0
     return np.bincount(faces.ravel(), np.repeat(thirds, 3), minlength=len(vertices))
+
+
+def smooth_over_surface(
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    values: Float[np.ndarray, "vertices channels"],
+    sigma_m: float,
+) -> Float[np.ndarray, "vertices channels"]:
+    """Averages values over about `sigma_m` metres of the surface.
+
+    One implicit step of heat diffusion with the cotangent Laplacian (Desbrun et al. 1999, Implicit
+    fairing of irregular meshes using diffusion and curvature flow).
+    """
+    count, corners = len(vertices), vertices[faces]
+    edges = np.roll(corners, 1, axis=1) - np.roll(corners, -1, axis=1)  # opposite to each corner
+    doubled = np.linalg.norm(_doubled_area_vectors(vertices, faces), axis=1)
+    before, after = np.roll(edges, 1, axis=1), np.roll(edges, -1, axis=1)
+    cotangents = -(before * after).sum(axis=2) / np.maximum(doubled, 1e-12)[:, None]
+    weights = 0.5 * np.clip(cotangents, 0.0, MAX_COTANGENT).ravel()
+    one, other = np.roll(faces, -1, axis=1).ravel(), np.roll(faces, 1, axis=1).ravel()
+    links = coo_array((weights, (one, other)), shape=(count, count)).tocsc()
+    links = links + links.T
+    areas = np.maximum(vertex_areas(vertices, faces), 1e-12)
+    share = 0.5 * sigma_m**2
+    system = diags_array(areas + share * links.sum(axis=0)) - share * links
+    return splu(system.tocsc()).solve(areas[:, None] * values)
 
 
 def _doubled_area_vectors(

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from capture.input_error import InputError
 from preprocess.body.body_pose import Motion
-from preprocess.body.body_surface import vertex_normals
+from preprocess.body.body_surface import smooth_over_surface, vertex_normals
 from preprocess.body.parametric_body import (
     BodyModel,
     ShapedBody,
@@ -20,6 +20,8 @@ from preprocess.body.parametric_body import (
     with_smpl_joints,
 )
 
+HEAD_JOINT = 15
+"""Joint at the base of the skull."""
 BONE_GROUPS = {
     "hip width": (1, 2), "thigh": (4, 5), "shin": (7, 8), "foot": (10, 11), "trunk": (3, 6, 9),
     "neck": (12, 15), "shoulder width": (13, 14, 16, 17), "upper arm": (18, 19),
@@ -31,13 +33,20 @@ GIRTH_GROUPS = {
     "feet": (7, 8, 10, 11), "upper arms": (16, 17), "forearms": (18, 19),
     "hands": (20, 21, 22, 23), "head": (12, 15),
 }  # fmt: skip
-"""Joints whose skin one girth moves along its normals."""
+"""Joints whose skin one girth moves outward; of the head's, that under hair."""
+SMOOTHED_M = 0.02
+"""Width over which the directions of girths are smoothed, metres. Along the normals of every vertex, hair and
+loose clothes would inflate noses, ears and fingers instead of covering them."""
+FACE_MIN_NORMAL = 0.2
+"""Least forward component of a normal of the face."""
+HAIRLINE = 0.7
+"""Height of the hairline between the head's joint and its top."""
 SIGMA_BETA = 0.7
 """Prior standard deviation of a shape coefficient."""
 SIGMA_LOG_LENGTH = 0.05
 """Prior standard deviation of the logarithm of a bone's length."""
 SIGMA_GIRTH_M = 0.02
-"""Prior standard deviation of a girth: a motion of the skin along its normals, metres."""
+"""Prior standard deviation of a girth: a motion of the skin outward, metres."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -57,10 +66,10 @@ class ProportionSpace:
     def around(cls, shaped: ShapedBody) -> "ProportionSpace":
         """The space around one person's shape."""
         body = shaped.body
-        normals = vertex_normals(shaped.vertices, body.faces)
+        outward = _outward_directions(shaped)
         lengths = [_lengthen(shaped, joints) for joints in BONE_GROUPS.values()]
         girths = [
-            SIGMA_GIRTH_M * body.weights[:, list(joints)].sum(axis=1)[:, None] * normals
+            SIGMA_GIRTH_M * body.weights[:, list(joints)].sum(axis=1)[:, None] * outward
             for joints in GIRTH_GROUPS.values()
         ]
         still = np.zeros((24, 3))
@@ -88,6 +97,18 @@ class ProportionSpace:
             vertices=self.shaped.vertices + self.vertex_directions @ coefficients,
             joints=self.shaped.joints + self.joint_directions @ coefficients,
         )
+
+
+def _outward_directions(shaped: ShapedBody) -> Float[np.ndarray, "vertices 3"]:
+    """Directions in which clothes and hair thicken the body; shorter on fingers, zero on a face."""
+    body, vertices = shaped.body, shaped.vertices
+    normals = vertex_normals(vertices, body.faces)
+    low, top = shaped.joints[HEAD_JOINT, 1], vertices[:, 1].max()
+    is_face = (normals[:, 2] > FACE_MIN_NORMAL) & (vertices[:, 1] < low + HAIRLINE * (top - low))
+    face = is_face * body.weights[:, HEAD_JOINT]
+    both = np.column_stack([normals, face])
+    *outward, bare = smooth_over_surface(vertices, body.faces, both, SMOOTHED_M).T
+    return np.column_stack(outward) * (1.0 - bare[:, None])
 
 
 def _lengthen(
