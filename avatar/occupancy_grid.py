@@ -57,17 +57,28 @@ class OccupancyGrid:
             cells_per_m=torch.from_numpy(rig.cells_per_m),
         )
         self.band_cells: Int64[Tensor, " band"] = band.flatten().nonzero()[:, 0]
-        self._in_band = band.to(torch.uint8)
+        self._band = self._in_band = band.to(torch.uint8)
         interior = np.argwhere(rig.inside_skin & (rig.skin_distance > INTERIOR_DEPTH_M))
         weights = rig.weights_at(rig.box_low + (interior + 0.5) / rig.cells_per_m)
         flat = np.ravel_multi_index(tuple(interior.T), band.shape)
         self._interior_cells = torch.from_numpy(flat)
-        self._head_cells = torch.from_numpy(flat[weights[:, HEAD_JOINT] > 0.5])
+        self._deep_head_cells = torch.from_numpy(flat[weights[:, HEAD_JOINT] > 0.5])
+        self._head_cells = self._deep_head_cells
         off_skin = torch.from_numpy(~rig.inside_skin & (rig.skin_distance > OFF_SKIN_M))
         self._off_skin_cells = (band & off_skin).flatten().nonzero()[:, 0]
         self._near_skin = rig.skin_distance <= NEAR_SKIN_M
         self._cached_empty_cells: tuple[int, Tensor] | None = None
         self._floaters, self._updates = torch.zeros_like(self._in_band), 0
+
+    def shape_face(self, before: Int64[Tensor, "before"], under: Int64[Tensor, "under"]) -> None:
+        """Keeps cells before a face empty, and counts those under its skin to the head's interior.
+
+        They are flat indices; those of an earlier call are forgotten.
+        """
+        self._in_band = self._band.clone()
+        self._in_band.view(-1)[before] = 0
+        self.density_grid.occupied.mul_(self._in_band)
+        self._head_cells = torch.cat([self._deep_head_cells, under])
 
     @torch.no_grad()
     def update(

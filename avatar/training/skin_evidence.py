@@ -19,6 +19,9 @@ MIN_PERSON_ALPHA = 127
 UNSEEN_COSINE, SEEN_COSINE = 0.1, 0.4
 """Cosines between normal and view direction up to which a patch counts as not seen (84°), and from
 which it counts as seen (66°)."""
+FLAT_SPREAD, DEEP_SPREAD = 0.3, 0.8
+"""Standard deviations of the directions from which a patch was seen, up to which its depth counts
+as unknown, and from which as known, radians: those of a sixth of a turn, and of a whole one."""
 
 
 @final
@@ -32,6 +35,7 @@ class SkinEvidence:
         self._rig = rig
         self._weights = rig.weights_at(rig.seeds)
         self.cosines = np.zeros(len(rig.seeds), dtype=np.float32)
+        self._direction_sums, self._frames = np.zeros((len(rig.seeds), 3)), np.zeros(len(rig.seeds))
 
     def add(self, frame: TrainingFrame) -> None:
         """Takes in what a frame shows: patches that face the camera, unoccluded, in the mask."""
@@ -51,13 +55,33 @@ class SkinEvidence:
         shown = visible_points(plane, depths, cosines)
         shown &= _lies_in_mask(in_camera, frame)
         np.maximum(self.cosines, np.where(shown, cosines, 0.0), out=self.cosines)
+        canonical = np.einsum("pab,pa->pb", blends[..., :3], to_camera)
+        canonical /= np.maximum(np.linalg.norm(canonical, axis=1, keepdims=True), 1e-9)
+        self._direction_sums += shown[:, None] * canonical
+        self._frames += shown
 
     @property
     def seen(self) -> Float32[np.ndarray, "seeds"]:
         """Degree to which each patch was seen, in [0, 1]: a smooth step of its cosine."""
-        share = (self.cosines - UNSEEN_COSINE) / (SEEN_COSINE - UNSEEN_COSINE)
-        share = np.clip(share, 0.0, 1.0)
-        return (share * share * (3.0 - 2.0 * share)).astype(np.float32)
+        return _smooth_step(self.cosines, UNSEEN_COSINE, SEEN_COSINE)
+
+    @property
+    def depth_known(self) -> Float32[np.ndarray, "seeds"]:
+        """Degree to which each patch was seen from several sides, in [0, 1].
+
+        From one side alone, a surface at any depth shows the same pictures.
+        """
+        length = np.linalg.norm(self._direction_sums, axis=1) / np.maximum(self._frames, 1.0)
+        spread = np.sqrt(np.clip(2.0 - 2.0 * length, 0.0, 2.0)) * (self._frames > 0.0)
+        return _smooth_step(spread, FLAT_SPREAD, DEEP_SPREAD)
+
+
+def _smooth_step(
+    values: Float[np.ndarray, "seeds"] | Float32[np.ndarray, "seeds"], low: float, high: float
+) -> Float32[np.ndarray, "seeds"]:
+    """0 up to `low`, 1 from `high` on, without a corner."""
+    share = np.clip((values - low) / (high - low), 0.0, 1.0)
+    return (share * share * (3.0 - 2.0 * share)).astype(np.float32)
 
 
 def _lies_in_mask(

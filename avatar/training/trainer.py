@@ -227,6 +227,9 @@ class Trainer:
         config, field = self._config_at(detail_share), self.field
         if self.steps % SOURCE_INTERVAL == 0:
             self.unseen.update()
+            if config.head_interior_weight:
+                face = self.unseen.face_cells(config.pose_uncertainty)
+                self.learner.occupancy.shape_face(face.before, face.under)
         falling = rate if pose_rate is None else pose_rate
         batch = self.replay.sample_rays(config.rays, self.generator)
         refines = config.refine_poses and self.steps % self.poses.correction_interval(falling) == 0

@@ -16,7 +16,7 @@ from typing import NamedTuple, final
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int, Int64
 from scipy.sparse import coo_array
 from scipy.spatial import KDTree
 from torch import Tensor
@@ -63,6 +63,12 @@ the fold of an ear, and know it to be empty."""
 MIN_WEIGHT = 0.02
 """Weight below which a patch is left to its rays."""
 
+FACE_REACH_M = 0.008
+"""Distance from the body's skin within which a face of unknown depth lies, metres; one of known
+depth lies within the clothing band."""
+FACE_THICKNESS_M = 0.005, 0.03
+"""Depths under that skin between which it is solid, metres."""
+
 STEPS_PER_DRAW = 64
 """Steps whose pairs are drawn at once, which takes a tenth of the time."""
 DrawnPairs = tuple[
@@ -95,6 +101,13 @@ class SourcePairs(NamedTuple):
     def none(cls) -> "SourcePairs":
         """No pairs."""
         return cls(torch.empty(0, 3), torch.empty(0))
+
+
+class FaceCells(NamedTuple):
+    """Flat indices of cells before a face, which are empty, and under its skin, which are solid."""
+
+    before: Int64[Tensor, "before"]
+    under: Int64[Tensor, "under"]
 
 
 class _BoneFrames(NamedTuple):
@@ -177,6 +190,24 @@ class UnseenSkin:
         self._drawn_from = np.concatenate([drawn, *[near] * (NEAR_SKIN_FACTOR - 1)])
         self._unseen_share = len(drawn) / len(self._cells)
         self._is_stale, self._steps = False, 0
+
+    def face_cells(self, strength: float) -> FaceCells:
+        """Cells before and under the skin of a face, as far as its depth is unknown.
+
+        `strength` is the share, in [0, 1], by which the body's face is to be believed.
+        """
+        rig, seed = self._rig, self._seed_of_cell[self._cells]
+        is_face = _faces(self._frames, rig)
+        unknown = (strength * is_face * (1.0 - self.evidence.depth_known))[seed]
+        distance = rig.skin_distance.reshape(-1)[self._cells]
+        is_inside = rig.inside_skin.reshape(-1)[self._cells]
+        reach = CLOTHING_BAND_M + (FACE_REACH_M - CLOTHING_BAND_M) * unknown
+        least, most = FACE_THICKNESS_M
+        is_solid = is_inside & (least < distance) & (distance < most * unknown)
+        return FaceCells(
+            torch.from_numpy(self._cells[~is_inside & (distance > reach)]),
+            torch.from_numpy(self._cells[is_solid]),
+        )
 
     def sample(self, count: int, generator: torch.Generator) -> SourcePairs:
         """Random points of unseen skin with their sources: of `count` the share that is unseen."""

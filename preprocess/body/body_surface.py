@@ -10,14 +10,12 @@ from typing import final
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
-
 from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import splu
 
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.parametric_body import ShapedBody
-
 
 MAX_COTANGENT = 10.0
 """Bound of a corner's cotangent: slivers would dominate."""
