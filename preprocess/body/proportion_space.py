@@ -35,7 +35,7 @@ GIRTH_GROUPS = {
 }  # fmt: skip
 """Joints whose skin one girth moves outward; of the head's, that under hair."""
 SMOOTHED_M = 0.02
-"""Width over which the directions of girths are smoothed, metres. Along the normals of every vertex,
+"""Width over which the directions of girths are smoothed, metres. Along each vertex's own normal,
 hair and loose clothes would inflate noses, ears and fingers instead of covering them."""
 FACE_MIN_NORMAL = 0.2
 """Least forward component of a normal of the face."""
