@@ -164,3 +164,21 @@ def test_the_heads_interior_lies_in_the_head(rig, generator):
     assert len(points) == 200
     assert (rig.weights_at(points).argmax(axis=1) == HEAD_JOINT).mean() > 0.95
     assert points[:, 1].min() > rig.rest_joints[HEAD_JOINT, 1] - 0.1
+
+
+def test_a_face_is_empty_before_its_skin_until_it_is_given_other_cells(rig, generator):
+    occupancy = OccupancyGrid(rig)
+    cells = occupancy.band_cells
+    before, under = cells[::50], cells[1::50]
+    occupancy.shape_face(before, under)
+    run(occupancy, lambda points: torch.full((len(points),), 6.0), generator, 8)
+    occupied = occupancy.density_grid.occupied.view(-1)
+    assert not occupied[before].any()
+    assert occupied[under].float().mean() > 0.9
+    grid, drawn = occupancy.density_grid, occupancy.sample_interior(500, generator, of_head=True)
+    place = ((drawn - grid.low) * grid.cells_per_m).long().numpy().T
+    flat = np.ravel_multi_index(tuple(place), tuple(grid.occupied.shape))
+    assert np.isin(flat, under.numpy()).mean() > 0.3
+    occupancy.shape_face(cells[:0], cells[:0])
+    run(occupancy, lambda points: torch.full((len(points),), 6.0), generator, 8)
+    assert occupied[before].float().mean() > 0.9

@@ -7,6 +7,7 @@ import torch
 from avatar import radiance_field
 from avatar.config import TrainConfig
 from avatar.kernels.numba_priors import OPACITY_LENGTH_M
+from avatar.rig import HEAD_JOINT
 from avatar.training import checkpoint
 from avatar.training.frame_stream import prepare_frame
 from avatar.training.skin_evidence import SkinEvidence
@@ -62,6 +63,40 @@ def test_skin_outside_the_mask_or_the_picture_is_not_seen(rig, frame):
     away = SkinEvidence(rig)
     away.add(frame(up_m=30.0))
     assert not away.seen.any()
+
+
+def test_depth_is_known_where_several_sides_were_seen(rig, frame):
+    evidence, face = SkinEvidence(rig), facing(rig, HEAD, 1.0)
+    for turned in (-0.1, 0.0, 0.1):
+        evidence.add(frame(turned=turned))
+    assert evidence.depth_known[face].max() < 0.05
+    for turned in np.linspace(0.0, 2.0 * np.pi, 12):
+        evidence.add(frame(turned=turned))
+    assert evidence.depth_known[face].mean() > 0.6
+    assert not SkinEvidence(rig).depth_known.any()
+
+
+def test_a_face_seen_from_one_side_lies_near_the_bodys(rig, frame, of_front):
+    shape, reach = rig.skin_distance.shape, rig.skin_distance.reshape(-1)
+    face = of_front.face_cells(1.0)
+    before, under = face.before.numpy(), face.under.numpy()
+    assert len(before) > 500
+    assert len(under) > 100
+    assert not rig.inside_skin.reshape(-1)[before].any()
+    assert rig.inside_skin.reshape(-1)[under].all()
+    assert 0.008 < reach[before].min() < 0.02
+    centers = np.stack(np.unravel_index(before, shape), axis=1) + 0.5
+    places = rig.box_low + centers / rig.cells_per_m
+    assert (rig.weights_at(places).argmax(axis=1) == HEAD_JOINT).mean() > 0.8
+    assert places[:, 2].mean() > rig.seeds[rig.seed_parts == HEAD, 2].mean()
+
+    turned = UnseenSkin(rig)
+    for angle in np.linspace(0.0, 2.0 * np.pi, 24):
+        turned.add(frame(turned=angle))
+    turned.update()
+    assert len(turned.face_cells(1.0).before) < 0.5 * len(before)
+    assert not len(of_front.face_cells(0.0).before)
+    assert not len(of_front.face_cells(0.0).under)
 
 
 def test_the_back_is_drawn_to_the_front_and_the_front_to_nothing(rig, of_front):

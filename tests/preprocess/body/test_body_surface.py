@@ -5,10 +5,18 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import trimesh
 
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
-from preprocess.body.body_surface import MeshSilhouette, SkinPoints, soft_iou, splat_silhouette
+from preprocess.body.body_surface import (
+    MeshSilhouette,
+    SkinPoints,
+    smooth_over_surface,
+    soft_iou,
+    splat_silhouette,
+    vertex_normals,
+)
 from preprocess.body.kinematics import rotation_matrices
 
 
@@ -109,3 +117,13 @@ def test_rotating_world_and_camera_together_changes_nothing(skin, camera):
         splat_silhouette((points @ turn[:3, :3].T).astype(np.float32), turned),
     )
     assert soft_iou(before, after.astype(np.float32)) > 0.98
+
+
+def test_a_surface_is_smoothed_as_heat_spreads_on_a_sphere():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.05)
+    vertices, faces = np.asarray(ball.vertices), np.asarray(ball.faces)
+    values = np.column_stack([vertex_normals(vertices, faces), np.ones(len(vertices))])
+    smooth = smooth_over_surface(vertices, faces, values, 0.02)
+    np.testing.assert_allclose(smooth[:, 3], 1.0, atol=1e-9)
+    # a normal is a spherical harmonic of degree 1, of eigenvalue 2 / r²
+    np.testing.assert_allclose(smooth[:, :3], values[:, :3] / (1.0 + 0.02**2 / 0.05**2), atol=5e-3)
