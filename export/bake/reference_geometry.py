@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float32, Int32, Int64
 from export.bake.skinning_kernels import PosedNodes, invert_matrices, skin_trilinear
 from export.package.player_tables import (
     DEPTH_CODES,
+    HOLE_SPACINGS,
     SURFEL_BITS,
     SURFEL_MASK,
     BrickTable,
@@ -234,15 +235,22 @@ class SurfelFootprints(NamedTuple):
     """Surfels' footprints, one row for each cell that one covers.
 
     Attributes:
+        spacing_px: Edge of a footprint before it is rounded up, pixels.
         side: Edge of a footprint, pixels.
-        cell: Cells, numbered in a picture with a margin of `side` pixels.
+        cell: Cells, numbered in a picture with a margin of `margin` pixels.
         depth: Depths of surfels that may form a further layer, metres; 0 for the others.
     """
 
+    spacing_px: float
     side: int
     cell: Int64[np.ndarray, "splats"]
     key: Int64[np.ndarray, "splats"]
     depth: Float32[np.ndarray, "splats"]
+
+    @property
+    def margin(self) -> int:
+        """Pixels about the picture from which holes in it are filled."""
+        return HOLE_SPACINGS[-1] * self.side
 
 
 def surfel_of_key(key: Int64[np.ndarray, "*pixels"]) -> Int64[np.ndarray, "*pixels"]:
@@ -256,7 +264,7 @@ def z_buffer(
     chosen: Bool[np.ndarray, "splats"] | None = None,
 ) -> Int64[np.ndarray, "rows columns"]:
     """Return the least key of every cell, of some splats or of all."""
-    (width, height), margin = size_px, 2 * splats.side
+    (width, height), margin = size_px, 2 * splats.margin
     buffer = np.full((height + margin, width + margin), EMPTY_PIXEL_KEY, dtype=np.int64)
     where = slice(None) if chosen is None else chosen
     np.minimum.at(buffer.reshape(-1), splats.cell[where], splats.key[where])
@@ -267,12 +275,18 @@ def fill_holes(
     keys: Int64[np.ndarray, "rows columns"],
     tables: PlayerTables,
     settings: RenderSettings,
-    side: int,
+    splats: SurfelFootprints,
 ) -> Int64[np.ndarray, "height width"]:
-    """Fill pixels that two opposite ones, a footprint away, overtop by far; cut off the margin."""
-    here = slice(side, -side)
-    across = np.maximum(keys[here, : -2 * side], keys[here, 2 * side :])
-    along = np.maximum(keys[: -2 * side, here], keys[2 * side :, here])
-    neighbors, keys = np.minimum(across, along), keys[here, here]
+    """Fill pixels that opposite ones, some spacings away, overtop by far; cut off the margin."""
+    side, margin = splats.side, splats.margin
+    here, filled = slice(margin, -margin), keys[margin:-margin, margin:-margin]
     steps = int(settings.hole_depth_m / (2.0 * tables.reach_m) * DEPTH_CODES)
-    return np.where(keys - (steps << SURFEL_BITS) > neighbors, neighbors, keys)
+    for spacings in HOLE_SPACINGS:
+        away = min(max(int(spacings * splats.spacing_px + 0.999), side), spacings * side)
+        before = slice(margin - away, -margin - away)
+        after = slice(margin + away, away - margin or None)
+        across = np.maximum(keys[here, before], keys[here, after])
+        along = np.maximum(keys[before, here], keys[after, here])
+        neighbors = np.minimum(across, along)
+        filled = np.where(filled - (steps << SURFEL_BITS) > neighbors, neighbors, filled)
+    return filled

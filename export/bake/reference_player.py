@@ -35,6 +35,7 @@ from export.bake.skinning_kernels import (
 )
 from export.package.player_tables import (
     DEPTH_CODES,
+    HOLE_SPACINGS,
     MAX_MEDIAN_DIFFERENCE,
     MAX_TRUSTED_COMPRESSION,
     MIN_FOOTPRINT_PX,
@@ -174,7 +175,7 @@ def trace_picture(
     posed = _pose_surface(tables, settings, inputs)
     splats = _splat_surfels(tables, settings, inputs, posed)
     buffer = z_buffer(inputs.size_px, splats)
-    filled = fill_holes(buffer, tables, settings, splats.side).ravel()
+    filled = fill_holes(buffer, tables, settings, splats).ravel()
     covered = np.flatnonzero(filled < EMPTY_PIXEL_KEY)
     key = filled[covered]
     close_up = splats.side >= MIN_FOOTPRINT_PX
@@ -222,21 +223,21 @@ def _keys_behind(
     front: _FrontLayer,
 ) -> Int64[np.ndarray, "all_pixels"]:
     """Return every pixel's key in a z-buffer of surfels far enough behind the layer in front."""
-    (width, height), side = inputs.size_px, splats.side
+    (width, height), margin = inputs.size_px, splats.margin
     limit = np.full((height, width), 1e6, dtype=np.float32)
     limit.reshape(-1)[pixel] = front.depth + np.float32(settings.layer_gap_m)
-    limits = np.pad(limit, side, constant_values=1e6).reshape(-1)[splats.cell]
+    limits = np.pad(limit, margin, constant_values=1e6).reshape(-1)[splats.cell]
     behind = splats.depth > limits
     if settings.other_sheet_gap_m < settings.layer_gap_m:
         passed = np.zeros((height, width), dtype=np.int64)
         passed.reshape(-1)[pixel] = front.surfel
         limits -= np.float32(settings.layer_gap_m - settings.other_sheet_gap_m)
         near = np.flatnonzero(~behind & (splats.depth > limits))
-        before = np.pad(passed, side).reshape(-1)[splats.cell[near]]
+        before = np.pad(passed, margin).reshape(-1)[splats.cell[near]]
         behind[near] = ~_one_sheet(
             settings, tables, posed.positions, surfel_of_key(splats.key[near]), before
         )
-    return z_buffer(inputs.size_px, splats, behind)[side:-side, side:-side].ravel()
+    return z_buffer(inputs.size_px, splats, behind)[margin:-margin, margin:-margin].ravel()
 
 
 def _one_sheet(
@@ -283,22 +284,22 @@ def _project_surfels(
     return place, within & (depth > settings.near_plane_m)
 
 
-def _footprint_px(
+def _spacing_px(
     tables: PlayerTables, settings: RenderSettings, inputs: PlayerInputs, posed: _PosedSurface
-) -> int:
-    """Return the edge of every footprint, pixels: a surfel spacing where they are nearest."""
+) -> float:
+    """Return about a surfel spacing where they are nearest, pixels."""
     _, near = _project_surfels(settings, inputs, posed, 0.5 * settings.max_footprint_px)
     if not near.any():
-        return 2
+        return 0.0
     spacing_px = inputs.focal.max() * tables.surfels.spacing_m / posed.positions[near, 2].min()
-    side = int(np.floor(spacing_px * settings.footprint_spacings + 0.999))
-    return int(np.clip(side, 2, settings.max_footprint_px))
+    return float(spacing_px * settings.footprint_spacings)
 
 
 def _splat_surfels(
     tables: PlayerTables, settings: RenderSettings, inputs: PlayerInputs, posed: _PosedSurface
 ) -> SurfelFootprints:
-    side = _footprint_px(tables, settings, inputs, posed)
+    spacing_px = _spacing_px(tables, settings, inputs, posed)
+    side = int(np.clip(np.floor(spacing_px + 0.999), 2, settings.max_footprint_px))
     width, height = inputs.size_px
     place, seen = _project_surfels(settings, inputs, posed, 0.5 * side)
     surfel = np.flatnonzero(seen)
@@ -312,12 +313,14 @@ def _splat_surfels(
 
     first = np.floor(place - np.float32((side - 1) / 2)).astype(np.int64)
     steps = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 1, 2)
-    column, row = np.moveaxis(first + steps + side, -1, 0)
-    inside = (column >= 0) & (column < width + 2 * side) & (row >= 0) & (row < height + 2 * side)
+    margin = HOLE_SPACINGS[-1] * side
+    column, row = np.moveaxis(first + steps + margin, -1, 0)
+    rows, columns = height + 2 * margin, width + 2 * margin
+    inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
     shape = inside.shape
-    cell = (row * (width + 2 * side) + column)[inside]
+    cell = (row * columns + column)[inside]
     key, depth = (np.broadcast_to(part, shape)[inside] for part in (key, deep_enough))
-    return SurfelFootprints(side, cell, key, depth)
+    return SurfelFootprints(spacing_px, side, cell, key, depth)
 
 
 def _ray_entries(

@@ -10,7 +10,12 @@ from export.graph.graph_skinning import (
     faces_camera,
 )
 from export.graph.onnx_builder import GraphValue
-from export.package.player_tables import DEPTH_CODES, SURFEL_BITS, SURFEL_MASK
+from export.package.player_tables import (
+    DEPTH_CODES,
+    HOLE_SPACINGS,
+    SURFEL_BITS,
+    SURFEL_MASK,
+)
 
 EMPTY_KEY = np.int32(2**31 - 1)
 """Key of a pixel that no surfel covers."""
@@ -44,6 +49,7 @@ class SurfelSplats:
     """Surfels on their way into a z-buffer: values of the graph, one entry a surfel.
 
     Attributes:
+        spacing_px: Edge of a footprint before it is rounded up, pixels, scalar.
         footprint_px: Edge of every surfel's footprint, pixels, int64 scalar.
         cell: Upper left cell of the footprint in the buffer; `SplatWindow.cells` for none.
         key: Depth code and surfel number; the least one wins.
@@ -51,6 +57,7 @@ class SurfelSplats:
     """
 
     window: SplatWindow
+    spacing_px: GraphValue
     footprint_px: GraphValue
     cell: GraphValue
     key: GraphValue
@@ -72,7 +79,11 @@ def project_surfels(context: GraphContext, surfels: PosedSurfels) -> SurfelSplat
         return before & beside
 
     near = within(graph.constant(np.float32(0.5 * settings.max_footprint_px)))
-    side = _footprint_size(context, graph.where(near, depth, INFINITE_DEPTH_M).reduce_min())
+    nearest = graph.where(near, depth, INFINITE_DEPTH_M).reduce_min()
+    metres = context.tables.surfels.spacing_m * settings.footprint_spacings
+    spacing_px = view.focal[0].maximum(view.focal[1]) * metres / nearest
+    # the surfels nearest to the camera count, so that close-ups have no gaps
+    side = _pixels(spacing_px).clip(2.0, float(settings.max_footprint_px)).cast(np.int64)
     reach = side.cast(np.float32) * 0.5
     seen = within(reach)
     window = _window(context, u, v, side)
@@ -83,6 +94,7 @@ def project_surfels(context: GraphContext, surfels: PosedSurfels) -> SurfelSplat
     number = graph.range(graph.constant(np.int32(len(context.tables.surfels))))
     return SurfelSplats(
         window=window,
+        spacing_px=spacing_px,
         footprint_px=side,
         cell=graph.where(seen, cell, window.cells.cast(np.int32)),
         key=_depth_code(context, depth) * (1 << SURFEL_BITS) + number,
@@ -92,7 +104,7 @@ def project_surfels(context: GraphContext, surfels: PosedSurfels) -> SurfelSplat
 
 def _window(context: GraphContext, u: GraphValue, v: GraphValue, side: GraphValue) -> SplatWindow:
     """Bound all projected points, seen or not, within the picture."""
-    border, reach = side * 2 + 2, side.cast(np.float32) * 0.5
+    border, reach = side * (HOLE_SPACINGS[-1] + 1) + 2, side.cast(np.float32) * 0.5
 
     def extent(places: GraphValue, size: GraphValue) -> tuple[GraphValue, GraphValue]:
         inside = places.maximum(-reach).minimum(size.cast(np.float32) + reach)
@@ -126,22 +138,16 @@ def _depth_code(context: GraphContext, depth: GraphValue) -> GraphValue:
     return steps.clip(0.0, DEPTH_CODES - 1.0).cast(np.int32)
 
 
-def _footprint_size(context: GraphContext, nearest: GraphValue) -> GraphValue:
-    """Return the edge of every footprint, pixels, an int64 scalar of at least 2.
-
-    It follows the spacing of the surfels nearest to the camera, so that close-ups have no gaps.
-    """
-    settings, focal = context.settings, context.camera.focal
-    spacing_px = focal[0].maximum(focal[1]) * context.tables.surfels.spacing_m / nearest
-    side = (spacing_px * settings.footprint_spacings + 0.999).floor()
-    return side.clip(2.0, float(settings.max_footprint_px)).cast(np.int64)
+def _pixels(length_px: GraphValue) -> GraphValue:
+    """Round a length up to whole pixels."""
+    return (length_px + 0.999).floor()
 
 
 def nearest_keys(context: GraphContext, splats: SurfelSplats) -> GraphValue:
     """Return the least key of each of the window's pixels, row after row.
 
     Where the skin is stretched, surfels lie farther apart than a footprint is wide: a pixel that
-    two opposite ones, a footprint away, overtop by far is a hole, and filled.
+    two opposite ones, `HOLE_SPACINGS` away, overtop by far is a hole, and filled.
     """
     window = splats.window
     buffer = _scatter_keys(context, window, splats.cell, splats.key)
@@ -153,13 +159,17 @@ def nearest_keys(context: GraphContext, splats: SurfelSplats) -> GraphValue:
         return buffer.slice_axes([begin + by], [begin + by + window.stride * window.height])
 
     keys = shifted(0)
-    row = splats.footprint_px * window.stride
-    across = shifted(-splats.footprint_px).maximum(shifted(splats.footprint_px))
-    along = shifted(-row).maximum(shifted(row))
-    neighbors = across.minimum(along)
     steps = int(context.settings.hole_depth_m / (2.0 * context.tables.reach_m) * DEPTH_CODES)
-    hole = (keys - (steps << SURFEL_BITS)) > neighbors
-    keys = context.graph.where(hole, neighbors, keys)
+    side = splats.footprint_px
+    for spacings in HOLE_SPACINGS:
+        away = _pixels(splats.spacing_px * float(spacings)).minimum(1e6).cast(np.int64)
+        column = away.maximum(side).minimum(side * spacings)
+        row = column * window.stride
+        across = shifted(-column).maximum(shifted(column))
+        along = shifted(-row).maximum(shifted(row))
+        neighbors = across.minimum(along)
+        hole = (keys - (steps << SURFEL_BITS)) > neighbors
+        keys = context.graph.where(hole, neighbors, keys)
     rows = keys.reshape(-1, window.stride)
     return rows.slice_axes([0, 0], [window.height, window.width]).reshape(-1)
 

@@ -21,6 +21,8 @@ MIN_MEDIAN_ALPHA = 0.9
 """Least alpha of the median about a pixel that counts as the inside of the avatar."""
 MAX_MEDIAN_DIFFERENCE = 0.15
 """Difference of any channel from that median, in [0, 1], above which the pixel is a speck."""
+HOLE_SPACINGS = 1, 2, 3
+"""Distances of opposite pixels that close a hole: surfel spacings, at least a footprint."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +62,7 @@ class RenderSettings:
     footprint_spacings: float = 1.1
     """Edge of a footprint at the nearest surfel's depth, in surfel spacings."""
     hole_depth_m: float = 0.025
-    """Fill a pixel that opposite ones, a footprint away, overtop by this depth, metres."""
+    """Fill a pixel that opposite ones, `HOLE_SPACINGS` away, overtop by this depth, metres."""
     near_plane_m: float = 0.1
     """Least depth of a surfel that is drawn, metres."""
 
