@@ -14,7 +14,6 @@ from export.package.player_tables import (
     SURFEL_BITS,
     SURFEL_MASK,
     BrickTable,
-    PlayerTables,
     RenderSettings,
 )
 
@@ -273,14 +272,17 @@ def z_buffer(
 
 def fill_holes(
     keys: Int64[np.ndarray, "rows columns"],
-    tables: PlayerTables,
+    reach_m: float,
     settings: RenderSettings,
     splats: SurfelFootprints,
 ) -> Int64[np.ndarray, "height width"]:
-    """Fill pixels that opposite ones, some spacings away, overtop by far; cut off the margin."""
+    """Fill pixels that opposite ones, some spacings away, overtop by far; cut off the margin.
+
+    `reach_m` is the tables', metres.
+    """
     side, margin = splats.side, splats.margin
     here, filled = slice(margin, -margin), keys[margin:-margin, margin:-margin]
-    steps = int(settings.hole_depth_m / (2.0 * tables.reach_m) * DEPTH_CODES)
+    steps = int(settings.hole_depth_m / (2.0 * reach_m) * DEPTH_CODES)
     for spacings in HOLE_SPACINGS:
         away = min(max(int(spacings * splats.spacing_px + 0.999), side), spacings * side)
         before = slice(margin - away, -margin - away)

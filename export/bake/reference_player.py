@@ -175,7 +175,7 @@ def trace_picture(
     posed = _pose_surface(tables, settings, inputs)
     splats = _splat_surfels(tables, settings, inputs, posed)
     buffer = z_buffer(inputs.size_px, splats)
-    filled = fill_holes(buffer, tables, settings, splats).ravel()
+    filled = fill_holes(buffer, tables.reach_m, settings, splats).ravel()
     covered = np.flatnonzero(filled < EMPTY_PIXEL_KEY)
     key = filled[covered]
     close_up = splats.side >= MIN_FOOTPRINT_PX

@@ -6,13 +6,7 @@ import pytest
 from export.bake.reference_geometry import SurfelFootprints, fill_holes, z_buffer
 from export.package.player_tables import DEPTH_CODES, SURFEL_BITS, RenderSettings
 
-SIZE_PX = 24, 20
-
-
-class Reach:
-    """The part of the tables that tells a depth's code."""
-
-    reach_m = 1.0
+SIZE_PX, REACH_M = (24, 20), 1.0
 
 
 def filled_share(gap_px, *, side, spacing_px):
@@ -25,7 +19,7 @@ def filled_share(gap_px, *, side, spacing_px):
     keys[:] = 0
     left = splats.margin + width // 2 - gap_px // 2
     keys[:, left : left + gap_px] = behind << SURFEL_BITS
-    shown = fill_holes(keys, Reach(), RenderSettings(), splats)
+    shown = fill_holes(keys, REACH_M, RenderSettings(), splats)
     assert shown.shape == (height, width)
     start = left - splats.margin
     return float((shown[:, start : start + gap_px] == 0).mean())
@@ -36,8 +30,8 @@ def test_holes_of_up_to_three_spacings_are_filled_in_close_ups(gap_px):
     assert filled_share(gap_px, side=5, spacing_px=4.2) == 1.0
 
 
-def test_wider_gaps_are_gaps(gap_px=14):
-    assert filled_share(gap_px, side=2, spacing_px=1.9) == 0.0
+def test_wider_gaps_are_gaps():
+    assert filled_share(14, side=2, spacing_px=1.9) == 0.0
 
 
 def test_far_away_a_gap_is_not_filled_by_what_a_footprint_is_rounded_up_to():
