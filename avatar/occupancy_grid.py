@@ -16,7 +16,8 @@ from torch import Tensor
 
 from avatar.kernels import numba_priors
 from avatar.kernels.operands import MAX_LOG_DENSITY, DensityGrid
-from avatar.rig import CLOTHING_BAND_M, HEAD_JOINT, Rig
+from avatar.rig import CLOTHING_BAND_M, Rig
+from preprocess.body.kinematics import HEAD_JOINT
 
 OCCUPANCY_DECAY = 0.9
 """Factor of a probed cell's cached density. At 0.6 thin surfaces vanish."""
@@ -71,7 +72,7 @@ class OccupancyGrid:
         self._floaters, self._updates = torch.zeros_like(self._in_band), 0
 
     def shape_face(self, before: Int64[Tensor, "before"], under: Int64[Tensor, "under"]) -> None:
-        """Keeps cells before a face empty, and counts those under its skin to the head's interior.
+        """Keeps cells before a face empty, and adds those under its skin to the head's interior.
 
         They are flat indices; those of an earlier call are forgotten.
         """

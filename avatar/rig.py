@@ -23,8 +23,6 @@ SEED_SPACING_M = 0.02
 """Edge of the voxels that hold one seed each, metres."""
 SKINNING_CELL_M = 0.023
 """Spacing of the nodes of the skinning volume, metres."""
-HEAD_JOINT = 15
-"""Joint at the base of the skull."""
 CLOTHING_BAND_M = 0.08
 """Distance from the skin within which clothes and hair lie, metres."""
 BOX_MARGIN_M = 0.17

@@ -84,29 +84,8 @@ def build_splats(
     tables: PlayerTables, bones: Float[np.ndarray, "24 4 4"] | None = None
 ) -> GaussianSplats:
     """Lay Gaussians under the surface of baked bricks, moved by world-from-canonical matrices."""
-    parts: list[tuple[np.ndarray, ...]] = []
-    surface = None
-    for shell in SHELLS:
-        mesh = extract_mesh(tables, spacing_m=shell.spacing_m)
-        surface = surface or KDTree(mesh.positions)
-        found = KDTree(mesh.positions).query(mesh.positions, 1 + NEIGHBORS)
-        distances, neighbors = np.asarray(found[0]), np.asarray(found[1])
-        sizes = SPREAD * distances[:, 1 : 1 + NEAREST].mean(axis=1)
-        shares = np.exp(-0.5 * (distances / np.hypot(sizes, VIEWER_BLUR_M)[neighbors]) ** 2)
-        facing = np.einsum("vnx,vx->vn", mesh.normals[neighbors], mesh.normals)
-        shares *= facing > MIN_FACING
-        axes = _tangents(mesh.normals)
-        axes[..., :2] *= sizes[:, None, None]
-        axes[..., 2] *= shell.thickness_m
-        positions = mesh.positions - shell.depth_m * mesh.normals.astype(np.float64)
-        clear = np.asarray(surface.query(positions)[0]) >= shell.clear_m
-        if bones is not None:
-            moved = np.einsum("vi,viab->vab", mesh.weights / 255.0, bones[mesh.joints])
-            positions = np.einsum("vab,vb->va", moved[:, :3, :3], positions) + moved[:, :3, 3]
-            axes = moved[:, :3, :3] @ axes
-        colors = _sharpen(mesh.colors / 255.0, neighbors, shares)
-        opacities = np.full(len(positions), shell.opacity)
-        parts.append(tuple(each[clear] for each in (positions, axes, colors, opacities)))
+    surface = KDTree(extract_mesh(tables, spacing_m=SHELLS[0].spacing_m).positions)
+    parts = [_lay_shell(tables, shell, surface, bones) for shell in SHELLS]
     positions, axes, colors, opacities = (np.concatenate(each) for each in zip(*parts, strict=True))
     turned, scales, _ = np.linalg.svd(axes)
     turned[np.linalg.det(turned) < 0.0, :, 2] *= -1.0
@@ -118,6 +97,34 @@ def build_splats(
         scales=scales.astype(np.float32),
         rotations=rotations.astype(np.float32),
     )
+
+
+def _lay_shell(
+    tables: PlayerTables,
+    shell: Shell,
+    surface: KDTree,
+    bones: Float[np.ndarray, "24 4 4"] | None,
+) -> tuple[np.ndarray, ...]:
+    """Positions, axes times standard deviations, colors and opacities of a shell's Gaussians."""
+    mesh = extract_mesh(tables, spacing_m=shell.spacing_m)
+    found = KDTree(mesh.positions).query(mesh.positions, 1 + NEIGHBORS)
+    distances, neighbors = np.asarray(found[0]), np.asarray(found[1])
+    sizes = SPREAD * distances[:, 1 : 1 + NEAREST].mean(axis=1)
+    shares = np.exp(-0.5 * (distances / np.hypot(sizes, VIEWER_BLUR_M)[neighbors]) ** 2)
+    facing = np.einsum("vnx,vx->vn", mesh.normals[neighbors], mesh.normals)
+    shares *= facing > MIN_FACING
+    axes = _tangents(mesh.normals)
+    axes[..., :2] *= sizes[:, None, None]
+    axes[..., 2] *= shell.thickness_m
+    positions = mesh.positions - shell.depth_m * mesh.normals.astype(np.float64)
+    clear = np.asarray(surface.query(positions)[0]) >= shell.clear_m
+    if bones is not None:
+        moved = np.einsum("vi,viab->vab", mesh.weights / 255.0, bones[mesh.joints])
+        positions = np.einsum("vab,vb->va", moved[:, :3, :3], positions) + moved[:, :3, 3]
+        axes = moved[:, :3, :3] @ axes
+    colors = _sharpen(mesh.colors / 255.0, neighbors, shares)
+    opacities = np.full(len(positions), shell.opacity)
+    return tuple(each[clear] for each in (positions, axes, colors, opacities))
 
 
 def _sharpen(

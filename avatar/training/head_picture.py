@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from avatar.config import HEAD_SIDE_M, MAX_HEAD_PX
-from avatar.rig import HEAD_JOINT, Rig
+from avatar.rig import Rig
 from avatar.training.training_pixels import (
     PixelRuns,
     RayView,
@@ -19,7 +19,7 @@ from avatar.training.training_pixels import (
 )
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
-from preprocess.body.kinematics import body_from_rest
+from preprocess.body.kinematics import HEAD_JOINT, body_from_rest
 from preprocess.observation import Observation
 
 HEAD_UP_M = 0.08

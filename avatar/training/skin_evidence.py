@@ -1,4 +1,4 @@
-"""Evidence of the skin in the frames: how squarely each of its patches was seen.
+"""Evidence of the skin in the frames: how squarely each patch was seen, and from how many sides.
 
 A patch is a seed of the rig, about 2 cm wide. Evidence only grows, costs a millisecond a frame, and
 needs no image but the frame's mask.
@@ -19,9 +19,9 @@ MIN_PERSON_ALPHA = 127
 UNSEEN_COSINE, SEEN_COSINE = 0.1, 0.4
 """Cosines between normal and view direction up to which a patch counts as not seen (84°), and from
 which it counts as seen (66°)."""
-FLAT_SPREAD, DEEP_SPREAD = 0.3, 0.8
+DEPTH_UNKNOWN_SPREAD, DEPTH_KNOWN_SPREAD = 0.3, 0.8
 """Standard deviations of the directions from which a patch was seen, up to which its depth counts
-as unknown, and from which as known, radians: those of a sixth of a turn, and of a whole one."""
+as unknown, and from which as known, radians: about those of a sixth of a turn, and of a whole."""
 
 
 @final
@@ -73,7 +73,7 @@ class SkinEvidence:
         """
         length = np.linalg.norm(self._direction_sums, axis=1) / np.maximum(self._frames, 1.0)
         spread = np.sqrt(np.clip(2.0 - 2.0 * length, 0.0, 2.0)) * (self._frames > 0.0)
-        return _smooth_step(spread, FLAT_SPREAD, DEEP_SPREAD)
+        return _smooth_step(spread, DEPTH_UNKNOWN_SPREAD, DEPTH_KNOWN_SPREAD)
 
 
 def _smooth_step(

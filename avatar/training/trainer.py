@@ -226,8 +226,8 @@ class Trainer:
         """
         config, field = self._config_at(detail_share), self.field
         if self.steps % SOURCE_INTERVAL == 0:
-            self.unseen.update()
-            if config.head_interior_weight:
+            has_new_frames = self.unseen.update()
+            if has_new_frames and config.head_interior_weight:
                 face = self.unseen.face_cells(config.pose_uncertainty)
                 self.learner.occupancy.shape_face(face.before, face.under)
         falling = rate if pose_rate is None else pose_rate

@@ -10,6 +10,8 @@ a point whose color and density it is drawn to as far as it is unseen and the so
 The source of a patch is the candidate of the least cost: the distance to it, in which lengths along
 the bone count more than those around it, a cost of each kind of reflection, and one of candidates
 that were seen poorly.
+
+A face that was seen from one side alone could have any depth; it is kept near the body model's.
 """
 
 from typing import NamedTuple, final
@@ -177,10 +179,10 @@ class UnseenSkin:
         self.evidence.add(frame)
         self._is_stale = True
 
-    def update(self) -> None:
-        """Finds the sources again, if frames have been added since the last time."""
+    def update(self) -> bool:
+        """Finds the sources again, if frames have been added since; returns whether they have."""
         if not self._is_stale:
-            return
+            return False
         found = find_sources(self._rig, self._frames, self.evidence.seen, self._middle_x)
         around = (self._neighbors @ found.weight + found.weight) / self._neighbor_counts
         self.sources = found._replace(weight=(found.weight * around).astype(np.float32))
@@ -190,6 +192,7 @@ class UnseenSkin:
         self._drawn_from = np.concatenate([drawn, *[near] * (NEAR_SKIN_FACTOR - 1)])
         self._unseen_share = len(drawn) / len(self._cells)
         self._is_stale, self._steps = False, 0
+        return True
 
     def face_cells(self, strength: float) -> FaceCells:
         """Cells before and under the skin of a face, as far as its depth is unknown.

@@ -278,7 +278,7 @@ def fill_holes(
 ) -> Int64[np.ndarray, "height width"]:
     """Fill pixels that opposite ones, some spacings away, overtop by far; cut off the margin.
 
-    `reach_m` is the tables', metres.
+    `reach_m` is half the range of the depths that keys code, metres (`PlayerTables.reach_m`).
     """
     side, margin = splats.side, splats.margin
     here, filled = slice(margin, -margin), keys[margin:-margin, margin:-margin]

@@ -22,7 +22,7 @@ MIN_MEDIAN_ALPHA = 0.9
 MAX_MEDIAN_DIFFERENCE = 0.15
 """Difference of any channel from that median, in [0, 1], above which the pixel is a speck."""
 HOLE_SPACINGS = 1, 2, 3
-"""Distances of opposite pixels that close a hole: surfel spacings, at least a footprint."""
+"""Distances of opposite pixels that close a hole, surfel spacings; each at least a footprint."""
 
 
 @dataclass(frozen=True, kw_only=True)

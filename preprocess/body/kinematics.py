@@ -12,6 +12,8 @@ JOINT_NAMES = (
     "left_wrist", "right_wrist", "left_hand", "right_hand",
 )  # fmt: skip
 """Joints in the order of all arrays."""
+HEAD_JOINT = JOINT_NAMES.index("head")
+"""Joint at the base of the skull."""
 
 PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
 """Parent of each joint, before its children; -1 for the root."""

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from capture.input_error import InputError
 from preprocess.body.body_pose import Motion
 from preprocess.body.body_surface import smooth_over_surface, vertex_normals
+from preprocess.body.kinematics import HEAD_JOINT
 from preprocess.body.parametric_body import (
     BodyModel,
     ShapedBody,
@@ -20,8 +21,6 @@ from preprocess.body.parametric_body import (
     with_smpl_joints,
 )
 
-HEAD_JOINT = 15
-"""Joint at the base of the skull."""
 BONE_GROUPS = {
     "hip width": (1, 2), "thigh": (4, 5), "shin": (7, 8), "foot": (10, 11), "trunk": (3, 6, 9),
     "neck": (12, 15), "shoulder width": (13, 14, 16, 17), "upper arm": (18, 19),
@@ -33,14 +32,14 @@ GIRTH_GROUPS = {
     "feet": (7, 8, 10, 11), "upper arms": (16, 17), "forearms": (18, 19),
     "hands": (20, 21, 22, 23), "head": (12, 15),
 }  # fmt: skip
-"""Joints whose skin one girth moves outward; of the head's, that under hair."""
-SMOOTHED_M = 0.02
+"""Joints whose skin one girth moves outward; that of the head moves the skin under hair alone."""
+GIRTH_SMOOTHING_M = 0.02
 """Width over which the directions of girths are smoothed, metres. Along each vertex's own normal,
 hair and loose clothes would inflate noses, ears and fingers instead of covering them."""
-FACE_MIN_NORMAL = 0.2
-"""Least forward component of a normal of the face."""
+FRONT_MIN_NORMAL = 0.2
+"""Least forward component of a normal of the face; ears may lie under hair."""
 HAIRLINE = 0.7
-"""Height of the hairline between the head's joint and its top."""
+"""Height of the hairline, as a share of that of the head above its joint."""
 SIGMA_BETA = 0.7
 """Prior standard deviation of a shape coefficient."""
 SIGMA_LOG_LENGTH = 0.05
@@ -104,10 +103,10 @@ def _outward_directions(shaped: ShapedBody) -> Float[np.ndarray, "vertices 3"]:
     body, vertices = shaped.body, shaped.vertices
     normals = vertex_normals(vertices, body.faces)
     low, top = shaped.joints[HEAD_JOINT, 1], vertices[:, 1].max()
-    is_face = (normals[:, 2] > FACE_MIN_NORMAL) & (vertices[:, 1] < low + HAIRLINE * (top - low))
+    is_face = (normals[:, 2] > FRONT_MIN_NORMAL) & (vertices[:, 1] < low + HAIRLINE * (top - low))
     face = is_face * body.weights[:, HEAD_JOINT]
     both = np.column_stack([normals, face])
-    *outward, bare = smooth_over_surface(vertices, body.faces, both, SMOOTHED_M).T
+    *outward, bare = smooth_over_surface(vertices, body.faces, both, GIRTH_SMOOTHING_M).T
     return np.column_stack(outward) * (1.0 - bare[:, None])
 
 

@@ -14,7 +14,8 @@ from avatar.occupancy_grid import (
     dilate,
     find_floaters,
 )
-from avatar.rig import CLOTHING_BAND_M, HEAD_JOINT
+from avatar.rig import CLOTHING_BAND_M
+from preprocess.body.kinematics import HEAD_JOINT
 
 STEP_M = 0.01
 

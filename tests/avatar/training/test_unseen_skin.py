@@ -7,12 +7,12 @@ import torch
 from avatar import radiance_field
 from avatar.config import TrainConfig
 from avatar.kernels.numba_priors import OPACITY_LENGTH_M
-from avatar.rig import HEAD_JOINT
 from avatar.training import checkpoint
 from avatar.training.frame_stream import prepare_frame
 from avatar.training.skin_evidence import SkinEvidence
 from avatar.training.trainer import Trainer, cosine_decay
 from avatar.training.unseen_skin import FACE_MIN_NORMAL, HEAD, MIN_WEIGHT, UnseenSkin
+from preprocess.body.kinematics import HEAD_JOINT
 
 TORSO, LEFT_THIGH, LEFT_FOREARM, RIGHT_FOREARM = 0, 1, 10, 11
 

@@ -10,7 +10,7 @@ SIZE_PX, REACH_M = (24, 20), 1.0
 
 
 def filled_share(gap_px, *, side, spacing_px):
-    """Share of a gap between two sheets 2 cm before a third that shows the sheets after filling."""
+    """Share of a gap between two sheets, far before what it shows, that is filled."""
     width, height = SIZE_PX
     empty = np.zeros(0, dtype=np.int64)
     splats = SurfelFootprints(spacing_px, side, empty, empty, np.zeros(0, dtype=np.float32))

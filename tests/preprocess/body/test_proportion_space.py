@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from preprocess.body.proportion_space import GIRTH_GROUPS, HEAD_JOINT, ProportionSpace
+from preprocess.body.kinematics import HEAD_JOINT
+from preprocess.body.proportion_space import GIRTH_GROUPS, ProportionSpace
 
 THICKER = 1.5
 
