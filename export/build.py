@@ -8,7 +8,7 @@ The checks compare a package's player with its reference and with the volume ren
 import io
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -58,6 +58,8 @@ from export.player_inputs import fit_camera
 GRAPH_CHECK_PICTURES = {"hq": 2, "lite": 1}
 """Golden frames on which each tier's graph is compared with its reference, 0.2 s each. They test
 the arithmetic of this machine's onnxruntime; further poses would test the same."""
+SCORED_VIEWS = {"hq": None, "lite": 1}
+"""Views on which each tier is compared with the renderer; None for all."""
 MAX_GOLDEN_FRAMES = 4
 """Golden frames of a package."""
 BAKING_PROGRESS = 0.25
@@ -223,17 +225,19 @@ class _PackageDraft:
         """
         started = time.perf_counter()
         with PackageWriter(self.path, level=level) as writer:
-            compressed = self.executor.submit(writer.add_tables, tuned.tables)
-            try:
-                package = _checked_package(
-                    _unchecked_package(
-                        tuned.tables, tuned.settings, self.rig, self.views, self.metrics
-                    ),
-                    self.views, self.exact, self.executor, warnings=list(warnings),
-                    difference=difference,
-                )  # fmt: skip
-            finally:
-                compressed.result()
+            package = _unchecked_package(
+                tuned.tables, tuned.settings, self.rig, self.views, self.metrics
+            )
+            players = {
+                tier: self.executor.submit(_prepare_player, package, tier)
+                for tier in package.manifest.tiers
+            }
+            writer.add_tables(tuned.tables)  # compressed beside them
+            package = _checked_package(
+                package, {tier: player.result() for tier, player in players.items()},
+                self.views, self.exact, self.executor, warnings=list(warnings),
+                difference=difference,
+            )  # fmt: skip
             size = writer.finish(package)
         tiers = package.manifest.tiers
         return ExportReport(
@@ -263,36 +267,50 @@ def _fine_tune(
     return FineTuningResult(tables=inputs.tables, settings=inputs.settings, psnr=None)
 
 
+def _prepare_player(package: AvatarPackage, tier: str) -> tuple[bytes, Player]:
+    """Build the graph of a tier, and its player."""
+    tables, settings = package.tables[tier], package.manifest.tiers[tier].settings
+    graph = build_graph(tables, settings).SerializeToString()
+    return graph, Player(replace(package, graphs={tier: graph}), tier=tier, optimize=False)
+
+
 def _checked_package(
     package: AvatarPackage,
+    players: Mapping[str, tuple[bytes, Player]],
     views: Sequence[PosedView],
     exact: Sequence[Float32[np.ndarray, "_ _ 3"]],
     executor: Executor,
     warnings: list[str],
     difference: float | None,
 ) -> AvatarPackage:
-    """Check every tier, its graph unless `difference` is known; add scores, warnings, pictures."""
+    """Check every tier, its graph unless `difference` is known; add what is missing."""
     manifest = package.manifest
-
-    def check(tier: str) -> tuple[Player, TierInfo]:
-        player, worst = Player(package, tier=tier), difference
-        if worst is None:
-            frames = manifest.golden[: GRAPH_CHECK_PICTURES[tier]]
-            worst = check_graph(player, package, tier, frames)
-        seen = slice(None) if tier == "hq" else slice(1)
-        score = mean_psnr_to_renderer(player, views[seen], exact[seen])
-        info = replace(manifest.tiers[tier], psnr_to_renderer=score, largest_difference=worst)
-        return player, info
-
-    checked = dict(zip(manifest.tiers, executor.map(check, manifest.tiers), strict=True))
-    hq, info = checked["hq"]
-    warnings = warnings + quality_warnings(info.psnr_to_renderer)
+    checks, scores = dict[str, list[Future[float]]](), dict[str, list[Future[float]]]()
+    for tier, (_, player) in players.items():
+        frames = manifest.golden[: GRAPH_CHECK_PICTURES[tier]] if difference is None else ()
+        checks[tier] = [
+            executor.submit(check_graph, player, package, tier, frame) for frame in frames
+        ]
+        scores[tier] = [
+            executor.submit(psnr_to_renderer, player, view, truth)
+            for view, truth in list(zip(views, exact, strict=True))[: SCORED_VIEWS[tier]]
+        ]
+    hq = players["hq"][1]
     shots = [views[0], *((frame.pose, frame.camera) for frame in manifest.golden)]
     preview, *golden = executor.map(lambda shot: hq.render(*shot), shots)
-    tiers = {tier: info for tier, (_, info) in checked.items()}
+    tiers = {
+        tier: replace(
+            info,
+            psnr_to_renderer=float(np.mean([score.result() for score in scores[tier]])),
+            largest_difference=max((check.result() for check in checks[tier]), default=difference),
+        )
+        for tier, info in manifest.tiers.items()
+    }
+    warnings = warnings + quality_warnings(tiers["hq"].psnr_to_renderer)
     return replace(
         package,
         manifest=replace(manifest, tiers=tiers, metrics={**manifest.metrics, "warnings": warnings}),
+        graphs={tier: graph for tier, (graph, _) in players.items()},
         golden=tuple(golden),
         preview=_encode_png(preview),
     )
@@ -305,7 +323,7 @@ def _unchecked_package(
     views: Sequence[PosedView],
     metrics: Mapping[str, Any],
 ) -> AvatarPackage:
-    """Build the package without scores and pictures."""
+    """Build the package without graphs, scores and pictures."""
     notes = {
         tier: TierInfo(
             layout=TableLayout.of(tables),
@@ -332,9 +350,7 @@ def _unchecked_package(
             ),
             sha256={},
         ),
-        graphs={
-            tier: build_graph(tables, rule).SerializeToString() for tier, rule in settings.items()
-        },
+        graphs={},
         tables=dict.fromkeys(settings, tables),
         golden=(),
         preview=b"",
@@ -366,39 +382,28 @@ CHECK_PX = 256
 """Longer side of the pictures that are compared with the volume renderer, pixels."""
 
 
-def check_graph(
-    player: Player, package: AvatarPackage, tier: str, frames: Sequence[GoldenFrame]
-) -> float:
-    """Return the largest difference of a tier's graph from its reference over frames, in 1/255."""
+def check_graph(player: Player, package: AvatarPackage, tier: str, frame: GoldenFrame) -> float:
+    """Return the largest difference of a tier's graph from its reference on a frame, in 1/255."""
     tables, settings = package.tables[tier], package.manifest.tiers[tier].settings
-    worst = 0.0
-    for number, frame in enumerate(frames):
-        camera = frame.camera
-        inputs = PlayerInputs.of(player.bones(frame.pose, camera), camera, settings.samples)
-        drawn = premultiply(player.render(frame.pose, camera))
-        difference = PictureDifference.of(drawn, draw_reference(tables, settings, inputs))
-        worst = max(worst, difference.largest_difference)
-        if not difference.matches:
-            raise ExportRefused(
-                f"In view {number} the player's graph ({tier}) is within 2/255 of its reference "
-                f"on only {difference.close_fraction:.2%} of the pixels; {MIN_CLOSE_FRACTION:.1%} "
-                "are required. Nothing was written; the checkpoint is kept. This is a fault of the "
-                "program: please report it with the version of onnxruntime."
-            )
-    return worst
+    camera = frame.camera
+    inputs = PlayerInputs.of(player.bones(frame.pose, camera), camera, settings.samples)
+    drawn = premultiply(player.render(frame.pose, camera))
+    difference = PictureDifference.of(drawn, draw_reference(tables, settings, inputs))
+    if not difference.matches:
+        raise ExportRefused(
+            f"In one view the player's graph ({tier}) is within 2/255 of its reference on only "
+            f"{difference.close_fraction:.2%} of the pixels; {MIN_CLOSE_FRACTION:.1%} are "
+            "required. Nothing was written; the checkpoint is kept. This is a fault of the "
+            "program: please report it with the version of onnxruntime."
+        )
+    return difference.largest_difference
 
 
-def mean_psnr_to_renderer(
-    player: Player,
-    views: Sequence[PosedView],
-    exact: Sequence[Float32[np.ndarray, "_ _ 3"]],
-) -> float:
-    """Return the mean PSNR of the player to the renderer's pictures on white, dB."""
-    scores = []
-    for (pose, camera), truth in zip(views, exact, strict=True):
-        drawn = picture_on_white(premultiply(player.render(pose, fit_camera(camera, CHECK_PX))))
-        scores.append(min(psnr(drawn, truth), 99.0))
-    return float(np.mean(scores))
+def psnr_to_renderer(player: Player, view: PosedView, exact: Float32[np.ndarray, "_ _ 3"]) -> float:
+    """Return the PSNR of the player to the renderer's picture of a view on white, dB."""
+    pose, camera = view
+    drawn = picture_on_white(premultiply(player.render(pose, fit_camera(camera, CHECK_PX))))
+    return min(psnr(drawn, exact), 99.0)
 
 
 def quality_warnings(score: float) -> list[str]:

@@ -99,8 +99,8 @@ def train(
     of a recording is lost: if the time is too short to read them all beside training, reading takes
     precedence and may overrun the time. Frames of a paced source are not waited for, except for the
     first. A live source is left when the time is up, and training closes with the last frame of a
-    folder that grows. Where steps are counted, one more frame of a recording is read before each
-    step until all are read.
+    folder that grows, from which on nothing is scored. Where steps are counted, one more frame of a
+    recording is read before each step until all are read.
 
     Held-out frames that arrive are appended to `held_out`. Events are yielded on the caller's
     thread; the time the caller spends on one counts as training time.
@@ -117,7 +117,7 @@ def train(
         now = stream.clock.read()
         if stream.is_done(now):
             break
-        if marks.is_due(now):
+        if marks.is_due(now) and not stream.is_closing:
             yield marks.score(held_out, stream.clock)
             continue
         if stream.is_behind(now) or stream.needs_frame():
@@ -190,6 +190,11 @@ class _FrameIntake:
     @property
     def ended(self) -> bool:
         return self._ended_at is not None
+
+    @property
+    def is_closing(self) -> bool:
+        """True if the last frame has come of a source that ends the run: a user waits."""
+        return self._inbox.ends_run and self._closing_from is not None
 
     def receive(self, now: float) -> Iterator[FrameArrived | FrameLeftOut]:
         """Adds the frames that have arrived to the trainer; the clock starts with the first."""

@@ -1,5 +1,6 @@
 """Baking: a trained field and its rig as the tables that the player draws."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -171,15 +172,18 @@ def sample_field(
 
 
 def bake_tables(grid: FieldGrid, rig: Rig, config: BakeConfig) -> PlayerTables:
-    """Bake sampled density and color, the second half; numpy and serial kernels, on any thread."""
+    """Bake sampled density and color, the second half; numpy and serial kernels, on any threads."""
     surface = _surface_within_surfel_limit(grid, config)
     canonical = body_from_rest(rig.rest_joints, rig.parents, rig.canonical_rotations)
     pelvis = canonical[0, :3, :3] @ rig.rest_joints[0] + canonical[0, :3, 3]
-    reached = _visible_nodes(grid, surface)
+    with ThreadPoolExecutor(1) as beside:
+        skinning = beside.submit(bake_skinning, rig, surface)
+        surfels = beside.submit(_encode_surfels, surface)
+        bricks = _encode_bricks(grid, _visible_nodes(grid, surface))
     return PlayerTables(
-        surfels=_encode_surfels(surface),
-        bricks=_encode_bricks(grid, reached),
-        skinning=bake_skinning(rig, surface),
+        surfels=surfels.result(),
+        bricks=bricks,
+        skinning=skinning.result(),
         pelvis=pelvis.astype(np.float32),
         reach_m=_max_reach_m(rig),
     )
@@ -249,16 +253,19 @@ def _encode_bricks(grid: FieldGrid, reached: Bool[np.ndarray, "x y z"]) -> Brick
     codes = np.zeros(grid.density.shape, dtype=np.uint8)
     codes.ravel()[places] = seen
     visible = dilate(codes > 0)
-    blocks = _overlapping_blocks(visible)
-    used = blocks.any(axis=(3, 4, 5))
+    used = visible
+    for axis, count in enumerate(counts):
+        first = np.arange(count) * BRICK_SIZE
+        used = np.logical_or.reduceat(used, first, axis) | used.take(first + BRICK_SIZE, axis)
     index = np.zeros(counts, dtype=np.int32)
     index[used] = np.arange(1, used.sum() + 1)
     voxels = np.zeros((used.sum() + 1, BRICK_NODES, BRICK_NODES, BRICK_NODES, 4), dtype=np.uint8)
     voxels[1:, ..., 3] = _overlapping_blocks(codes)[used]
-    shown = blocks[used]
+    shown = _overlapping_blocks(visible)[used]
+    rounded = round_codes(np.arange(256, dtype=np.uint8), COLOR_CODE_STEP, 255)
     for channel in range(3):
         values = _overlapping_blocks(grid.rgb[..., channel])[used]
-        voxels[1:, ..., channel] = round_codes(values, COLOR_CODE_STEP, 255) * shown
+        voxels[1:, ..., channel] = rounded[values] * shown
     return BrickTable(low=grid.low, voxel_m=grid.voxel_m, index=index, voxels=voxels)
 
 

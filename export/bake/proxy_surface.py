@@ -4,17 +4,22 @@ The field is sampled once; everything else is baked from that grid. The proxy su
 with normals and the thickness under it that is visible.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int, UInt8
-from scipy import ndimage
+from jaxtyping import Bool, Float, Float32, Int, Int64, UInt8
 
 from avatar.kernels.kernel_compiler import compile_kernel
 from avatar.rig import Rig
-from export.bake.voxel_grid import dilate, remove_floaters_and_cavities, resample_grid
+from export.bake.voxel_grid import (
+    blur_grid,
+    dilate,
+    remove_floaters_and_cavities,
+    resample_grid,
+)
 from export.package.player_tables import BRICK_SIZE, LOG_DENSITY_RANGE
 
 F32, I32 = np.float32, np.int32
@@ -115,8 +120,8 @@ FieldFunction = Callable[
     tuple[Float32[torch.Tensor, "points 3"], Float32[torch.Tensor, "points"]],
 ]
 """Evaluates color in [0, 1] and density in 1/m at canonical points."""
-CHUNK_POINTS = 1 << 18
-"""Points per evaluation of the field."""
+CHUNK_POINTS = 1 << 16
+"""Points per evaluation of the field; their colors fit into a cache."""
 MIN_DENSITY = float(np.exp(LOG_DENSITY_RANGE[0]))
 """Density below which a node is empty, 1/m."""
 
@@ -145,12 +150,14 @@ def sample_field_grid(
     counts = np.ceil(extent / (voxel_m * BRICK_SIZE)).astype(int) * BRICK_SIZE + 1
     density = np.zeros(counts, dtype=np.float32)
     rgb = np.zeros((*counts, 3), dtype=np.uint8)
-    for nodes in _occupied_nodes(occupied, (low - rig.box_low) / cell, voxel_m / cell, counts):
-        points = torch.from_numpy((low + nodes * voxel_m).astype(np.float32))
+    axes = [(low[k] + np.arange(counts[k]) * voxel_m).astype(np.float32) for k in range(3)]
+    places = _occupied_nodes(occupied, (low - rig.box_low) / cell, voxel_m / cell, counts)
+    for start in range(0, len(places), CHUNK_POINTS):
+        place = places[start : start + CHUNK_POINTS]
+        nodes = np.unravel_index(place, counts)
+        points = np.stack([axis[node] for axis, node in zip(axes, nodes, strict=True)], axis=1)
         with torch.no_grad():
-            colors, densities = field_at(points)
-        i, j, k = nodes.T
-        place = (i * counts[1] + j) * counts[2] + k
+            colors, densities = field_at(torch.from_numpy(points))
         density.ravel()[place] = densities.numpy()
         rgb.reshape(-1, 3)[place] = np.round(np.clip(colors.numpy(), 0, 1) * 255.0).astype(np.uint8)
     dilate_colors(density > MIN_DENSITY, rgb)
@@ -169,23 +176,14 @@ def _occupied_nodes(
     offset: Float[np.ndarray, "3"],
     step: Float[np.ndarray, "3"],
     counts: Int[np.ndarray, "3"],
-) -> Iterator[Int[np.ndarray, "nodes 3"]]:
-    """Yield the nodes inside occupied cells, some 10⁵ at a time."""
+) -> Int64[np.ndarray, "nodes"]:
+    """Return the flat indices of nodes inside occupied cells."""
     padded = np.pad(occupied, 1)
     cells = [
         np.clip(np.floor(offset[k] + np.arange(counts[k]) * step[k]).astype(int) + 1, 0, size - 1)
         for k, size in enumerate(padded.shape)
     ]
-    waiting: list[Int[np.ndarray, "nodes 3"]] = []
-    for i, cell in enumerate(cells[0]):
-        j, k = np.nonzero(padded[cell][np.ix_(cells[1], cells[2])])
-        waiting.append(np.stack([np.full_like(j, i), j, k], axis=1))
-        if sum(len(nodes) for nodes in waiting) > CHUNK_POINTS or i == counts[0] - 1:
-            nodes = np.concatenate(waiting)
-            yield from (
-                nodes[start : start + CHUNK_POINTS] for start in range(0, len(nodes), CHUNK_POINTS)
-            )
-            waiting = []
+    return np.flatnonzero(padded[:, :, cells[2]][:, cells[1]][cells[0]])
 
 
 DENSITY_CONTRAST = 16.0
@@ -225,12 +223,11 @@ def extract_proxy_surface(grid: FieldGrid, *, level: float, spacing_m: float) ->
     field. Surfels lie on the edges of cells of `spacing_m`.
     """
     logs = resample_grid(_log_density(grid, level), spacing_m / grid.voxel_m)
-    logs = ndimage.gaussian_filter(logs, SMOOTHING_M / spacing_m, truncate=3.0)
+    logs = blur_grid(logs, SMOOTHING_M / spacing_m)
     inside = remove_floaters_and_cavities(logs > 0.0, MIN_PART_FRACTION)
     nothing = np.float32(1e-3)
     logs = np.where(inside, np.maximum(logs, nothing), np.minimum(logs, -nothing))
-    slope = ndimage.gaussian_filter(logs, 1.0, truncate=3.0)
-    nodes, normals = _zero_crossings(logs, slope)
+    nodes, normals = _zero_crossings(logs, blur_grid(logs, 1.0))
     positions = (grid.low + nodes * spacing_m).astype(np.float32)
     return ProxySurface(
         spacing_m=spacing_m,
@@ -254,21 +251,24 @@ def _zero_crossings(
     logs: Float32[np.ndarray, "x y z"], smoothed: Float32[np.ndarray, "x y z"]
 ) -> tuple[Float32[np.ndarray, "surfels 3"], Float32[np.ndarray, "surfels 3"]]:
     """Return zero crossings of edges, in nodes, and unit normals of the smoother grid."""
-    nodes, normals = [], []
-    for axis in range(3):
-        along = np.eye(3, dtype=int)[axis]
+    inside = logs > 0
+
+    def crossings(along: Int[np.ndarray, "3"]) -> tuple[np.ndarray, np.ndarray]:
         here = tuple(slice(1, -1) for _ in range(3))
         there = tuple(slice(1 + a, -1 + a or None) for a in along)
-        start = np.argwhere((logs[here] > 0) != (logs[there] > 0)) + 1
+        start = np.argwhere(inside[here] != inside[there]) + 1
         low, high = logs[tuple(start.T)], logs[tuple((start + along).T)]
         share = (low / (low - high))[:, None]
         normal = (
             _central_differences(smoothed, start) * (1 - share)
             + _central_differences(smoothed, start + along) * share
         )
-        nodes.append(start + along * share)
-        normals.append(-normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9))
-    return np.concatenate(nodes).astype(np.float32), np.concatenate(normals).astype(np.float32)
+        length = np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+        return (start + along * share).astype(np.float32), (-normal / length).astype(np.float32)
+
+    with ThreadPoolExecutor(2) as threads:
+        nodes, normals = zip(*threads.map(crossings, np.eye(3, dtype=int)), strict=True)
+    return np.concatenate(nodes), np.concatenate(normals)
 
 
 def _central_differences(

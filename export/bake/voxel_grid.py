@@ -3,6 +3,8 @@
 Isosurfaces are naive surface nets: one vertex for each crossed cell.
 """
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, Int64
 from scipy import ndimage
@@ -12,16 +14,31 @@ def resample_grid(
     values: Float32[np.ndarray, "x y z"], step: float
 ) -> Float32[np.ndarray, "x2 y2 z2"]:
     """Interpolate linearly at every `step`-th node along each axis, which has two nodes or more."""
-    for axis in range(3):
-        places = np.arange(0.0, values.shape[axis] - 1, step)
+    lower, shares = [], []
+    for size in values.shape:
+        places = np.arange(0.0, size - 1, step)
         # rounding may put the last place on the last node, which begins no cell
-        below = np.minimum(places.astype(int), values.shape[axis] - 2)
-        shape = [1, 1, 1]
-        shape[axis] = -1
-        part = (places - below).astype(np.float32).reshape(shape)
-        lower = np.take(values, below, axis=axis)
-        values = lower + (np.take(values, below + 1, axis=axis) - lower) * part
-    return values
+        lower.append(np.minimum(places.astype(int), size - 2))
+        shares.append((places - lower[-1]).astype(np.float32))
+    (x, y, z), (_, along_y, along_z) = lower, shares
+    out = np.empty([len(axis) for axis in lower], dtype=np.float32)
+    for plane, below, share in zip(out, x, shares[0], strict=True):  # planes fit into caches
+        rows = values[below] + (values[below + 1] - values[below]) * share
+        rows = rows[y] + (rows[y + 1] - rows[y]) * along_y[:, None]
+        left = rows[:, z]
+        plane[:] = left + (rows[:, z + 1] - left) * along_z
+    return out
+
+
+def blur_grid(values: Float32[np.ndarray, "x y z"], sigma: float) -> Float32[np.ndarray, "x y z"]:
+    """Convolve with a Gaussian up to three standard deviations; two halves side by side."""
+    radius, middle = int(3.0 * sigma + 0.5), len(values) // 2
+    with ThreadPoolExecutor(1) as beside:
+        upper = beside.submit(
+            ndimage.gaussian_filter, values[max(middle - radius, 0) :], sigma, truncate=3.0
+        )
+        lower = ndimage.gaussian_filter(values[: middle + radius], sigma, truncate=3.0)
+    return np.concatenate([lower[:middle], upper.result()[min(middle, radius) :]])
 
 
 def dilate(solid: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:

@@ -63,6 +63,16 @@ def test_the_graph_draws_what_the_reference_draws(
 
 
 @pytest.mark.parametrize("tier", ["hq", "lite"])
+def test_pictures_do_not_depend_on_what_onnxruntime_optimizes(exported, bent, camera, tier):
+    package, view = read_package(exported.path, tier=tier), camera(131, 77, distance_m=1.2)
+    pictures = [
+        Player(package, tier=tier, optimize=optimize).render(bent, view)
+        for optimize in (False, True)
+    ]
+    np.testing.assert_array_equal(*pictures)
+
+
+@pytest.mark.parametrize("tier", ["hq", "lite"])
 def test_folded_skin_is_filtered_as_in_the_reference(exported, tables, camera, tier, monkeypatch):
     """A shoulder from near by, with the arm turned half round about its axis."""
     rotations = np.zeros((23, 3))

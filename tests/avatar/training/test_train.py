@@ -321,10 +321,15 @@ def test_a_live_source_is_left_when_the_time_is_up(rig, clip, ticking):
 
 def test_training_ends_with_the_last_image_of_a_folder_that_grows(rig, clip, ticking, monkeypatch):
     monkeypatch.setattr(train_module, "LEAST_STEPS", 0)
+    monkeypatch.setattr(train_module, "EVALUATION_TIMES_S", (0.5, 60.0))
     frames = [prepare_frame(observation, rig) for observation in clip.observations[:2]]
     trainer = Trainer(rig, dataclasses.replace(QUICK, seconds=3600.0))
-    events = list(train(trainer, Inbox(frames, paced=True, ends_run=True), []))
+    inbox = Inbox(frames, paced=True, ends_run=True)
+    inbox._thread.join()  # all frames are there before the mark
+    events = list(train(trainer, inbox, []))
+    assert not any(isinstance(event, Evaluated) for event in events)  # a user waits
     assert isinstance(events[-1], Finished)
+    assert events[-1].wall_seconds > 0.5
     assert trainer.steps >= train_module.MIN_STEPS_AFTER_LAST_FRAME
 
 

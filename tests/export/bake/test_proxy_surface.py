@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from export.bake.proxy_surface import (
     OPAQUE_OPTICAL_DEPTH,
@@ -8,7 +9,7 @@ from export.bake.proxy_surface import (
     dilate_colors,
     extract_proxy_surface,
 )
-from export.bake.voxel_grid import resample_grid
+from export.bake.voxel_grid import blur_grid, resample_grid
 
 VOXEL_M = 0.004
 RADIUS_M = 0.08
@@ -40,6 +41,21 @@ def test_a_ramp_is_read_at_any_step_also_where_the_last_one_is_rounded_to_the_en
         ends += int(places[-1]) == 401
         np.testing.assert_allclose(resample_grid(ramp, step)[:, 0, 0], places, rtol=1e-5)
     assert ends  # a length over a step that divides it is at times a step too many
+
+
+def test_a_grid_is_resampled_trilinearly():
+    values = np.random.default_rng(0).random((9, 14, 6), dtype=np.float32)
+    places = np.meshgrid(*(np.arange(0.0, size - 1, 1.3) for size in values.shape), indexing="ij")
+    expected = ndimage.map_coordinates(values, places, order=1)
+    np.testing.assert_allclose(resample_grid(values, 1.3), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [1, 2, 7, 30])
+@pytest.mark.parametrize("sigma", [0.5, 1.0, 2.4])
+def test_halves_of_a_grid_are_blurred_as_the_whole(size, sigma):
+    values = np.random.default_rng(0).random((size, 8, 5), dtype=np.float32)
+    whole = ndimage.gaussian_filter(values, sigma, truncate=3.0)
+    np.testing.assert_array_equal(blur_grid(values, sigma), whole)
 
 
 def test_the_surface_of_a_ball_is_its_level_set():
