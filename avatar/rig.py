@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32, Int64
-from scipy.ndimage import maximum_filter, uniform_filter
+from scipy.ndimage import distance_transform_edt, maximum_filter, uniform_filter
 from scipy.spatial import KDTree
 
 from preprocess.body.body_pose import BodyPose
@@ -146,6 +146,18 @@ class Rig:
     def _nodes_by_reach(self) -> dict[float, SparseSkinningNodes]:
         return {}
 
+    @cached_property
+    def clothing_cells(self) -> Int64[np.ndarray, "near"]:
+        """Occupancy cells within the clothing band, by flat index."""
+        return np.flatnonzero(self.skin_distance <= CLOTHING_BAND_M)
+
+    @cached_property
+    def seed_of_clothing_cell(self) -> Int64[np.ndarray, "near"]:
+        """The seed nearest to the center of each of `clothing_cells`."""
+        cells = np.stack(np.unravel_index(self.clothing_cells, self.skin_distance.shape), axis=1)
+        tree = KDTree(self.seeds, leafsize=LEAF_VERTICES)
+        return tree.query(self.box_low + (cells + 0.5) / self.cells_per_m, workers=-1)[1]
+
     def body_from_canonical(
         self, joint_rotations: Float[np.ndarray, "23 3"]
     ) -> Float[np.ndarray, "24 4 4"]:
@@ -227,19 +239,24 @@ def skinning_weight_volume(
     shape = tuple(n + 1 for n in volume_shape(low, high, cell_m))
     axes = [np.linspace(low[k], high[k], shape[k]) for k in range(3)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    tree = KDTree(vertices, leafsize=LEAF_VERTICES)
-    nearest_m, _ = tree.query(nodes, distance_upper_bound=reach_m, workers=-1)
-    near = np.flatnonzero(np.isfinite(nearest_m))
+    spacing = (high - low) / (np.array(shape) - 1.0)
+    is_free = np.ones(shape, dtype=bool)
+    is_free[tuple(np.round((vertices - low) / spacing).astype(int).T)] = False
+    roughly_m = np.asarray(distance_transform_edt(is_free, sampling=spacing.tolist()))
+    near = np.flatnonzero(roughly_m < reach_m + 0.51 * np.linalg.norm(spacing))
 
+    tree = KDTree(vertices, leafsize=LEAF_VERTICES)
+    far = np.ones(len(nodes), dtype=bool)
     weights = np.zeros((len(nodes), 24), dtype=np.float32)
     weights[:, 0] = 1.0
     for chunk in np.array_split(near, max(1, len(near) // 8192)):
         distance_m, index = tree.query(nodes[chunk], k=BLENDED_VERTICES, workers=-1)
-        share = 1.0 / np.maximum(distance_m, MIN_VERTEX_DISTANCE_M) ** 2
+        within, far[chunk] = distance_m[:, 0] < reach_m, distance_m[:, 0] > SMOOTHED_BEYOND_M
+        share = 1.0 / np.maximum(distance_m[within], MIN_VERTEX_DISTANCE_M) ** 2
         share /= share.sum(axis=1, keepdims=True)
-        weights[chunk] = np.einsum("nk,nkj->nj", share, vertex_weights[index])
-    far = (~(nearest_m <= SMOOTHED_BEYOND_M)).reshape(*shape, 1)
-    return _smooth_far_weights(weights.reshape(*shape, 24), far)
+        blended = np.einsum("nk,nkj->nj", share, vertex_weights[index[within]])
+        weights[chunk[within]] = blended
+    return _smooth_far_weights(weights.reshape(*shape, 24), far.reshape(*shape, 1))
 
 
 def _smooth_far_weights(

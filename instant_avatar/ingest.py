@@ -3,6 +3,7 @@
 import sys
 import time
 from collections.abc import Sequence
+from threading import Thread
 from typing import TYPE_CHECKING
 
 from instant_avatar.cli.command_line import (
@@ -12,6 +13,7 @@ from instant_avatar.cli.command_line import (
     parse_arguments,
     require_packages,
     run_command,
+    without_garbage_collection,
 )
 from instant_avatar.cli.console import Console
 from instant_avatar.cli.shared_options import open_recording
@@ -47,12 +49,14 @@ def ingest(
     inputs = arguments.capture_inputs()
     if not inputs.is_live:
         open_recording(inputs, console)  # before code is loaded that takes a second
-    from instant_avatar.run.run_capture import open_observations, write_solved_cameras
+    with without_garbage_collection():
+        from instant_avatar.run.run_capture import open_observations, write_solved_cameras
 
     run, read = arguments.run_folder(), inputs.input_paths()
     run.check_usable(read, resume=arguments.resume, overwrite=arguments.overwrite)
     with run.claim(console, resume=arguments.resume, overwrite=arguments.overwrite):
         command = arguments.as_json()
+        Thread(target=_load_libraries).start()
         threads = None
         if inputs.kind is InputKind.STREAMED:  # its frames come as soon as it is open
             threads = _load_trainer_code(arguments, run, console)
@@ -81,9 +85,22 @@ def ingest(
         return INTERRUPTED if is_interrupted else code
 
 
+def _load_libraries() -> None:
+    """Import torch and all of numba, beside the opening of the capture."""
+    with without_garbage_collection():
+        import torch  # noqa: F401
+        from numba.core.registry import cpu_target
+
+        cpu_target.target_context.refresh()
+
+
 def _load_trainer_code(arguments: IngestArguments, run: RunFolder, console: Console) -> int:
     """Import torch, and set and return the number of threads."""
-    with exit_on_interrupt(console, PROGRAM, run.release), console.status("loading torch"):
+    with (
+        exit_on_interrupt(console, PROGRAM, run.release),
+        console.status("loading torch"),
+        without_garbage_collection(),
+    ):
         from instant_avatar.report import report_writer  # noqa: F401
         from instant_avatar.run.session_start import set_threads
 

@@ -155,13 +155,9 @@ class UnseenSkin:
         self._rig, self._frames = rig, _BoneFrames.of(rig)
         sides = rig.rest_joints[np.array(SIDES_OF_BODY)][..., 0]
         self._middle_x = float(sides.mean())
-        near = (rig.skin_distance <= CLOTHING_BAND_M).reshape(-1)
-        self._cells = np.flatnonzero(near)
-        self._shape = rig.skin_distance.shape
-        centers = np.stack(np.unravel_index(self._cells, rig.skin_distance.shape), axis=1) + 0.5
-        _, seed = KDTree(rig.seeds).query(rig.box_low + centers / rig.cells_per_m, workers=1)
-        self._seed_of_cell = np.full(near.size, -1, dtype=np.int32)
-        self._seed_of_cell[self._cells] = seed
+        self._cells, self._shape = rig.clothing_cells, rig.skin_distance.shape
+        self._seed_of_cell = np.full(rig.skin_distance.size, -1, dtype=np.int32)
+        self._seed_of_cell[self._cells] = rig.seed_of_clothing_cell
         one, other = KDTree(rig.seeds).query_pairs(NEIGHBOR_M, output_type="ndarray").T
         links = np.concatenate([one, other]), np.concatenate([other, one])
         shape = (len(rig.seeds), len(rig.seeds))
@@ -310,8 +306,9 @@ def find_sources(
             to = frames.to_bone(rig.seeds[here], parts[here])
             come = frames.to_bone(places[there], landed[there])
             along = 1.0 if part == HEAD else ALONG_BONE_FACTOR
-            away = (to[:, None, :] - come[None, :, :]) * (1.0, 1.0, along)
-            costs = np.linalg.norm(away, axis=2) + extra[there]
+            away = [np.subtract.outer(to[:, k], come[:, k]) for k in range(3)]  # not one array of
+            away[2] *= along  # threes, along whose short axis sums are slow
+            costs = np.sqrt(away[0] ** 2 + away[1] ** 2 + away[2] ** 2) + extra[there]
             costs += FACE_COST_M * (is_face[sources[there]][None] & ~is_face[here][:, None])
             chosen = costs.argmin(axis=1)
             least = costs[np.arange(len(here)), chosen]

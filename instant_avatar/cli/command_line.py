@@ -4,6 +4,7 @@ The first Ctrl-C requests a stop, the second one quits.
 """
 
 import errno
+import gc
 import inspect
 import os
 import re
@@ -81,6 +82,18 @@ def exit_on_interrupt(
 
     with handle_signals({signal.SIGINT: leave}):
         yield
+
+
+@contextmanager
+def without_garbage_collection() -> Iterator[None]:
+    """Collect no garbage during this block, which loads code: a fifth of the time of loading."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
 
 
 EXTRAS = {
