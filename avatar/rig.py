@@ -156,7 +156,8 @@ class Rig:
         """The seed nearest to the center of each of `clothing_cells`."""
         cells = np.stack(np.unravel_index(self.clothing_cells, self.skin_distance.shape), axis=1)
         tree = KDTree(self.seeds, leafsize=LEAF_VERTICES)
-        return tree.query(self.box_low + (cells + 0.5) / self.cells_per_m, workers=-1)[1]
+        centers = self.box_low + (cells + 0.5) / self.cells_per_m
+        return np.asarray(tree.query(centers, workers=-1)[1])
 
     def body_from_canonical(
         self, joint_rotations: Float[np.ndarray, "23 3"]
@@ -241,7 +242,8 @@ def skinning_weight_volume(
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     spacing = (high - low) / (np.array(shape) - 1.0)
     is_free = np.ones(shape, dtype=bool)
-    is_free[tuple(np.round((vertices - low) / spacing).astype(int).T)] = False
+    places = np.round((vertices - low) / spacing).astype(int).clip(0, np.array(shape) - 1)
+    is_free[tuple(places.T)] = False
     roughly_m = np.asarray(distance_transform_edt(is_free, sampling=spacing.tolist()))
     near = np.flatnonzero(roughly_m < reach_m + 0.51 * np.linalg.norm(spacing))
 
@@ -254,7 +256,7 @@ def skinning_weight_volume(
         within, far[chunk] = distance_m[:, 0] < reach_m, distance_m[:, 0] > SMOOTHED_BEYOND_M
         share = 1.0 / np.maximum(distance_m[within], MIN_VERTEX_DISTANCE_M) ** 2
         share /= share.sum(axis=1, keepdims=True)
-        blended = np.einsum("nk,nkj->nj", share, vertex_weights[index[within]])
+        blended = np.einsum("nk,nkj->nj", share, vertex_weights[np.asarray(index)[within]])
         weights[chunk[within]] = blended
     return _smooth_far_weights(weights.reshape(*shape, 24), far.reshape(*shape, 1))
 

@@ -4,7 +4,7 @@ import sys
 import time
 from collections.abc import Sequence
 from threading import Thread
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from instant_avatar.cli.command_line import (
     INTERRUPTED,
@@ -91,7 +91,8 @@ def _load_libraries() -> None:
         import torch  # noqa: F401
         from numba.core.registry import cpu_target
 
-        cpu_target.target_context.refresh()
+        context: Any = cpu_target.target_context
+        context.refresh()
 
 
 def _load_trainer_code(arguments: IngestArguments, run: RunFolder, console: Console) -> int:

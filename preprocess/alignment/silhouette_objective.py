@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from capture.input_error import InputError
-from capture.source import FrameSource
+from capture.source import Frame, FrameSource
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.body.body_pose import Motion
 from preprocess.body.body_surface import (
@@ -41,11 +41,15 @@ MAX_CACHED_POSES = 256
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MaskSample:
-    """One frame's reduced mask, in [0, 1], and the row of the frame's camera."""
+    """One frame's reduced mask, in [0, 1], and the row of the frame's camera.
+
+    `picture` is the frame, reduced like those of training, if it was decoded and is to be kept.
+    """
 
     index: int
     camera_row: int
     alpha: Float32[np.ndarray, "height width"]
+    picture: Frame | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

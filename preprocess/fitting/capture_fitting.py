@@ -184,19 +184,27 @@ def make_fitter(capture: Capture) -> ClipFitter | None:
     track = capture.motion.keypoints
     geometry, space = capture.geometry(), ProportionSpace.around(capture.shaped)
     count = TRACKED_KEY_FRAMES if track else KEY_FRAMES
-    outlines = _read_outlines(capture, geometry, count)
+    samples = {
+        sample.index: sample
+        for sample in read_silhouettes(capture, count)
+        if geometry.row_for_frame(sample.index) is not None
+    }
     others = _spread_frames(capture.source) if track is None else track.frames.tolist()
-    numbers = {*outlines, *others}
-    sizes = [each.camera.size_px for each in outlines.values()]
+    numbers = {*samples, *others}
+    sizes = [each.alpha.shape[::-1] for each in samples.values()]
     size_px = sizes[0] if sizes else _reduced_size_px(capture)
     camera_row, frames = associate_cameras(capture.cameras, capture.source), []
     for number in sorted(numbers - capture.cameras.frames_without_camera):
         row = geometry.row_for_frame(number)
         if row is not None:
-            mask = outlines.get(number)
-            camera = geometry.camera_at(camera_row(number), size_px)
-            frames.append(ClipFrame(row=row, number=float(number), camera=camera, mask=mask))
-    if len(frames) < MIN_FRAMES or (track is None and len(outlines) < MIN_FRAMES):
+            camera, sample = geometry.camera_at(camera_row(number), size_px), samples.get(number)
+            mask = picture = None
+            if sample is not None:
+                mask, picture = OutlineDistances.of(sample.alpha, camera), sample.picture
+            frames.append(
+                ClipFrame(row=row, number=float(number), camera=camera, mask=mask, picture=picture)
+            )
+    if len(frames) < MIN_FRAMES or (track is None and len(samples) < MIN_FRAMES):
         return None
     if track is None:
         return ClipFitter(capture.motion, space, frames)
@@ -206,7 +214,7 @@ def make_fitter(capture: Capture) -> ClipFitter | None:
         frames,
         track=track,
         frames_per_prior=TRACKED_FRAMES_PER_PRIOR,
-        weights=TRACKED_WEIGHTS if outlines else USUAL_WEIGHTS,
+        weights=TRACKED_WEIGHTS if samples else USUAL_WEIGHTS,
     )
 
 
@@ -237,19 +245,6 @@ def fitted_motion(capture: Capture, fit: CaptureFit) -> Motion:
     cameras = fit.scale_focal_lengths(capture.cameras)
     intrinsic = None if cameras.is_moving else cameras[0].intrinsic
     return replace(moved, betas=betas, proportions=fit.coefficients, intrinsic=intrinsic)
-
-
-def _read_outlines(
-    capture: Capture, geometry: CaptureGeometry, count: int
-) -> dict[int, OutlineDistances]:
-    """Outlines of evenly spread masks, by frame."""
-    return {
-        sample.index: OutlineDistances.of(
-            sample.alpha, geometry.camera_at(sample.camera_row, sample.alpha.shape[::-1])
-        )
-        for sample in read_silhouettes(capture, count)
-        if geometry.row_for_frame(sample.index) is not None
-    }
 
 
 def _reduction(capture: Capture, fitter: ClipFitter) -> float:

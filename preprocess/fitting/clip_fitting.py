@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from capture.camera import Camera
-from capture.source import ASSUMED_FPS
+from capture.source import ASSUMED_FPS, Frame
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.fitting.clip_poses import POSE_SIGMA, ClipPoses, GivenPosePrior, HumanPosePrior
@@ -61,12 +61,14 @@ class ClipFrame:
     """A frame whose pose is fitted: its row of the motion, and its number.
 
     The camera is of the reduced masks' size; without a mask the frame is not compared with one.
+    A picture is there if it was decoded for the mask and kept.
     """
 
     row: int
     number: float
     camera: Camera
     mask: OutlineDistances | None = None
+    picture: Frame | None = None
 
 
 class FitParameters(NamedTuple):

@@ -7,13 +7,14 @@ disagreement between the two.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from capture.input_error import InputError
+from capture.source import Frame
 from capture.source_opening import reopen
 from preprocess.alignment.silhouette_objective import spaced_indices
 from preprocess.capture_session import Capture
@@ -118,20 +119,22 @@ def _find_keypoints(
     zoom = float(np.exp(fitter.log_focal))
     persons = dict[int, PersonKeypoints]()
     times_s = dict[int, float]()
-    step = source.selection.step
-    for frame in reopen(source, slice(wanted[0], wanted[-1] + 1, step)).frames():
+    size_px, step = source.size_px, int(np.gcd.reduce(np.diff(wanted)))
+    pictures: Iterable[Frame] = [each.picture for each in frames if each.picture is not None]
+    if len(pictures) < len(frames):
+        pictures = reopen(source, slice(wanted[0], wanted[-1] + 1, step)).frames()
+    for frame in pictures:
         if frame.index not in wanted or "corrupt" in frame.flags:
             continue
-        camera = capture.cameras[camera_row(frame.index)].scale_focal(zoom)
+        size_px = frame.size_px
+        camera = capture.cameras[camera_row(frame.index)].scale_focal(zoom).resize(size_px)
         try:
             person, _ = find(frame.rgb, fitter.pose(places[frame.index]), camera)
         except InputError:  # the body is outside the image
             continue
         if person.presence >= MIN_PRESENCE:
             persons[frame.index], times_s[frame.index] = person, frame.time_s
-    return KeypointTrack.of(
-        list(persons), list(persons.values()), source.size_px, list(times_s.values())
-    )
+    return KeypointTrack.of(list(persons), list(persons.values()), size_px, list(times_s.values()))
 
 
 def _fit_keypoints(capture: Capture, fitter: ClipFitter, track: KeypointTrack) -> ClipFitter:

@@ -16,6 +16,9 @@ FIRST_FRAMES = 240
 decoding takes longest."""
 FIRST_SIZE_PX = 320
 """Longer side of the images in which they are estimated."""
+LEAST_PICTURE_PX, MOST_PICTURE_PX = 480, 960
+"""Longer side from and up to which reduced pictures are kept for the key points: the network sees
+them at 256 px, and 50 take 80 MB."""
 
 
 def read_first_silhouettes(capture: Capture, count: int) -> tuple[MaskSample, ...]:
@@ -65,7 +68,14 @@ def _observe(capture: Capture, count: int, total: int) -> tuple[MaskSample, ...]
     for each in map(observe, reopen(source, slice(start, stop, stride)).frames()):
         if isinstance(each, Observation):
             index = each.frame.index
-            samples.append(MaskSample(index=index, camera_row=camera_row(index), alpha=each.alpha))
+            longer, is_whole = max(each.frame.size_px), each.filmed_rgb is None
+            keeps = longer <= MOST_PICTURE_PX and (is_whole or longer >= LEAST_PICTURE_PX)
+            samples.append(
+                MaskSample(
+                    index=index, camera_row=camera_row(index), alpha=each.alpha,
+                    picture=each.frame if keeps else None,
+                )
+            )  # fmt: skip
         if not masks.needs_all_frames:
             break
     return reduce_masks(samples, source.size_px, OUTLINE_PERSON_PX) if samples else ()
