@@ -138,7 +138,7 @@ class FineTuningInputs:
     Attributes:
         settings: Tiers' settings, "hq" among them; rays of all tiers are learnt from, and judge.
         renderer: Renders the exact picture, on the caller's thread alone.
-        executor: Traces the player's rays meanwhile.
+        executor: Traces the player's rays meanwhile, those of the next picture, too.
     """
 
     tables: PlayerTables
@@ -161,17 +161,23 @@ class FineTuningInputs:
         called after each picture.
         """
         drawn = [list[tuple[TracedPicture, RgbaPicture]]() for _ in tiers]
+        traces = (
+            [self.executor.submit(self._trace, codes, settings, *view) for settings in tiers]
+            for view in views
+        )
+        ahead = next(traces, [])
         for pose, camera in views:
+            traced, ahead = ahead, next(traces, [])  # no thread waits for the renderer
             waiting = [
-                (parts, self.executor.submit(self._trace, codes, settings, pose, camera))
-                for parts, settings in zip(drawn, tiers, strict=True)
-                if sum(len(traced.segments.step_m) for traced, _ in parts) <= MAX_SEGMENTS
+                (parts, trace)
+                for parts, trace in zip(drawn, traced, strict=True)
+                if sum(len(each.segments.step_m) for each, _ in parts) <= MAX_SEGMENTS
             ]
             if not waiting:
                 break
             picture = self.renderer(pose, camera)
-            for parts, traced in waiting:
-                parts.append((traced.result(), picture))
+            for parts, trace in waiting:
+                parts.append((trace.result(), picture))
             on_picture()
         return [_join_targets(parts) for parts in drawn]
 
@@ -276,7 +282,9 @@ def fine_tune(
         update = solver.descend(codes, cells)
         if turn == FREE_ROUNDS - 1:
             price = MIN_ERROR_SHARE * _squared_error(first, pixels)
-            cells = share_codes_within_budget(tables.bricks, codes, update, baked, price)
+            cells = share_codes_within_budget(
+                tables.bricks, codes, update, baked, price, executor=inputs.executor
+            )
         del update
         progress(next(steps) / total)
     tuned = quantize_bricks(tables.bricks, codes, baked)

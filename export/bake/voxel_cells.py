@@ -6,7 +6,9 @@ Lookabaugh and Gray 1989, "Optimal pruning with applications to tree-structured 
 Differences between the voxels of a cell are 0 and hardly take bytes.
 """
 
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from itertools import repeat
 from typing import NamedTuple
 
 import numpy as np
@@ -174,18 +176,23 @@ def share_codes_within_budget(
     update: SirtUpdate,
     baked: Float32[np.ndarray, "voxels"],
     price: float,
+    *,
+    executor: Executor,
 ) -> list[VoxelCells]:
     """Share codes, in place, at higher prices until bricks fit into `MAX_BRICK_BYTES`.
 
     Returns the cells of each of the `brick_chunks`; arguments as of `choose_cells`, for all bricks.
     """
     shared = VoxelCodes(np.empty_like(codes.density), np.empty_like(codes.color))
+
+    def share(chunk: slice, price: float) -> VoxelCells:
+        known = codes.chunk(chunk), update.chunk(chunk), baked[chunk]
+        cells = choose_cells(*known, price)
+        shared.density[chunk], shared.color[chunk] = share_codes(*known, cells)
+        return cells
+
     for raised in price * PRICE_FACTOR ** np.arange(MAX_PRICES):
-        cells = list[VoxelCells]()
-        for chunk in brick_chunks(len(baked)):
-            known = codes.chunk(chunk), update.chunk(chunk), baked[chunk]
-            cells.append(choose_cells(*known, float(raised)))
-            shared.density[chunk], shared.color[chunk] = share_codes(*known, cells[-1])
+        cells = list(executor.map(share, brick_chunks(len(baked)), repeat(float(raised))))
         if estimate_brick_bytes(quantize_bricks(bricks, shared, baked)) <= MAX_BRICK_BYTES:
             break
     codes.density[:], codes.color[:] = shared

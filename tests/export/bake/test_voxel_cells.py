@@ -1,3 +1,5 @@
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
@@ -112,7 +114,10 @@ def test_chunks_do_not_change_shared_codes(tables, monkeypatch):
     for bricks in (1, 7, len(tables.bricks.voxels)):
         monkeypatch.setattr(voxel_cells, "CHUNK_BRICKS", bricks)
         codes = VoxelCodes(given.density.copy(), given.color.copy())
-        cells = share_codes_within_budget(tables.bricks, codes, update, given.density, 3e3)
+        with ThreadPoolExecutor(2) as executor:
+            cells = share_codes_within_budget(
+                tables.bricks, codes, update, given.density, 3e3, executor=executor
+            )
         assert len(cells) == len(brick_chunks(len(given.density)))
         results.append(codes)
     assert not np.array_equal(results[0].color, given.color)
