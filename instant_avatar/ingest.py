@@ -2,9 +2,8 @@
 
 import sys
 import time
-from collections.abc import Sequence
-from threading import Thread
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 from instant_avatar.cli.command_line import (
     INTERRUPTED,
@@ -19,6 +18,7 @@ from instant_avatar.cli.console import Console
 from instant_avatar.cli.shared_options import open_recording
 from instant_avatar.run.ingest_arguments import PROGRAM, VIEW_PORT, IngestArguments
 from instant_avatar.run.run_folder import RunFolder
+from instant_avatar.run.start_up import preparing_to_train
 from preprocess.capture_inputs import InputKind
 
 if TYPE_CHECKING:  # it imports torch
@@ -54,12 +54,14 @@ def ingest(
 
     run, read = arguments.run_folder(), inputs.input_paths()
     run.check_usable(read, resume=arguments.resume, overwrite=arguments.overwrite)
-    with run.claim(console, resume=arguments.resume, overwrite=arguments.overwrite):
+    with (
+        run.claim(console, resume=arguments.resume, overwrite=arguments.overwrite),
+        preparing_to_train(console) as wait,
+    ):
         command = arguments.as_json()
-        Thread(target=_load_libraries).start()
         threads = None
         if inputs.kind is InputKind.STREAMED:  # its frames come as soon as it is open
-            threads = _load_trainer_code(arguments, run, console)
+            threads = _load_trainer_code(arguments, run, console, wait)
 
         def show_tracked(frame: "Frame", person: "PersonKeypoints | None") -> None:
             from instant_avatar.run.session_events import Tracked
@@ -68,7 +70,7 @@ def ingest(
                 reader(Tracked(frame=frame, person=person))
 
         observations, before_fit = open_observations(arguments, inputs, run, console, show_tracked)
-        threads = threads or _load_trainer_code(arguments, run, console)
+        threads = threads or _load_trainer_code(arguments, run, console, wait)
         from instant_avatar.report.report_writer import ReportWriter
         from instant_avatar.run.session_start import run_session
 
@@ -85,27 +87,17 @@ def ingest(
         return INTERRUPTED if is_interrupted else code
 
 
-def _load_libraries() -> None:
-    """Import torch and all of numba, beside the opening of the capture."""
-    with without_garbage_collection():
-        import torch  # noqa: F401
-        from numba.core.registry import cpu_target
+def _load_trainer_code(
+    arguments: IngestArguments, run: RunFolder, console: Console, wait: Callable[[], None]
+) -> int:
+    """Import torch, and set and return the number of threads; `wait` for the kernels first."""
+    with exit_on_interrupt(console, PROGRAM, run.release):
+        wait()
+        with console.status("loading torch"), without_garbage_collection():
+            from instant_avatar.report import report_writer  # noqa: F401
+            from instant_avatar.run.session_start import set_threads
 
-        context: Any = cpu_target.target_context
-        context.refresh()
-
-
-def _load_trainer_code(arguments: IngestArguments, run: RunFolder, console: Console) -> int:
-    """Import torch, and set and return the number of threads."""
-    with (
-        exit_on_interrupt(console, PROGRAM, run.release),
-        console.status("loading torch"),
-        without_garbage_collection(),
-    ):
-        from instant_avatar.report import report_writer  # noqa: F401
-        from instant_avatar.run.session_start import set_threads
-
-        return set_threads(arguments.threads)
+            return set_threads(arguments.threads)
 
 
 if __name__ == "__main__":

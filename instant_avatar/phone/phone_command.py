@@ -113,6 +113,7 @@ def capture(options: CaptureOptions, console: Console) -> int:
         )
         from instant_avatar.phone.film_queue import FilmQueue
         from instant_avatar.phone.phone_server import PhoneServer
+        from instant_avatar.run.start_up import warm_up
 
         warm_up()
     options.out.mkdir(parents=True, exist_ok=True)
@@ -145,20 +146,6 @@ def capture(options: CaptureOptions, console: Console) -> int:
     finally:
         queue.end_all()
         server.close()
-
-
-def warm_up() -> None:
-    """Load the compiled kernels, so that the first film does not wait for them."""
-    from avatar.config import TrainConfig
-    from avatar.rig import Rig
-    from avatar.training import train
-    from avatar.training.trainer import Trainer
-    from export.bake import proxy_surface
-    from preprocess.body.parametric_body import load_body_model
-
-    rig = Rig.from_shaped_body(load_body_model(None).with_shape())
-    train.warm_up(Trainer(rig, TrainConfig()))
-    proxy_surface.warm_up()
 
 
 def _print_address(address: str, console: Console) -> None:
