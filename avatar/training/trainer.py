@@ -187,19 +187,15 @@ class Trainer:
             self._discard_old_corrections()
         return slot
 
-    def revise_pose(self, frame: int, pose: BodyPose, solved: CorrespondenceGrid) -> None:
-        """Gives a frame that replay holds a better pose of its tracker, without a correction.
-
-        `solved` are the pose's correspondences.
-        """
+    def revise_pose(self, frame: int, pose: BodyPose) -> None:
+        """Gives a frame that replay holds a better pose of its tracker, without a correction."""
         self.pose_corrections.pop(frame, None)
         if frame not in self.replay.frame_indices:
             return
-        slot = self.replay.frame_indices.index(frame)
-        self.replay.set_pose(slot, pose, self.avatar.rig)
-        self.poses.set_pose(slot, pose, frame=frame, step=self.steps)
-        self.replay.set_correspondences(slot, solved)
-        self.replay.correct_root(slot, self.poses.root_correction(slot))
+        slot, rig = self.replay.frame_indices.index(frame), self.avatar.rig
+        self.replay.set_pose(slot, pose, rig)
+        far = self.poses.replace_pose(slot, pose, frame=frame, step=self.steps)
+        move_correspondences(self.replay, self.poses, slot, far=far)
 
     @contextmanager
     def paused(self) -> Iterator[None]:

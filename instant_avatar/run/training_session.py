@@ -4,11 +4,9 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, replace
 from typing import Any, final
 
-from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.coverage import Coverage, coverage_advice
 from avatar.evaluation.held_out import PIXELS_PER_FRAME, HeldOutFrame, add_held_out
 from avatar.evaluation.image_metrics import overall_verdict
@@ -56,6 +54,9 @@ from preprocess.licence_chain import licence_chain
 from preprocess.observation import Observation
 from preprocess.observation_source import ObservationSource
 
+REVISED_PER_STEP = 2
+"""Frames whose poses are replaced between two steps; each solves its correspondences again."""
+
 
 @final
 class TrainingSession:
@@ -91,8 +92,6 @@ class TrainingSession:
         self.held_out: list[HeldOutFrame] = []
         self.newest_observation: Observation | None = None
         self._revised_poses: dict[int, BodyPose] = {}
-        self._solver = ThreadPoolExecutor(1, thread_name_prefix="revised poses")
-        self._solving: tuple[int, BodyPose, Future[CorrespondenceGrid]] | None = None
         self._checkpoints = CheckpointWriter(run, observations.capture)
         self.meter = StreamMeter(stop, observations.frames)
         self.coverage = Coverage(observations.capture.shaped)
@@ -163,7 +162,6 @@ class TrainingSession:
         finally:
             source.close()
             inbox.close()
-            self._solver.shutdown(cancel_futures=True)
             self._checkpoints.settle()
         self.meter.inbox_dropped, self.is_interrupted = inbox.dropped, self.stop.is_set()
         for message in [*source.warnings, *self.meter.lateness_warnings()]:
@@ -291,10 +289,7 @@ class TrainingSession:
         return seen
 
     def _revise_poses(self) -> None:
-        """Bring along the poses of earlier frames that a stream's later frames have improved.
-
-        Their correspondences are solved beside the steps.
-        """
+        """Bring along the poses of earlier frames that a stream's later frames have improved."""
         found = self._source.take_revised_poses()
         for place, frame in enumerate(self.held_out):
             pose = found.get(frame.observation.frame.index)
@@ -303,17 +298,9 @@ class TrainingSession:
                     frame, observation=replace(frame.observation, pose=pose)
                 )
         self._revised_poses |= found
-        if self._solving is not None and self._solving[2].done():
-            number, pose, solved = self._solving
-            self.trainer.revise_pose(number, pose, solved.result())
-            self._solving = None
-        while self._solving is None and self._revised_poses:
+        for _ in range(min(REVISED_PER_STEP, len(self._revised_poses))):
             number = next(iter(self._revised_poses))
-            pose = self._revised_poses.pop(number)
-            if number in self.trainer.replay.frame_indices:
-                rig, joints = self.trainer.avatar.rig, pose.joint_rotations
-                solved = self._solver.submit(CorrespondenceGrid.solve, rig, joints)
-                self._solving = number, pose, solved
+            self.trainer.revise_pose(number, self._revised_poses.pop(number))
 
     def _handle_event(self, event: TrainEvent, inbox: Inbox[StreamItem]) -> Iterator[SessionEvent]:
         """Keep count of an event, and pass it on with what follows from it."""

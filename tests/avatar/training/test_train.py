@@ -11,7 +11,6 @@ import pytest
 import torch
 
 from avatar.config import NOMINAL_STEPS_PER_S, TrainConfig
-from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.held_out import HeldOutFrame
 from avatar.events import Evaluated, Finished, FrameArrived, FrameLeftOut, Stepped, WaitingForFrame
 from avatar.render import render
@@ -418,9 +417,8 @@ def test_a_revised_pose_is_that_of_a_frame_that_came_with_it(rig, clip):
         trainer.add_frame(dataclasses.replace(frame, head=None))  # cut out where the pose was
     trainers[0].pose_corrections[one.frame.index] = np.ones((25, 3))
     trainers[0].poses.corrections[0] = 0.1
-    solved = CorrespondenceGrid.solve(rig, one.pose.joint_rotations)
-    trainers[0].revise_pose(one.frame.index, one.pose, solved)
-    trainers[0].revise_pose(999, one.pose, solved)  # a frame that the replay buffer does not hold
+    trainers[0].revise_pose(one.frame.index, one.pose)
+    trainers[0].revise_pose(999, one.pose)  # a frame that the replay buffer does not hold
     rays = [
         trainer.replay.sample_rays(64, torch.Generator().manual_seed(0)).rays
         for trainer in trainers

@@ -172,7 +172,7 @@ def test_a_stream_learns_from_given_masks_and_brings_poses_along(ingest_video, f
     monkeypatch.setattr(tracked_frames, "REVISED_FRAMES", 4)
     monkeypatch.setattr(MaskRefiner, "__call__", lambda *given: pytest.fail("a mask is refined"))
     revised = []
-    monkeypatch.setattr(Trainer, "revise_pose", lambda trainer, frame, *_: revised.append(frame))
+    monkeypatch.setattr(Trainer, "revise_pose", lambda trainer, frame, pose: revised.append(frame))
     done, out = ingest_video("--realtime", "--no-refine-masks", "--masks", filmed / "masks")
     assert done.code == 0, done.err
     assert json.loads((out / "report.json").read_text())["recipe"]["masks"] == "masks"
