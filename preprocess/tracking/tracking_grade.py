@@ -3,13 +3,12 @@
 No grade uses ground truth, so the same grades hold for any video.
 """
 
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from capture.camera import Camera
 from preprocess.alignment.capture_geometry import MIN_VIEW_COVERAGE, view_sector_share
@@ -23,8 +22,11 @@ MIN_IOU = 0.7
 """Least mean IoU of body and mask of poses that are good enough for an avatar."""
 DOUBTFUL_IOU = 0.65
 """IoU below which a frame is doubtful."""
-MIN_FOUND_SHARE = 0.7
-"""Least share of the frames in which the person must be found."""
+MAX_MISSED_SHARE = 0.3
+"""Largest share of the frames with the person in which the tracker may miss them."""
+ABSENCE_S = 1.0
+"""Length of a gap whose frames count half as missed, seconds: in longer ones the person is away, as
+before a title of an edited video."""
 MAX_DOUBTFUL_SHARE = 0.5
 """Largest share of doubtful frames of poses that are good enough for an avatar."""
 MIN_PERSON_PX = 96.0
@@ -67,7 +69,10 @@ class TrackingGrade:
     """Grades of tracked poses.
 
     Attributes:
-        doubtful_share: Share of frames that are doubtful; those without the person included.
+        missed_share: Share of frames that seem to show the person, but in which they were not found;
+            the longer a gap, the less so.
+        doubtful_share: Share of frames that seem to show the person, and are doubtful; missed ones
+            are.
         iou_mean, iou_worst: IoU of posed body and mask; NaN where no mask could be compared.
         jitter_mm: Median second difference of joints relative to the root, mm per frame squared.
         person_px: Median height of the person in the frames, px.
@@ -83,6 +88,7 @@ class TrackingGrade:
 
     frames: int
     found_share: float
+    missed_share: float
     doubtful_share: float
     iou_mean: float
     iou_worst: float
@@ -105,7 +111,7 @@ class TrackingGrade:
             objections.append(
                 f"{self.main_doubt} in {self.main_doubt_frames} of {self.frames} frames"
             )
-        if self.found_share < MIN_FOUND_SHARE:
+        if self.missed_share > MAX_MISSED_SHARE:
             objections.append(f"the person was found in only {self.found_share:.0%} of the frames")
         count = round(self.found_share * self.frames)
         if count < MIN_FRAMES:
@@ -190,14 +196,21 @@ def grade_tracking(
     """
     numbers = np.array(sorted(frame_times_s))
     reasons = _reasons_by_frame(keypoints, frame_times_s, iou_of_frame)
-    counts = Counter(each for number in numbers for each in reasons.get(int(number), ()))
-    ((main_doubt, main_doubt_frames),) = counts.most_common(1) or [("", 0)]
+    missed = _missed(numbers, np.array([frame_times_s[each] for each in numbers]), keypoints.frames)
+    shown = len(keypoints) + sum(missed.values())
+    doubts = {each: missed.get(each, 1.0) for each in reasons}
+    weights = dict.fromkeys((each for some in reasons.values() for each in some), 0.0)
+    for number, weight in doubts.items():
+        for reason in set(reasons[number]):
+            weights[reason] += weight
+    main_doubt = max(weights, key=weights.__getitem__, default="")
     ious = np.array([value for value in iou_of_frame.values() if np.isfinite(value)])
     heights, views = np.ptp(keypoints.image_px[:, :, 1], axis=1), _views(motion, camera)
     return TrackingGrade(
         frames=len(numbers),
         found_share=len(keypoints) / max(1, len(numbers)),
-        doubtful_share=float(np.mean([int(number) in reasons for number in numbers])),
+        missed_share=sum(missed.values()) / max(1.0, shown),
+        doubtful_share=sum(doubts.values()) / max(1.0, shown),
         iou_mean=float(ious.mean()) if len(ious) else float("nan"),
         iou_worst=float(ious.min()) if len(ious) else float("nan"),
         jitter_mm=_jitter_mm(motion, shaped),
@@ -206,7 +219,7 @@ def grade_tracking(
         breadth=_breadth(shaped) / _breadth(shaped.body.with_shape()),
         breadth_seen=_breadth_seen(views),
         main_doubt=main_doubt,
-        main_doubt_frames=main_doubt_frames,
+        main_doubt_frames=sum(main_doubt in some for some in reasons.values()),
         left_out=_frames_to_leave_out(keypoints, iou_of_frame),
         stretches=tuple(_stretches(numbers.tolist(), frame_times_s, reasons)),
         doubts={number: "; ".join(words) for number, words in reasons.items()},
@@ -237,6 +250,22 @@ def _reasons_by_frame(
             note((keypoints.problems & bit) > 0, problem.value)
     note(_jumps(keypoints), JUMPED)
     return reasons
+
+
+def _missed(
+    numbers: Int[np.ndarray, "frames"],
+    times_s: Float[np.ndarray, "frames"],
+    tracked: Int[np.ndarray, "rows"],
+) -> dict[int, float]:
+    """Degree to which each frame without a pose may show the person, in [0, 1], by its number."""
+    lost = ~np.isin(numbers, tracked)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], lost, [False]])))
+    weights: dict[int, float] = {}
+    for first, end in edges.reshape(-1, 2):
+        length_s = times_s[end - 1] - times_s[first]
+        degree = 1.0 / (1.0 + (length_s / ABSENCE_S) ** 2)
+        weights.update(dict.fromkeys(numbers[first:end].tolist(), float(degree)))
+    return weights
 
 
 def _frames_to_leave_out(

@@ -143,16 +143,29 @@ def test_frames_with_another_person_near_are_left_out_unless_they_are_most(shape
     assert grade(shaped, keypoints=most).left_out == ()
 
 
-def test_lost_frames_are_reported_by_their_time(shaped):
-    keep = np.r_[0:20, 35:FRAMES]
+def keypoints_in(rows) -> KeypointTrack:
     keypoints = some_keypoints()
-    some = replace(
-        keypoints,
-        **{
-            name: getattr(keypoints, name)[keep]
-            for name in ("frames", "image_px", "world_m", "visibility", "presence")
-        },
-    )
-    found = grade(shaped, keypoints=some)
+    names = ("frames", "image_px", "world_m", "visibility", "presence")
+    return replace(keypoints, **{name: getattr(keypoints, name)[rows] for name in names})
+
+
+def test_titles_before_and_after_the_person_are_no_objection(shaped):
+    """Ten seconds of titles are not ten seconds of a person who was missed."""
+    rows = np.r_[20:40]
+    times = {number: number * 10.0 / FPS for number in TIMES}
+    found = grade(shaped, keypoints=keypoints_in(rows), times=times)
+    assert found.found_share == pytest.approx(20 / 60)
+    assert found.missed_share < 0.05
+    assert found.is_good_enough
+
+
+def test_a_person_missed_in_every_other_frame_is_an_objection(shaped):
+    found = grade(shaped, keypoints=keypoints_in(np.r_[0:FRAMES:2]))
+    assert found.missed_share == pytest.approx(0.5)
+    assert "found in only 50% of the frames" in found.describe()
+
+
+def test_lost_frames_are_reported_by_their_time(shaped):
+    found = grade(shaped, keypoints=keypoints_in(np.r_[0:20, 35:FRAMES]))
     assert found.found_share == pytest.approx(45 / 60)
     assert found.stretches[0].describe().startswith("0.7 to 1.1 s")
