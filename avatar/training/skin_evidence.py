@@ -7,8 +7,9 @@ needs no image but the frame's mask.
 from dataclasses import replace
 from typing import final
 
+import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Float, Float32
 
 from avatar.rig import Rig
 from avatar.training.frame_stream import TrainingFrame
@@ -19,6 +20,9 @@ MIN_PERSON_ALPHA = 127
 UNSEEN_COSINE, SEEN_COSINE = 0.1, 0.4
 """Cosines between normal and view direction up to which a patch counts as not seen (84°), and from
 which it counts as seen (66°)."""
+BORDER_PX = 1.0, 5.0
+"""Distances from the person's outline up to which a pixel shows the background's color, and from
+which the skin's alone: a video has one color for each 2 x 2 pixels, and smears it."""
 DEPTH_UNKNOWN_SPREAD, DEPTH_KNOWN_SPREAD = 0.3, 0.8
 """Standard deviations of the directions from which a patch was seen, up to which its depth counts
 as unknown, and from which as known, radians: about those of a sixth of a turn, and of a whole."""
@@ -53,7 +57,9 @@ class SkinEvidence:
             return
         plane = in_camera[:, :2] / depths[:, None] * depths.mean()
         shown = visible_points(plane, depths, cosines)
-        shown &= _lies_in_mask(in_camera, frame)
+        within = _pixels_within_border(in_camera, frame)
+        shown &= within > 0.0
+        cosines = cosines * _smooth_step(within, *BORDER_PX)
         np.maximum(self.cosines, np.where(shown, cosines, 0.0), out=self.cosines)
         canonical = np.einsum("pab,pa->pb", blends[..., :3], to_camera)
         canonical /= np.maximum(np.linalg.norm(canonical, axis=1, keepdims=True), 1e-9)
@@ -84,14 +90,16 @@ def _smooth_step(
     return (share * share * (3.0 - 2.0 * share)).astype(np.float32)
 
 
-def _lies_in_mask(
+def _pixels_within_border(
     in_camera: Float[np.ndarray, "points 3"], frame: TrainingFrame
-) -> Bool[np.ndarray, "points"]:
-    """Mask of the points in camera axes that fall onto pixels of the person."""
+) -> Float32[np.ndarray, "points"]:
+    """Distance of points in camera axes to the person's outline, pixels; 0 beside the person."""
     camera = replace(frame.view.camera, camera_from_world=np.eye(4))
     width, height = camera.size_px
     column, row = np.floor(camera.project(in_camera)).astype(np.int64).T
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    alpha = np.zeros(width * height, dtype=np.uint8)
-    alpha[frame.view.near_person().reshape(-1)] = frame.colors[:, 3]
-    return inside & (alpha[(row * width + column) * inside] > MIN_PERSON_ALPHA)
+    near = frame.view.near_person()
+    alpha = np.zeros((height, width), dtype=np.uint8)
+    alpha[near] = frame.colors[:, 3] > MIN_PERSON_ALPHA
+    distances = cv2.distanceTransform(alpha, cv2.DIST_L2, 3)
+    return np.where(inside, distances.reshape(-1)[(row * width + column) * inside], 0.0)
