@@ -20,7 +20,7 @@ MIN_PERSON_ALPHA = 127
 UNSEEN_COSINE, SEEN_COSINE = 0.1, 0.4
 """Cosines between normal and view direction up to which a patch counts as not seen (84°), and from
 which it counts as seen (66°)."""
-BORDER_PX = 1.0, 5.0
+BORDER_PX = 0.5, 3.0
 """Distances from the person's outline up to which a pixel shows the background's color, and from
 which the skin's alone: a video has one color for each 2 x 2 pixels, and smears it."""
 DEPTH_UNKNOWN_SPREAD, DEPTH_KNOWN_SPREAD = 0.3, 0.8

@@ -49,8 +49,17 @@ UNSEEN_COST_M = 0.2
 """Cost of a source that is unseen itself, metres."""
 ALONG_BONE_FACTOR = 4.0
 """Factor of lengths along the bone; none of the head, whose hair comes from above."""
-FACE_MIN_NORMAL = -0.2
-"""Least forward component of a normal that belongs to a face; ears are part of it."""
+NECK_SHARE = 0.3
+"""Height of the neck's upper end, share of the head's height."""
+HAIRLINE_SHARES = 0.7, 0.92
+"""Heights from which hair covers the head's sides and the middle of its front, shares of its
+height."""
+HAIRLINE_WIDTH = 0.2
+"""Height below that over which a face begins, share of the head's."""
+EARS_BACK_SHARE, THROAT_BACK_SHARE = 0.33, 0.5
+"""Places behind which ears and throat end, shares of the head's depth from its back."""
+UPWARD_FACTOR = 3.0
+"""Factor of the head's lengths from a source up to a patch: hair falls, and skin does not rise."""
 MAX_COST_M = 0.6
 """Cost from which a source counts nothing, metres; its weight falls from half of it on."""
 MIN_SOURCE_SEEN = 0.5
@@ -196,8 +205,7 @@ class UnseenSkin:
         `strength` is the share, in [0, 1], by which the body's face is to be believed.
         """
         rig, seed = self._rig, self._seed_of_cell[self._cells]
-        is_face = _faces(self._frames, rig)
-        unknown = (strength * is_face * (1.0 - self.evidence.depth_known))[seed]
+        unknown = (strength * _faces(self._frames, rig) * (1.0 - self.evidence.depth_known))[seed]
         distance = rig.skin_distance.reshape(-1)[self._cells]
         is_inside = rig.inside_skin.reshape(-1)[self._cells]
         reach = CLOTHING_BAND_M + (FACE_REACH_M - CLOTHING_BAND_M) * unknown
@@ -249,7 +257,8 @@ class UnseenSkin:
         normal, place = rig.seed_normals[landed], rig.seeds[landed]
         lift = heights - ((at - place) * normal).sum(axis=1)
         along = self._frames.axes[rig.seed_parts[target], 2]
-        slide = ((points - place) * along).sum(axis=1, keepdims=True) * along
+        start = np.where((parts == HEAD)[:, None], rig.seeds[seeds], place)  # hair is from above
+        slide = ((points - start) * along).sum(axis=1, keepdims=True) * along
         around = place + slide + heights[:, None] * normal
         there = np.where(
             np.isin(reflection, (2, 3))[:, None],
@@ -289,7 +298,7 @@ def find_sources(
     parts = rig.seed_parts.astype(np.int64)
     best, cost = np.zeros(len(parts), dtype=np.int64), np.full(len(parts), np.inf)
     kind = np.zeros(len(parts), dtype=np.int64)
-    is_face = _faces(frames, rig)
+    face = _faces(frames, rig)
     sources = np.flatnonzero(seen > MIN_SOURCE_SEEN)
     for reflection in range(4):
         places = reflect(
@@ -305,11 +314,14 @@ def find_sources(
                 continue
             to = frames.to_bone(rig.seeds[here], parts[here])
             come = frames.to_bone(places[there], landed[there])
-            along = 1.0 if part == HEAD else ALONG_BONE_FACTOR
-            away = [np.subtract.outer(to[:, k], come[:, k]) for k in range(3)]  # not one array of
-            away[2] *= along  # threes, along whose short axis sums are slow
+            # one array of threes would be slower: sums along its short axis
+            away = [np.subtract.outer(to[:, k], come[:, k]) for k in range(3)]
+            if part == HEAD:
+                away[2] *= np.where(away[2] > 0.0, UPWARD_FACTOR, 1.0)
+            else:
+                away[2] *= ALONG_BONE_FACTOR
             costs = np.sqrt(away[0] ** 2 + away[1] ** 2 + away[2] ** 2) + extra[there]
-            costs += FACE_COST_M * (is_face[sources[there]][None] & ~is_face[here][:, None])
+            costs += FACE_COST_M * np.maximum(0.0, face[sources[there]] - face[here][:, None])
             chosen = costs.argmin(axis=1)
             least = costs[np.arange(len(here)), chosen]
             better = least < cost[here]
@@ -321,10 +333,16 @@ def find_sources(
     return Sources(best, kind, weight.astype(np.float32))
 
 
-def _faces(frames: _BoneFrames, rig: Rig) -> Bool[np.ndarray, "seeds"]:
-    """Mask of the patches of a face: the head's front, below the hairline."""
-    local = frames.to_bone(rig.seeds, rig.seed_parts)
+def _faces(frames: _BoneFrames, rig: Rig) -> Float[np.ndarray, "seeds"]:
+    """Degree to which patches belong to a face with ears, chin and throat, in [0, 1]."""
+    forward, aside, height = frames.to_bone(rig.seeds, rig.seed_parts).T
     head = rig.seed_parts == HEAD
-    height = local[:, 2]
-    top = height[head].max() if head.any() else 0.0
-    return head & (rig.seed_normals[:, 2] > FACE_MIN_NORMAL) & (height < 0.8 * top)
+    if not head.any():
+        return np.zeros(len(head))
+    forward = (forward - forward[head].min()) / np.ptp(forward[head])
+    height = height / height[head].max()
+    behind = np.where(height > NECK_SHARE, EARS_BACK_SHARE, THROAT_BACK_SHARE)
+    middle = 1.0 - (aside / np.abs(aside[head]).max()) ** 2
+    hairline = np.interp(forward * middle, (0.0, 1.0), HAIRLINE_SHARES)
+    below = np.clip((hairline - height) / HAIRLINE_WIDTH, 0.0, 1.0)
+    return np.where(head & (forward > behind), below, 0.0)
