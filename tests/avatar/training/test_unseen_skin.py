@@ -11,7 +11,7 @@ from avatar.training import checkpoint
 from avatar.training.frame_stream import prepare_frame
 from avatar.training.skin_evidence import SkinEvidence
 from avatar.training.trainer import Trainer, cosine_decay
-from avatar.training.unseen_skin import FACE_MIN_NORMAL, HEAD, MIN_WEIGHT, UnseenSkin
+from avatar.training.unseen_skin import HEAD, MIN_WEIGHT, UnseenSkin
 from preprocess.body.kinematics import HEAD_JOINT
 
 TORSO, LEFT_THIGH, LEFT_FOREARM, RIGHT_FOREARM = 0, 1, 10, 11
@@ -109,13 +109,29 @@ def test_the_back_is_drawn_to_the_front_and_the_front_to_nothing(rig, of_front):
     assert np.abs(apart[:, 1]).mean() < 0.03  # stripes go round
 
 
-def test_a_back_of_the_head_is_no_face(rig, of_front):
-    behind = facing(rig, HEAD, -1.0)
-    sources = rig.seed_normals[of_front.sources.patch[behind], 2]
-    cheeks = (
-        rig.seeds[of_front.sources.patch[behind], 1] < rig.seeds[rig.seed_parts == HEAD, 1].mean()
-    )
-    assert ((sources < FACE_MIN_NORMAL) | ~cheeks).mean() > 0.9
+def test_the_back_of_a_head_is_drawn_to_hair_and_never_to_a_face(rig, of_front, generator):
+    head = rig.seeds[rig.seed_parts == HEAD]
+    low, top, middle = head[:, 1].min(), head[:, 1].max(), 0.5 * (head[:, 2].min() + head[:, 2].max())
+    pairs = of_front.sample(40_000, generator).points.numpy()
+    points, sources = np.split(pairs, 2)
+    heights = (points[:, 1] - low) / (top - low)
+    behind = (heights > 0.5) & (heights < 1.0) & (points[:, 2] < middle - 0.03)
+    assert behind.sum() > 300
+    of_face = (sources[:, 2] > middle) & (sources[:, 1] < low + 0.7 * (top - low))
+    assert of_face[behind].mean() < 0.02
+    assert (sources[behind, 1] > points[behind, 1]).mean() > 0.6  # it falls
+
+
+def test_skin_at_the_outline_of_a_person_is_seen_less(rig, frame):
+    """Its pixels carry the background's color."""
+    alpha = np.zeros((200, 200), dtype=np.float32)
+    torso, seen = facing(rig, TORSO, 1.0), []
+    for columns in (slice(98, 102), slice(94, 106), slice(0, 200)):
+        alpha[:, columns] = 1.0
+        evidence = SkinEvidence(rig)
+        evidence.add(frame(alpha=alpha))
+        seen.append(evidence.seen[torso].mean())
+    assert 0.0 < seen[0] < 0.5 * seen[1] < 0.5 * seen[2]
 
 
 def test_a_hidden_arm_looks_like_the_other_one(rig, frame):
