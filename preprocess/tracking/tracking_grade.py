@@ -69,8 +69,8 @@ class TrackingGrade:
     """Grades of tracked poses.
 
     Attributes:
-        missed_share: Share of frames that seem to show the person, but in which they were not found;
-            the longer a gap, the less so.
+        missed_share: Share of frames that seem to show the person, but in which they were not
+            found; the longer a gap, the less so.
         doubtful_share: Share of frames that seem to show the person, and are doubtful; missed ones
             are.
         iou_mean, iou_worst: IoU of posed body and mask; NaN where no mask could be compared.

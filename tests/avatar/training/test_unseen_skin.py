@@ -111,7 +111,8 @@ def test_the_back_is_drawn_to_the_front_and_the_front_to_nothing(rig, of_front):
 
 def test_the_back_of_a_head_is_drawn_to_hair_and_never_to_a_face(rig, of_front, generator):
     head = rig.seeds[rig.seed_parts == HEAD]
-    low, top, middle = head[:, 1].min(), head[:, 1].max(), 0.5 * (head[:, 2].min() + head[:, 2].max())
+    low, top = head[:, 1].min(), head[:, 1].max()
+    middle = 0.5 * (head[:, 2].min() + head[:, 2].max())
     pairs = of_front.sample(40_000, generator).points.numpy()
     points, sources = np.split(pairs, 2)
     heights = (points[:, 1] - low) / (top - low)
