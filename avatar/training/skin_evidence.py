@@ -30,7 +30,10 @@ as unknown, and from which as known, radians: about those of a sixth of a turn, 
 
 @final
 class SkinEvidence:
-    """Largest cosine at which each patch of a rig's skin was seen, in [0, 1]; 0 if it never was."""
+    """Largest cosine at which each patch of a rig's skin was seen, in [0, 1]; 0 if it never was.
+
+    It is reduced near the person's outline (`BORDER_PX`).
+    """
 
     cosines: Float32[np.ndarray, "seeds"]
 

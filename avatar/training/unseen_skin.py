@@ -55,11 +55,11 @@ HAIRLINE_SHARES = 0.7, 0.92
 """Heights from which hair covers the head's sides and the middle of its front, shares of its
 height."""
 HAIRLINE_WIDTH = 0.2
-"""Height below that over which a face begins, share of the head's."""
+"""Height below the hairline over which a face begins, share of the head's height."""
 EARS_BACK_SHARE, THROAT_BACK_SHARE = 0.33, 0.5
-"""Places behind which ears and throat end, shares of the head's depth from its back."""
+"""Where ears and throat end, shares of the head's depth from its back."""
 UPWARD_FACTOR = 3.0
-"""Factor of the head's lengths from a source up to a patch: hair falls, and skin does not rise."""
+"""Factor of the height by which a source lies below its patch on a head: hair hangs down."""
 MAX_COST_M = 0.6
 """Cost from which a source counts nothing, metres; its weight falls from half of it on."""
 MIN_SOURCE_SEEN = 0.5
@@ -257,7 +257,8 @@ class UnseenSkin:
         normal, place = rig.seed_normals[landed], rig.seeds[landed]
         lift = heights - ((at - place) * normal).sum(axis=1)
         along = self._frames.axes[rig.seed_parts[target], 2]
-        start = np.where((parts == HEAD)[:, None], rig.seeds[seeds], place)  # hair is from above
+        # a head's source keeps its height, from which hair hangs down
+        start = np.where((parts == HEAD)[:, None], rig.seeds[seeds], place)
         slide = ((points - start) * along).sum(axis=1, keepdims=True) * along
         around = place + slide + heights[:, None] * normal
         there = np.where(

@@ -112,7 +112,10 @@ class TrackingGrade:
                 f"{self.main_doubt} in {self.main_doubt_frames} of {self.frames} frames"
             )
         if self.missed_share > MAX_MISSED_SHARE:
-            objections.append(f"the person was found in only {self.found_share:.0%} of the frames")
+            objections.append(
+                f"the person was missed in {self.missed_share:.0%} of the frames that seem to "
+                "show them"
+            )
         count = round(self.found_share * self.frames)
         if count < MIN_FRAMES:
             objections.append(f"too few frames show the person: {count} (expected {MIN_FRAMES})")

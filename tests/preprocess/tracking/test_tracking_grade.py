@@ -162,7 +162,7 @@ def test_titles_before_and_after_the_person_are_no_objection(shaped):
 def test_a_person_missed_in_every_other_frame_is_an_objection(shaped):
     found = grade(shaped, keypoints=keypoints_in(np.r_[0:FRAMES:2]))
     assert found.missed_share == pytest.approx(0.5)
-    assert "found in only 50% of the frames" in found.describe()
+    assert "missed in 50% of the frames" in found.describe()
 
 
 def test_lost_frames_are_reported_by_their_time(shaped):
