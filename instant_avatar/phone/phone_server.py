@@ -24,8 +24,9 @@ from instant_avatar.phone.film_queue import Film, FilmQueue, FilmRefused
 
 PAGE = Path(__file__).with_name("page")
 """Folder of the page's own files."""
-COOKIE = "session"
-"""Name of the cookie that a browser gets for its token."""
+COOKIES = {False: "session", True: "session-tls"}
+"""Cookie that a browser gets for its token, by whether the page has TLS: ports share cookies, and a
+page without TLS may not replace one of a page with it."""
 MAX_PIECE_BYTES = 8 << 20
 """Largest piece of a film, bytes."""
 MAX_REQUESTS_PER_S = 60
@@ -68,6 +69,7 @@ class PhoneServer:
         self._pages: dict[str, tuple[float, dict[str, bytes]]] = {}
         self._module = b""
         self._requests: dict[str, deque[float]] = {}
+        self._exporting = asyncio.Lock()  # meshes are costly: one at a time
         self._listeners: dict[str, set[asyncio.Event]] = {}
         self._app = web.Application(client_max_size=MAX_PIECE_BYTES, middlewares=[self._guard])
         self._app.add_routes(
@@ -116,7 +118,7 @@ class PhoneServer:
         handler: Callable[[web.Request], Awaitable[web.StreamResponse]],
     ) -> web.StreamResponse:
         """Refuse browsers without a session, pages of other sites, and more than the limits."""
-        session = request.cookies.get(COOKIE, "")
+        session = _session(request)
         try:
             if request.path == "/" and "token" in request.query:
                 return self._enter(request)
@@ -132,10 +134,10 @@ class PhoneServer:
             answer = web.json_response({"message": str(refused)}, status=refused.status)
         except InputError as error:
             answer = web.json_response({"message": str(error)}, status=404)
-        except (ValueError, KeyError, TypeError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             answer = web.json_response({"message": f"Malformed: {error}"}, status=400)
-        except ConnectionError as error:  # the answer reaches no one
-            answer = web.json_response({"message": f"The connection broke: {error}"}, status=400)
+        except (ConnectionError, TimeoutError) as error:  # most often the answer reaches no one
+            answer = web.json_response({"message": f"The connection broke: {error}"}, status=504)
         if not answer.prepared:
             for name, value in HEADERS.items():
                 answer.headers.setdefault(name, value)
@@ -146,8 +148,8 @@ class PhoneServer:
         if session is None:
             raise FilmRefused(403, REFUSED)
         answer = web.Response(status=303, headers={"Location": "/", **HEADERS})
-        answer.set_cookie(
-            COOKIE, session, httponly=True, samesite="Strict", secure=request.secure, path="/"
+        answer.set_cookie(  # a strict one is not sent on the way to the page with TLS
+            COOKIES[request.secure], session, httponly=True, samesite="Lax", secure=request.secure
         )
         self.on_entered()
         return answer
@@ -189,7 +191,7 @@ class PhoneServer:
         return web.Response(body=self._module, headers=HEADERS | KEPT)
 
     def _film(self, request: web.Request) -> Film:
-        return self._queue.find(request.match_info["number"], request.cookies[COOKIE])
+        return self._queue.find(request.match_info["number"], _session(request))
 
     async def _begin(self, request: web.Request) -> web.Response:
         given = await request.json()
@@ -197,7 +199,7 @@ class PhoneServer:
         if size is not None and (not isinstance(size, int) or isinstance(size, bool)):
             raise ValueError("size is a number of bytes, or null")
         film = self._queue.begin(
-            request.cookies[COOKIE],
+            _session(request),
             name=str(given.get("name", "")), kind=str(given["type"]), size=size,
             avatar=str(given.get("avatar") or ""),
         )  # fmt: skip
@@ -279,7 +281,8 @@ class PhoneServer:
             return web.FileResponse(package, headers=saved | HEADERS)
         if file in ("avatar.glb", "avatar.ply", "avatar.obj", "avatar.vrm"):
             author = request.query.get("author", "").strip()[:MAX_AUTHOR_LENGTH]
-            content = await asyncio.to_thread(_mesh, package, file, author)
+            async with self._exporting:
+                content = await asyncio.to_thread(_mesh, package, file, author)
             return web.Response(body=content, headers=saved)
         if file == "poster.png":
             content = await asyncio.to_thread(lambda: read_package(package).preview)
@@ -294,6 +297,10 @@ class PhoneServer:
             raise InputError("There is no such file.")
         kind = MIME_TYPES.get(Path(file).suffix, "application/octet-stream")
         return web.Response(body=files[file], headers={"Content-Type": kind})
+
+
+def _session(request: web.Request) -> str:
+    return request.cookies.get(COOKIES[request.secure], "")
 
 
 def _player_page(package: Path, name: str) -> dict[str, bytes]:

@@ -6,7 +6,7 @@ const $ = (id) => document.getElementById(id);
 const COUNTDOWN_S = 5;
 const PIECE_MS = 100; // length of what the camera hands over at once
 const SPOKEN_AGAIN_MS = 9000;
-const KINDS = ["video/webm;codecs=h264", "video/webm;codecs=vp8", "video/mp4;codecs=avc1.42E01E", "video/webm", "video/mp4"];
+const KINDS = ["video/webm;codecs=h264", "video/mp4;codecs=avc1.42E01E", "video/webm;codecs=vp8", "video/webm", "video/mp4"];
 let adding = "", facing = "environment", stream = null, shown = "";
 
 function view(name) {
@@ -100,6 +100,7 @@ async function live() {
     location.href = "live";
     return;
   }
+  window.speechSynthesis?.speak(new SpeechSynthesisUtterance("")); // iOS speaks only once it has in a tap
   try {
     $("stage").classList.remove("ended"); $("stop").hidden = true; $("turn").hidden = false;
     await openCamera();

@@ -10,6 +10,9 @@ import pytest
 from capture.input_error import InputError
 from capture.source_opening import open_source
 from export import player_page
+from instant_avatar.phone.access_control import AccessControl, made_certificate
+from instant_avatar.phone.film_queue import FilmQueue
+from instant_avatar.phone.phone_server import PhoneServer
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 from tests.instant_avatar.browser import Browser, chromium, until
 
@@ -49,6 +52,24 @@ def camera_film(tmp_path_factory):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(rgb, format="rgb24")))
         container.mux(stream.encode())
     return path
+
+
+def test_the_plain_page_leads_to_that_with_tls_and_opens_again_after_it(tmp_path):
+    port = 8741
+    flags = ["--ignore-certificate-errors"]  # a person would choose to go on
+    with Browser(tmp_path / "browser", size=(360, 740), flags=flags) as browser:
+        for _ in range(2):  # the second time beside the cookies of the first
+            access = AccessControl()
+            server = PhoneServer(FilmQueue(tmp_path, 30.0), access, port + 1)
+            server.start("127.0.0.1", [(port, None), (port + 1, made_certificate("127.0.0.1"))])
+            try:
+                browser.go(f"http://127.0.0.1:{port}/?token={access.token}")
+                until(lambda: "Film an avatar" in browser.text(), 60.0)
+                browser.run("location.href = 'live'")
+                until(lambda: browser.run("location.protocol") == "https:", 60.0)
+                until(lambda: "Film an avatar" in browser.text(), 60.0)
+            finally:
+                server.close()
 
 
 def test_a_film_of_the_pages_camera_becomes_an_avatar_in_its_player(camera_film, tmp_path):

@@ -11,8 +11,11 @@ import pytest
 
 pytest.importorskip("aiohttp")
 
+from cryptography import x509
+from cryptography.x509.oid import ExtendedKeyUsageOID
+
 from capture.input_error import InputError
-from instant_avatar.phone import film_queue, phone_server
+from instant_avatar.phone import access_control, film_queue, phone_server
 from instant_avatar.phone.access_control import (
     AccessControl,
     load_certificate,
@@ -141,6 +144,29 @@ def test_films_that_cannot_be_are_refused(phone, given, status):
     assert phone.ask("POST", "/films", json.dumps(note)).status == status
 
 
+@pytest.mark.parametrize("body", ["[]", "5", "null", '"x"', "[" * 100_000, "{"])
+def test_what_is_no_note_of_a_film_is_malformed(phone, body, caplog):
+    answer = phone.ask("POST", "/films", body)
+    assert answer.status == 400
+    assert json.loads(answer.content)["message"].startswith("Malformed")
+    assert caplog.records == []
+
+
+def test_a_piece_that_takes_too_long_keeps_what_came(phone, monkeypatch, caplog):
+    monkeypatch.setattr(phone_server, "PIECE_TIMEOUT_S", 0.2)
+    film = phone.begin()
+    line = http.client.HTTPConnection("127.0.0.1", phone.port, timeout=120.0)
+    line.putrequest("PUT", f"/films/{film}?offset=0")
+    for name, value in (("Cookie", phone.cookie), ("Origin", f"http://{phone.host}"),
+                        ("Content-Length", "100")):  # fmt: skip
+        line.putheader(name, value)
+    line.endheaders(CONTENT[:10])
+    assert line.getresponse().status == 504  # after which the page goes on where it stopped
+    line.close()
+    assert json.loads(phone.ask("GET", f"/films/{film}").content)["next"] == 10
+    assert caplog.records == []
+
+
 def test_names_are_no_paths(phone, queue):
     phone.begin(name="../../evil/../name")
     film = next(iter(queue))
@@ -198,8 +224,17 @@ def test_too_many_requests_must_wait(phone, monkeypatch):
 
 
 @pytest.mark.parametrize("address", ["192.168.0.7", "localhost", "studio.local"])
-def test_a_certificate_is_made_for_an_address_or_a_name(address):
-    assert made_certificate(address).cert_store_stats() is not None
+def test_a_certificate_is_made_for_an_address_or_a_name(address, monkeypatch):
+    made = []
+
+    def load(path, key):
+        made.append(x509.load_pem_x509_certificate(path.read_bytes()).extensions)
+        return load_certificate(path, key)
+
+    monkeypatch.setattr(access_control, "load_certificate", load)
+    made_certificate(address)
+    (usage,) = made[0].get_extension_for_class(x509.ExtendedKeyUsage).value
+    assert usage == ExtendedKeyUsageOID.SERVER_AUTH  # Apple's systems ask for it
 
 
 def test_what_is_no_certificate_is_bad_input(tmp_path):
