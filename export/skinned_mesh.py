@@ -8,7 +8,12 @@ from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.spatial import KDTree
 
-from export.bake.voxel_grid import extract_isosurface, remove_floaters_and_cavities, resample_grid
+from export.bake.voxel_grid import (
+    extract_isosurface,
+    fill_cavities,
+    remove_floaters_and_cavities,
+    resample_grid,
+)
 from export.mesh_texture import Texture, draw_texture, unwrap
 from export.package.player_tables import (
     BRICK_SIZE,
@@ -34,8 +39,6 @@ BLUR_VOXELS = 0.75
 """Standard deviation of the blur before the level set is extracted, voxels."""
 CODE_CONTRAST = 40.0
 """Density codes above and below the level to which densities are clipped."""
-MIN_VOLUME_FRACTION = 0.002
-"""Least volume of a part as a fraction of the largest one's; smaller ones are floaters."""
 NORMAL_SMOOTHINGS = 6
 """Averagings of normals over adjacent vertices, as a trained field is not quite smooth."""
 COLOR_STEP_M = 0.002
@@ -72,23 +75,44 @@ class SkinnedMesh:
     texture: Texture | None = None
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LevelSet:
+    """Where bricks are as dense as at the surface.
+
+    Attributes:
+        codes: Colors and density codes of all bricks.
+        heights: Positive inside of the surface.
+        low: Position of the first node, metres.
+    """
+
+    codes: UInt8[np.ndarray, "x y z 4"]
+    heights: Float32[np.ndarray, "x y z"]
+    low: Float32[np.ndarray, "3"]
+
+    @classmethod
+    def of(cls, bricks: BrickTable, density: float = SURFACE_DENSITY) -> "LevelSet":
+        """The level set of baked bricks at a density (1/m)."""
+        codes, low = _dense_grid(bricks)
+        return cls(codes=codes, heights=_level_function(codes[..., 3], density), low=low)
+
+
 def extract_mesh(
     tables: PlayerTables,
+    level: LevelSet | None = None,
     *,
     spacing_m: float = VERTEX_SPACING_M,
-    density: float = SURFACE_DENSITY,
     triangles: int | None = None,
     textured: bool = False,
 ) -> SkinnedMesh:
-    """Extract the surface of baked bricks at a density (1/m), a vertex about every `spacing_m`.
+    """Extract the surface of baked bricks, a vertex about every `spacing_m`.
 
     It is simplified to `triangles` (quadric error metrics, Garland and Heckbert 1997; needs
-    fast-simplification) unless that is None.
+    fast-simplification) unless that is None. Give `level` if it is known.
     """
-    codes, low = _dense_grid(tables.bricks)
-    voxel_m = tables.bricks.voxel_m
+    level = level or LevelSet.of(tables.bricks)
+    codes, low, voxel_m = level.codes, level.low, tables.bricks.voxel_m
     step = spacing_m / voxel_m
-    nodes, faces = extract_isosurface(resample_grid(_level_function(codes[..., 3], density), step))
+    nodes, faces = extract_isosurface(resample_grid(level.heights, step))
     nodes *= np.float32(step)
     positions = (low + nodes * np.float32(voxel_m)).astype(np.float32)
     normals = _smooth_normals(positions, faces)
@@ -146,10 +170,7 @@ def _level_function(
 ) -> Float32[np.ndarray, "x y z"]:
     """Return a function that is positive inside: log-density over the level, without floaters."""
     level, haze = density_code(np.array([density, HAZE_DENSITY])).astype(np.float32)
-    solid = remove_floaters_and_cavities(
-        (codes > level) | _solid_interior(codes > haze),
-        MIN_VOLUME_FRACTION,
-    )
+    solid = remove_floaters_and_cavities((codes > level) | _solid_interior(codes > haze))
     height = codes.astype(np.float32) - level
     height = np.where(solid, np.maximum(height, 1.0), np.minimum(height, -1.0))
     return ndimage.gaussian_filter(
@@ -160,8 +181,7 @@ def _level_function(
 def _solid_interior(cover: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
     """Mark what lies well below a cover with holes."""
     closed = ndimage.binary_closing(cover, iterations=CLOSING_VOXELS)
-    filled = ndimage.binary_fill_holes(closed)
-    return np.asarray(ndimage.binary_erosion(filled, iterations=SOLID_DEPTH_VOXELS))
+    return np.asarray(ndimage.binary_erosion(fill_cavities(closed), iterations=SOLID_DEPTH_VOXELS))
 
 
 def skinning_weights(

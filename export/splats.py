@@ -13,11 +13,12 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
+from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from export.package.player_tables import PlayerTables
-from export.skinned_mesh import extract_mesh
+from export.skinned_mesh import LevelSet, SkinnedMesh, extract_mesh
 
 
 class Shell(NamedTuple):
@@ -44,6 +45,11 @@ SHELLS = (
     Shell(0.012, 0.02, 0.016, 0.0005, 0.95),
 )
 """From the outermost, chosen by pictures from 1.4 to 7 mm a pixel (dev/log/player.md)."""
+MAX_CROSSED_M2 = 3.85
+"""Area of the voxels' faces between in and out, square metres, from which on Gaussians lie farther
+apart, as in wide clothes: a `.ply` has at most 12 MB."""
+MIN_SCALE_M = 1e-6
+"""Least standard deviation, where a pose flattens one."""
 SPREAD = 0.6
 """Standard deviation along the surface, in distances of neighbors: less shows gaps."""
 VIEWER_BLUR_M = 0.003
@@ -84,10 +90,17 @@ def build_splats(
     tables: PlayerTables, bones: Float[np.ndarray, "24 4 4"] | None = None
 ) -> GaussianSplats:
     """Lay Gaussians under the surface of baked bricks, moved by world-from-canonical matrices."""
-    surface = KDTree(extract_mesh(tables, spacing_m=SHELLS[0].spacing_m).positions)
-    parts = [_lay_shell(tables, shell, surface, bones) for shell in SHELLS]
+    level = LevelSet.of(tables.bricks)
+    crossings = sum(np.count_nonzero(np.diff(level.heights > 0.0, axis=axis)) for axis in range(3))
+    wider = max(1.0, np.sqrt(crossings * tables.bricks.voxel_m**2 / MAX_CROSSED_M2))
+    meshes = [extract_mesh(tables, level, spacing_m=wider * shell.spacing_m) for shell in SHELLS]
+    surface = KDTree(meshes[0].positions)
+    parts = [
+        _lay_shell(mesh, shell, surface, bones) for mesh, shell in zip(meshes, SHELLS, strict=True)
+    ]
     positions, axes, colors, opacities = (np.concatenate(each) for each in zip(*parts, strict=True))
-    turned, scales, _ = np.linalg.svd(axes)
+    squares, turned = np.linalg.eigh(axes @ axes.swapaxes(1, 2))
+    scales = np.sqrt(np.maximum(squares, MIN_SCALE_M**2))
     turned[np.linalg.det(turned) < 0.0, :, 2] *= -1.0
     rotations = Rotation.from_matrix(turned).as_quat(canonical=True, scalar_first=True)
     return GaussianSplats(
@@ -100,13 +113,12 @@ def build_splats(
 
 
 def _lay_shell(
-    tables: PlayerTables,
+    mesh: SkinnedMesh,
     shell: Shell,
     surface: KDTree,
     bones: Float[np.ndarray, "24 4 4"] | None,
 ) -> tuple[np.ndarray, ...]:
     """Positions, axes times standard deviations, colors and opacities of a shell's Gaussians."""
-    mesh = extract_mesh(tables, spacing_m=shell.spacing_m)
     found = KDTree(mesh.positions).query(mesh.positions, 1 + NEIGHBORS)
     distances, neighbors = np.asarray(found[0]), np.asarray(found[1])
     sizes = SPREAD * distances[:, 1 : 1 + NEAREST].mean(axis=1)
@@ -133,11 +145,13 @@ def _sharpen(
     shares: Float[np.ndarray, "splats neighbors"],
 ) -> Float[np.ndarray, "splats 3"]:
     """Find colors that become the given ones where Gaussians overlap (Van Cittert's iteration)."""
-    shares = shares / shares.sum(axis=1, keepdims=True)
+    starts = np.arange(0, neighbors.size + 1, neighbors.shape[1])
+    blur = csr_array(
+        ((shares / shares.sum(axis=1, keepdims=True)).ravel(), neighbors.ravel(), starts)
+    )
     found = colors
     for _ in range(SHARPENINGS):
-        blurred = np.einsum("vn,vnc->vc", shares, found[neighbors])
-        found = np.clip(found + colors - blurred, 0.0, 1.0)
+        found = np.clip(found + colors - blur @ found, 0.0, 1.0)
     return found
 
 

@@ -190,9 +190,6 @@ DENSITY_CONTRAST = 16.0
 """Factor about the level to which densities are clipped, as emptiness has no logarithm."""
 SMOOTHING_M = 0.004
 """Standard deviation of the blur before the level set is extracted, metres."""
-MIN_PART_FRACTION = 0.0002
-"""Least volume of a part as a fraction of the largest one's; smaller ones are floaters. At ten
-times this, a foot that few photographs had left in fragments was lost."""
 OPAQUE_OPTICAL_DEPTH = 7.0
 """Optical depth behind which nothing is visible (0.1 %)."""
 THICKNESS_MARGIN_M = 0.004
@@ -224,7 +221,7 @@ def extract_proxy_surface(grid: FieldGrid, *, level: float, spacing_m: float) ->
     """
     logs = resample_grid(_log_density(grid, level), spacing_m / grid.voxel_m)
     logs = blur_grid(logs, SMOOTHING_M / spacing_m)
-    inside = remove_floaters_and_cavities(logs > 0.0, MIN_PART_FRACTION)
+    inside = remove_floaters_and_cavities(logs > 0.0)
     nothing = np.float32(1e-3)
     logs = np.where(inside, np.maximum(logs, nothing), np.minimum(logs, -nothing))
     nodes, normals = _zero_crossings(logs, blur_grid(logs, 1.0))

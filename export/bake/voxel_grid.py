@@ -9,6 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32, Int64
 from scipy import ndimage
 
+MIN_PART_FRACTION = 0.0002
+"""Least volume of a part as a fraction of the largest one's; smaller ones are floaters. At ten
+times this, a foot that few photographs had left in fragments was lost, and a wrist."""
+
 
 def resample_grid(
     values: Float32[np.ndarray, "x y z"], step: float
@@ -53,17 +57,20 @@ def dilate(solid: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
     return solid
 
 
-def remove_floaters_and_cavities(
-    solid: Bool[np.ndarray, "x y z"], min_fraction: float
-) -> Bool[np.ndarray, "x y z"]:
+def remove_floaters_and_cavities(solid: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
     """Remove small components and fill what the others enclose; the first node is outside.
 
-    Components are connected through faces, and have `min_fraction` of the largest one's volume.
+    Components are connected through faces.
     """
     parts = _label_components(solid)
     sizes = np.bincount(parts.ravel())
     sizes[0] = 0
-    outside = _label_components(~(sizes >= min_fraction * sizes.max())[parts])
+    return fill_cavities((sizes >= MIN_PART_FRACTION * sizes.max())[parts])
+
+
+def fill_cavities(solid: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
+    """Fill what is enclosed; the first node is outside."""
+    outside = _label_components(~solid)
     return outside != outside[0, 0, 0]
 
 

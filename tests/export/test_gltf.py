@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from export.gltf import SkeletonAnimation, encode_glb, encode_vrm
 from export.package.package_file import read_package
-from export.skinned_mesh import extract_mesh
+from export.skinned_mesh import SURFACE_DENSITY, _level_function, extract_mesh
 from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import body_from_rest, rotation_matrices, world_from_body
 from preprocess.poses.pose_format_registry import read_poses
@@ -116,6 +116,16 @@ class Read:
         )
         points = self.attribute("POSITION")
         return np.einsum("vab,vb->va", blended[:, :3, :3], points) + blended[:, :3, 3]
+
+
+def test_a_wrist_that_a_film_left_apart_is_kept_and_a_floater_is_not():
+    codes = np.zeros((60, 60, 60, 4), dtype=np.uint8)
+    codes[5:45, 5:45, 5:45, 3] = 255
+    codes[50:54, 50:54, 50:54, 3] = 255  # a thousandth of the body
+    codes[50:52, 5:7, 5:7, 3] = 255
+    heights = _level_function(codes[..., 3], SURFACE_DENSITY)
+    assert heights[51, 51, 51] > 0.0
+    assert heights[50:52, 5:7, 5:7].max() < 0.0
 
 
 def test_the_mesh_is_one_closed_body_at_the_surface(mesh, tables):

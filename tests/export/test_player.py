@@ -26,7 +26,7 @@ from export.package.package_file import read_package
 from export.package.player_tables import RenderSettings
 from export.player import PictureDifference, Player, compare_golden_frames, premultiply
 from export.player_inputs import subdivided_skinning_nodes
-from export.skinned_mesh import extract_mesh, skinning_weights
+from export.skinned_mesh import LevelSet, extract_mesh, skinning_weights
 from preprocess.body.body_pose import BodyPose
 
 
@@ -110,7 +110,9 @@ def test_a_twisted_sleeve_looks_like_its_mesh(exported, tables, camera, tier, la
     pose = replace(BodyPose.rest(), joint_rotations=rotations)
     view = replace(camera(192, 192), focal_px=(1600.0, 1600.0), center_px=(196.0, 368.0))
     player = Player.load(exported.path, tier=tier)
-    mesh = extract_mesh(tables, density=50.0)  # at the surface that is seen, not where it ends
+    mesh = extract_mesh(
+        tables, LevelSet.of(tables.bricks, 50.0)
+    )  # at the surface that is seen, not where it ends
     bones = skinning_weights(tables, mesh.positions) @ player.bones(pose, view).reshape(24, 12)
     bones = bones.reshape(-1, 3, 4)
     x, y, depth = (np.einsum("nij,nj->ni", bones[..., :3], mesh.positions) + bones[..., 3]).T

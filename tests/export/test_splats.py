@@ -129,6 +129,14 @@ def test_they_lie_in_shells_under_the_surface_and_clear_of_it(package, splats):
     assert len(mesh.positions) == (splats.opacities == np.float32(SHELLS[0].opacity)).sum()
 
 
+def test_wide_clothes_have_gaussians_farther_apart(package, splats, monkeypatch):
+    monkeypatch.setattr("export.splats.MAX_CROSSED_M2", 0.2)
+    fewer = build_splats(package.tables["hq"])
+    assert len(fewer.positions) < 0.6 * len(splats.positions)
+    area = [np.sort(each.scales, axis=1)[:, 1:].prod(axis=1).sum() for each in (fewer, splats)]
+    assert area[0] == pytest.approx(area[1], rel=0.1)  # each is wider
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("pose", ["canonical", "bent"])
 def test_they_look_like_the_avatar(package, stand_in, camera, bent, pose):

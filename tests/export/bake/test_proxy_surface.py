@@ -101,7 +101,7 @@ def test_small_floaters_are_left_out_and_large_parts_are_kept(monkeypatch):
 
     assert nearest(floater) > 0.05
     assert nearest(part) < 0.04
-    monkeypatch.setattr("export.bake.proxy_surface.MIN_PART_FRACTION", 1e-9)
+    monkeypatch.setattr("export.bake.voxel_grid.MIN_PART_FRACTION", 1e-9)
     assert nearest(floater) < 0.02
 
 
