@@ -31,7 +31,7 @@ from avatar.evaluation.image_metrics import composite_on_white, psnr
 from avatar.training import checkpoint
 from benchmarks.hardware import Hardware
 from benchmarks.measurements import Measurement, markdown_rows
-from benchmarks.player_fidelity import ComparedView, views_of_person, views_of_sample
+from benchmarks.player_fidelity import ComparedView, filmed_view, held_out_observations
 from benchmarks.sample_training import open_sample
 from capture.camera import Camera
 from export.gltf import SkeletonAnimation, encode_glb
@@ -121,7 +121,7 @@ class ExportJob:
     run: Positional[Path]
     """Written by ia-ingest, with its checkpoint."""
     capture: Positional[Path]
-    """The sample that it was trained on."""
+    """The capture that it was trained on, with poses."""
     node: Path
     """Folder below which npm has put three."""
     keep: Path | None = None
@@ -129,11 +129,9 @@ class ExportJob:
     triangles: int = 20_000
     """Of the mesh."""
     stride: int = 1
-    """Take every n-th held-out frame of a sample."""
-    dance: Path | None = None
-    """Any file of poses, if CAPTURE is no sample."""
-    size: int = 540
-    """Longer side of a real person's pictures."""
+    """Take every n-th held-out frame."""
+    size: int | None = None
+    """Longer side of the pictures (default: as filmed)."""
 
 
 def main() -> int:
@@ -180,12 +178,9 @@ def measure(job: ExportJob) -> int:
 
 def filmed_views(job: ExportJob, avatar: Avatar) -> list[ComparedView]:
     """Held-out frames."""
-    if job.dance is not None:
-        kinds = views_of_person(job.capture, avatar, job.dance, size=job.size)
-    else:
-        count = open_sample(job.capture).source.frame_count
-        kinds = views_of_sample(job.capture, avatar, frames=count or 0, stride=job.stride)
-    return kinds["held out"]
+    recording = open_sample(job.capture, size=job.size)
+    held = held_out_observations(recording, avatar, recording.source.frame_count)
+    return [filmed_view(seen, avatar) for seen in held[:: job.stride]]
 
 
 def packages(node: Path) -> dict[str, bytes]:

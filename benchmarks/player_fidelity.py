@@ -59,10 +59,10 @@ def views_of_sample(
     """
     recording = open_sample(capture, frames=slice(0, frames))
     found = {
-        "held out": _held_out_observations(recording, avatar, frames),
+        "held out": held_out_observations(recording, avatar, frames),
         "novel poses": novel_observations(capture),
     }
-    return {name: [_filmed_view(s, avatar) for s in seen[::stride]] for name, seen in found.items()}
+    return {name: [filmed_view(s, avatar) for s in seen[::stride]] for name, seen in found.items()}
 
 
 def views_of_person(
@@ -79,7 +79,7 @@ def views_of_person(
         dance: A pose file; of `DANCE_POSES` of its poses, evenly spread, the joints are taken.
     """
     recording = open_sample(capture, size=size)
-    held = _held_out_observations(recording, avatar, recording.source.frame_count)
+    held = held_out_observations(recording, avatar, recording.source.frame_count)
     motion = read_poses(dance)
     chosen = np.linspace(0, len(motion) - 1, DANCE_POSES).round().astype(int)
     dances = []
@@ -87,19 +87,21 @@ def views_of_person(
         seen = held[position % len(held)]
         pose = replace(seen.pose, joint_rotations=motion[row].joint_rotations)
         dances.append(_unfilmed_view(pose, seen.camera, avatar))
-    return {"held out": [_filmed_view(seen, avatar) for seen in held], "dancing": dances}
+    return {"held out": [filmed_view(seen, avatar) for seen in held], "dancing": dances}
 
 
-def _held_out_observations(
+def held_out_observations(
     recording: Capture, avatar: Avatar, frames: int | None
 ) -> list[Observation]:
+    """Frames that training leaves out."""
     items = prepare_stream(
         recording.observations(), avatar.rig, stride=HELD_OUT_STRIDE, total=frames
     )
     return [item.observation for item in items if isinstance(item, HeldOutFrame)]
 
 
-def _filmed_view(seen: Observation, avatar: Avatar) -> ComparedView:
+def filmed_view(seen: Observation, avatar: Avatar) -> ComparedView:
+    """A frame, and what the renderer shows in its place."""
     return replace(
         _unfilmed_view(seen.pose, seen.camera, avatar), truth=ground_truth_on_white(seen)
     )

@@ -44,9 +44,11 @@ def explain_damage(path: Path, kind: str) -> Iterator[None]:
             "to .npz."
         ) from None
     except Exception as cause:  # damaged files fail in any way: numpy reads headers as Python
-        missing = isinstance(cause, KeyError)
-        text = str(cause).rstrip(".") or type(cause).__name__
-        reason = f"{text} is missing" if missing else text
+        reason = str(cause).rstrip(".") or type(cause).__name__
+        if isinstance(cause, KeyError):
+            reason = f"{reason} is missing"
+        elif isinstance(cause, (IndexError, TypeError, AttributeError)):
+            reason = f"its parts do not fit together ({reason})"
         raise InputError(
             f"{path} cannot be read as {kind}: {reason}. Is the file complete? Readable formats "
             "are listed in docs/formats.md."
@@ -141,7 +143,12 @@ def _decode(data: bytes, path: Path) -> Any:
         except (ValueError, RecursionError):
             if path.suffix.lower() == ".json":
                 raise
-    return _plain(load_safe_pickle(data), {})  # which may begin with a bracket, too
+    try:
+        return _plain(load_safe_pickle(data), {})  # which may begin with a bracket, too
+    except UnsafePickleError:
+        raise
+    except Exception as cause:
+        raise ValueError(f"it is of no kind that is known (as a pickle: {cause})") from cause
 
 
 def _decode_zip(data: bytes) -> Any:

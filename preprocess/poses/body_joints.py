@@ -284,7 +284,7 @@ def _read_item(node: dict[str, Any], frame: int, person: str | None) -> _Item | 
         points = np.asarray(node[key], dtype=np.float64)
         if points.shape[-2:] == (4, 4):
             points = points[..., :3, 3]
-        if points.ndim not in (2, 3) or points.shape[-1] != 3:
+        if points.ndim not in (2, 3) or points.shape[-1] != 3 or not points.size:
             raise ValueError(f"`{key}` has the shape {points.shape}; expected (joints, 3)")
         points = points.reshape(-1, *points.shape[-2:])
         names = next((node[some] for some in NAME_KEYS if node.get(some) is not None), None)
@@ -428,4 +428,6 @@ def _unit_m(places: Float[np.ndarray, "rows points 3"]) -> float:
     legs = np.diff(places[:, [POINT_NAMES.index(f"left_{n}") for n in ("hip", "knee", "ankle")]],
                    axis=1)  # fmt: skip
     length = float(np.median(np.linalg.norm(legs, axis=-1).sum(axis=1)))
+    if not length:
+        raise ValueError("hips, knees and ankles lie in one place")
     return min(UNITS_M, key=lambda unit: abs(np.log(max(unit * length, 1e-9) / USUAL_LEG_M)))

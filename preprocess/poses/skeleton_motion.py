@@ -83,6 +83,9 @@ class SkeletonMotion:
         source = match_joints(self.names, self.parents)
         is_smpl = {_plain(name) for name in JOINT_NAMES} <= {_plain(name) for name in self.names}
         turned, places = _forward(self.parents, self.rotations, self.translations)
+        finite = np.isfinite(places).all(axis=(1, 2))
+        if not (finite.any() and np.ptp(places[finite], axis=1).any()):
+            raise ValueError("in no frame are its joints in different, finite places")
         # the rest pose comes last; SMPL's own is the T in which no joint is turned
         at_rest = np.broadcast_to(np.eye(3), (len(self.names), 3, 3))
         at_rest = at_rest if is_smpl else self.rest_rotations

@@ -224,6 +224,8 @@ def test_gem_xs_rotations_move_its_skeleton(tmp_path, poses):
     [
         ({"joints": np.zeros((2, 33, 3))}, "33 joints; expected the 22"),
         ({"joints": np.zeros((2, 24, 2))}, "shape"),
+        ({"joints": np.zeros((0, 24, 3))}, "shape"),
+        ({"joints": np.zeros((2, 24, 3))}, "lie in one place"),
         ({"joints": np.full((2, 24, 3), np.nan)}, "no frame has all shoulders"),
         (
             {"joints": np.zeros((2, 30, 3)), "joint_names": [f"Joint_{n:03d}" for n in range(30)]},

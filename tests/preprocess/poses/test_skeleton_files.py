@@ -1,6 +1,7 @@
 """BVH and glTF as other programs write them move SMPL's joints as the truth does."""
 
 import json
+import re
 import struct
 
 import numpy as np
@@ -342,6 +343,10 @@ def test_a_skeleton_of_no_person_is_refused_by_the_joints_that_it_lacks(truth, t
         (lambda data: data[: data.index(b"MOTION")], "the part MOTION is missing"),
         (lambda data: data.replace(b"Frame Time", b"Zeit"), "Frame Time"),
         (lambda data: data[: data.index(b"Frame Time")] + b"Frame Time: 0.03\n1 2 3", "no frames"),
+        (lambda data: data[: data.index(b"MOTION") + 8], "its parts do not fit together"),
+        (lambda data: re.sub(rb"OFFSET.*", b"OFFSET 0 0 0", data), "in different, finite places"),
+        (lambda data: re.sub(rb"(?m)^-?\d\S* ", b"nan ", data), "in different, finite places"),
+        (lambda data: b"a letter", "it is of no kind that is known"),
     ],
 )
 def test_a_damaged_file_is_refused_with_its_cause(truth, tmp_path, spoil, reason):
