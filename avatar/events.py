@@ -74,6 +74,11 @@ class Warned:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Presentable:
+    """A user waits, and the avatar could be shown, though a second of training is left."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Finished:
     """The last step has been made; numbers are totals of the training."""
 
@@ -84,4 +89,7 @@ class Finished:
     samples: int
 
 
-TrainEvent = FrameArrived | FrameLeftOut | WaitingForFrame | Stepped | Evaluated | Warned | Finished
+TrainEvent = (
+    FrameArrived | FrameLeftOut | WaitingForFrame | Stepped | Evaluated | Warned | Presentable
+    | Finished
+)  # fmt: skip

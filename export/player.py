@@ -74,6 +74,16 @@ def premultiply(
     return picture
 
 
+def straighten(
+    premultiplied: Float32[np.ndarray, "height width 4"],
+) -> UInt8[np.ndarray, "height width 4"]:
+    """Convert premultiplied floats to a straight 8-bit picture."""
+    alpha = premultiplied[..., 3:]
+    color = premultiplied[..., :3] / np.maximum(alpha, 1e-6)
+    picture = np.concatenate([color, alpha], axis=-1)
+    return np.round(np.clip(picture, 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
 def picture_on_white(
     premultiplied: Float32[np.ndarray, "*pixels 4"],
 ) -> Float32[np.ndarray, "*pixels 3"]:

@@ -120,20 +120,29 @@ def build_page(
 
     The page has all tiers of the package. zlib's level: 1 for a local browser, 6 for a host.
     """
+    pages = player_files(motion, fps, compression_level=compression_level)
+    read_package(path)  # every checksum
+    pages["index.html"] = titled(pages["index.html"], name)
+    return pages | {PACKAGE_FILE: path.read_bytes()}
+
+
+def player_files(motion: Motion, fps: float, *, compression_level: int) -> dict[str, bytes]:
+    """Build the page's files but its package, the same for every avatar; arguments as above."""
     runtime = runtime_files()
     runtime[PACKED_WASM_FILE] = pack_runtime(compression_level)
     del runtime[WASM_FILE]
     runtime[PAGE_SCRIPT] = runtime.pop(SCRIPT_FILE)
-    read_package(path)  # every checksum
-    pages = static_page_files()
-    title = f"<title>{html.escape(name)}</title>".encode()
-    pages["index.html"] = pages["index.html"].replace(b"<title>Avatar</title>", title)
     return {
-        **pages,
-        PACKAGE_FILE: path.read_bytes(),
+        **static_page_files(),
         MOTION_FILE: encode_motion(motion, fps),
         **{f"runtime/{file}": held for file, held in runtime.items()},
     }
+
+
+def titled(index: bytes, name: str) -> bytes:
+    """Name index.html after its avatar."""
+    title = f"<title>{html.escape(name)}</title>".encode()
+    return index.replace(b"<title>Avatar</title>", title)
 
 
 def encode_motion(motion: Motion, fps: float) -> bytes:

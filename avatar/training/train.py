@@ -24,6 +24,7 @@ from avatar.events import (
     FrameArrived,
     FrameLeftOut,
     HeldOutScore,
+    Presentable,
     Stepped,
     TrainEvent,
     WaitingForFrame,
@@ -56,6 +57,8 @@ swings of the parameters leave their mean closer to the optimum."""
 CLOSING_S = 2.0
 """Time after the last frame of a paced source in which rates fall and surfaces become firm,
 seconds: a user waits."""
+PRESENTABLE_PROGRESS = 0.5
+"""Share of that time, or of the steps that are left, after which the avatar can be shown."""
 LATE_FRAMES_S = 0.5
 """Time for which frames are learnt that come while rates are falling, seconds."""
 LEAST_STEPS = 250
@@ -103,7 +106,7 @@ def train(
     recording is read before each step until all are read.
 
     Held-out frames that arrive are appended to `held_out`. Events are yielded on the caller's
-    thread; the time the caller spends on one counts as training time.
+    thread; the time the caller spends on one counts as training time unless it pauses the trainer.
     """
     stream, marks = _FrameIntake(trainer, inbox, held_out), _EvaluationSchedule(trainer)
     while True:
@@ -117,6 +120,9 @@ def train(
         now = stream.clock.read()
         if stream.is_done(now):
             break
+        if stream.is_presentable(now):
+            yield Presentable()
+            continue
         if marks.is_due(now) and not stream.is_closing:
             yield marks.score(held_out, stream.clock)
             continue
@@ -178,6 +184,7 @@ class _FrameIntake:
         self._closing_from: float | None = None
         self._ended_at: float | None = None
         self._steps_before_closing = self._least_steps = 0
+        self._was_presentable = False
         self._last_frame_step: int | None = None
         self.clock = TrainingClock(trainer)
         self._started = len(trainer.replay) > 0  # a resumed run remembers frames
@@ -195,6 +202,12 @@ class _FrameIntake:
     def is_closing(self) -> bool:
         """True if the last frame has come of a source that ends the run: a user waits."""
         return self._inbox.ends_run and self._closing_from is not None
+
+    def is_presentable(self, now: float) -> bool:
+        """True once, where a user waits for the avatar of a paced source."""
+        waits = self._inbox.paced and self.is_closing and not self._was_presentable
+        self._was_presentable |= waits and self.progress(now) >= PRESENTABLE_PROGRESS
+        return waits and self._was_presentable
 
     def receive(self, now: float) -> Iterator[FrameArrived | FrameLeftOut]:
         """Adds the frames that have arrived to the trainer; the clock starts with the first."""

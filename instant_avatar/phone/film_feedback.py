@@ -8,7 +8,7 @@ import numpy as np
 
 from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.coverage import coverage_advice
-from avatar.events import Finished, FrameArrived, Stepped, WaitingForFrame
+from avatar.events import FrameArrived, Stepped, WaitingForFrame
 from avatar.rig import canonical_rotations
 from instant_avatar.phone.film_queue import Film
 from instant_avatar.report.page_rendering import webp_data_uri
@@ -23,6 +23,7 @@ from instant_avatar.run.live_viewer import (
 from instant_avatar.run.session_events import (
     Ended,
     PackageWritten,
+    Playable,
     Progressed,
     SessionEvent,
     Started,
@@ -79,7 +80,7 @@ class FilmFeedback:
         self._map: CoverageMap | None = None
         self._grid: tuple[BodyPose, CorrespondenceGrid] | None = None
         self._framing: str | None = None
-        self._repeats = 0
+        self._repeats, self._is_playable = 0, False
         self._advice, self._next_map, self._next_preview = "", 0.0, 0.0
 
     def __call__(self, event: SessionEvent) -> None:
@@ -92,13 +93,13 @@ class FilmFeedback:
                 self._map = CoverageMap(event.shaped, event.coverage)
             case FrameArrived() | Stepped() | WaitingForFrame():
                 self._show()
-            case Finished():
-                self._film.tell("state", state="finishing", text="Making the avatar …")
             case Progressed(stage=stage, share=share):
                 self._film.tell("progress", text=stage, share=round(share, 2))
-            case PackageWritten(is_final=is_final):
-                name = self._film.place.name
-                self._film.tell("avatar", name=name, final=is_final)
+            case Playable() | PackageWritten(is_final=False) if not self._is_playable:
+                self._is_playable = True
+                self._film.tell("avatar", name=self._film.place.name, final=False)
+            case PackageWritten(is_final=True):
+                self._film.tell("avatar", name=self._film.place.name, final=True)
             case Ended():
                 self._film.tell("state", state="done")
 

@@ -69,6 +69,11 @@ class Film:
         """The run's folder."""
         return RunFolder(path=self.place / RUN_FOLDER)
 
+    @property
+    def is_playable(self) -> bool:
+        """Whether a package of its avatar has been written."""
+        return "avatar" in self._messages
+
     def tell(self, kind: str, **content: Any) -> None:
         """Leave a message for the page, in place of an older one of its kind; on any thread."""
         with self._lock:

@@ -14,7 +14,13 @@ from aiohttp import web
 
 from capture.input_error import InputError
 from export.package.package_file import read_package
-from export.player_page import ORT_WEB_VERSION, PACKED_WASM_FILE, build_page, pack_runtime
+from export.player_page import (
+    ORT_WEB_VERSION,
+    PACKAGE_FILE,
+    PACKED_WASM_FILE,
+    player_files,
+    titled,
+)
 from instant_avatar.animation.driving_motion import demo_motion, pose_rate
 from instant_avatar.animation.web_server import MIME_TYPES
 from instant_avatar.cli.console import Console
@@ -35,8 +41,12 @@ PIECE_TIMEOUT_S = 60.0
 """Longest time that one piece may take, seconds."""
 HEARTBEAT_S = 5.0
 """Longest time without a message to a page, seconds: proxies cut silent connections."""
+POLL_S = 0.02
+"""Interval at which a package is looked for that is waited for, seconds."""
+MESHES = ("avatar.glb", "avatar.vrm", "avatar.ply", "avatar.obj")
+"""Meshes that the page offers."""
 MESH_TRIANGLES = 20_000
-"""Triangles of the meshes that the page offers."""
+"""Triangles of each."""
 MAX_AUTHOR_LENGTH = 80
 """Longest author that a VRM names, characters."""
 HEADERS = {
@@ -48,6 +58,8 @@ HEADERS = {
 """Headers of all answers; the first two isolate the page, so that its player may use threads."""
 MODULE_FILE = f"ort-{ORT_WEB_VERSION}.wasm.zlib"
 """The player's WebAssembly module, named by its release."""
+WEB_MODULE = f"runtime/{PACKED_WASM_FILE}"
+"""Its name within a player's page."""
 KEPT = {"Cache-Control": "max-age=31536000, immutable"}
 """Header of that file."""
 REFUSED = (
@@ -66,8 +78,7 @@ class PhoneServer:
         self._queue, self._access, self._live_port = queue, access, live_port
         self.on_entered: Callable[[], object] = lambda: None
         self._loop = asyncio.new_event_loop()
-        self._pages: dict[str, tuple[float, dict[str, bytes]]] = {}
-        self._module = b""
+        self._player: dict[str, bytes] = {}
         self._requests: dict[str, deque[float]] = {}
         self._exporting = asyncio.Lock()  # meshes are costly: one at a time
         self._listeners: dict[str, set[asyncio.Event]] = {}
@@ -91,7 +102,7 @@ class PhoneServer:
     def start(self, host: str, sites: list[tuple[int, Any]]) -> None:
         """Serve at ports, each with a TLS context or None; raise an OSError if one is in use."""
         with suppress(InputError):  # the player's page names what is missing
-            self._module = pack_runtime(1)
+            self._player = _player_files()
         runner = web.AppRunner(self._app, access_log=None, shutdown_timeout=1.0)
 
         async def listen() -> None:
@@ -167,7 +178,7 @@ class PhoneServer:
         policy = "default-src 'self'; img-src 'self' data: blob:; media-src 'self' blob:"
         headers = {"Content-Security-Policy": f"{policy}; base-uri 'none'; form-action 'none'"}
         live = "here" if request.secure else "elsewhere" if self._live_port else "no"
-        module = f"runtime/{MODULE_FILE}" if self._module else ""
+        module = f"runtime/{MODULE_FILE}" if self._player else ""
         text = text.replace("{{live}}", live).replace("{{module}}", module)
         return web.Response(text=text, content_type="text/html", headers=headers)
 
@@ -186,9 +197,9 @@ class PhoneServer:
 
     async def _runtime(self, request: web.Request) -> web.Response:
         """The player's WebAssembly module, which the page fetches during filming."""
-        if request.match_info["file"] != MODULE_FILE:
+        if request.match_info["file"] != MODULE_FILE or not self._player:
             raise InputError("There is no such file.")
-        return web.Response(body=self._module, headers=HEADERS | KEPT)
+        return web.Response(body=self._player[WEB_MODULE], headers=HEADERS | KEPT)
 
     def _film(self, request: web.Request) -> Film:
         return self._queue.find(request.match_info["number"], _session(request))
@@ -204,7 +215,8 @@ class PhoneServer:
             avatar=str(given.get("avatar") or ""),
         )  # fmt: skip
         film.on_message = lambda: self._loop.call_soon_threadsafe(self._wake, film.number)
-        return web.json_response({"film": film.number, "next": 0}, status=201)
+        begun = {"film": film.number, "avatar": film.place.name, "next": 0}
+        return web.json_response(begun, status=201)
 
     async def _state(self, request: web.Request) -> web.Response:
         return self._progress(self._film(request))
@@ -273,40 +285,45 @@ class PhoneServer:
         return web.json_response(self._queue.avatars())
 
     async def _avatar(self, request: web.Request) -> web.StreamResponse:
-        """A file of an avatar's player page, its poster, its package, or a mesh of it."""
+        """A file of an avatar's player page, its poster, its package, or a mesh of it.
+
+        The package that a film in progress makes is waited for: its player starts meanwhile.
+        """
         name, file = request.match_info["name"], request.match_info["file"] or "index.html"
+        if file == WEB_MODULE:  # one module for all avatars
+            return web.Response(status=302, headers={"Location": f"../../../runtime/{MODULE_FILE}"})
+        if file not in (PACKAGE_FILE, "poster.png", *MESHES):
+            self._player = self._player or _player_files()
+            if file not in self._player:
+                raise InputError("There is no such file.")
+            body = self._player[file]
+            kind = MIME_TYPES.get(Path(file).suffix, "application/octet-stream")
+            body = titled(body, name) if file == "index.html" else body
+            return web.Response(body=body, headers={"Content-Type": kind})
+        film = next((film for film in self._queue if film.place.name == name), None)
+        while film is not None and film.has_turn and not (film.is_playable or film.is_over):
+            await asyncio.sleep(POLL_S)
         package = self._queue.package(name)
         saved = {"Content-Disposition": f'attachment; filename="{name}{Path(file).suffix}"'}
-        if file == "avatar.iavatar":
+        if file == PACKAGE_FILE:
             return web.FileResponse(package, headers=saved | HEADERS)
-        if file in ("avatar.glb", "avatar.ply", "avatar.obj", "avatar.vrm"):
-            author = request.query.get("author", "").strip()[:MAX_AUTHOR_LENGTH]
-            async with self._exporting:
-                content = await asyncio.to_thread(_mesh, package, file, author)
-            return web.Response(body=content, headers=saved)
         if file == "poster.png":
             content = await asyncio.to_thread(lambda: read_package(package).preview)
             return web.Response(body=content, content_type="image/png")
-        if file == f"runtime/{PACKED_WASM_FILE}":  # one module for all avatars
-            return web.Response(status=302, headers={"Location": f"../../../runtime/{MODULE_FILE}"})
-        written = package.stat().st_mtime
-        if self._pages.get(name, (0.0,))[0] != written:
-            self._pages = {name: (written, await asyncio.to_thread(_player_page, package, name))}
-        files = self._pages[name][1]
-        if file not in files:
-            raise InputError("There is no such file.")
-        kind = MIME_TYPES.get(Path(file).suffix, "application/octet-stream")
-        return web.Response(body=files[file], headers={"Content-Type": kind})
+        author = request.query.get("author", "").strip()[:MAX_AUTHOR_LENGTH]
+        async with self._exporting:
+            content = await asyncio.to_thread(_mesh, package, file, author)
+        return web.Response(body=content, headers=saved)
 
 
 def _session(request: web.Request) -> str:
     return request.cookies.get(COOKIES[request.secure], "")
 
 
-def _player_page(package: Path, name: str) -> dict[str, bytes]:
-    """The files of the player page with the built-in motion."""
+def _player_files() -> dict[str, bytes]:
+    """The files of a player's page with the built-in motion."""
     motion = demo_motion()
-    return build_page(package, motion, pose_rate(motion), name=name, compression_level=1)
+    return player_files(motion, pose_rate(motion), compression_level=1)
 
 
 def _mesh(package: Path, file: str, author: str) -> bytes:

@@ -62,8 +62,15 @@ class CheckpointSaved:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Playable:
+    """A draft of the package can be played, of which nothing was checked."""
+
+    path: Path
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class PackageWritten:
-    """The package can be played; `is_final` once it is fine-tuned."""
+    """The package is checked; `is_final` once it is fine-tuned."""
 
     path: Path
     result: TrainingResult
@@ -86,7 +93,7 @@ class Ended:
 
 SessionEvent = (
     TrainEvent | Progressed | Tracked | Started | Noted
-    | CheckpointSaved | PackageWritten | Scored | Ended
+    | CheckpointSaved | Playable | PackageWritten | Scored | Ended
 )  # fmt: skip
 EventReader = Callable[[SessionEvent], object]
 """Reads every event of a session, on the thread that trains: what it takes is not trained."""

@@ -4,13 +4,22 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
+from contextlib import suppress
 from dataclasses import asdict, replace
 from typing import Any, final
 
 from avatar.evaluation.coverage import Coverage, coverage_advice
 from avatar.evaluation.held_out import PIXELS_PER_FRAME, HeldOutFrame, add_held_out
 from avatar.evaluation.image_metrics import overall_verdict
-from avatar.events import Evaluated, FrameArrived, HeldOutScore, Stepped, TrainEvent, Warned
+from avatar.events import (
+    Evaluated,
+    FrameArrived,
+    HeldOutScore,
+    Presentable,
+    Stepped,
+    TrainEvent,
+    Warned,
+)
 from avatar.training.frame_stream import (
     SplitItem,
     StreamItem,
@@ -22,7 +31,7 @@ from avatar.training.train import train
 from avatar.training.trainer import Trainer
 from capture.inbox import Inbox
 from export.bake.bake_tables import ExportRefused
-from export.build import ExportReport
+from export.build import ExportReport, write_draft
 from export.package.package_file import update_metrics
 from instant_avatar.cli.command_line import BAD_INPUT, INTERRUPTED, CommandExit
 from instant_avatar.report.report_schema import CurvePoint, finite_mean, format_percent
@@ -38,6 +47,7 @@ from instant_avatar.run.session_events import (
     Ended,
     Noted,
     PackageWritten,
+    Playable,
     Progressed,
     Scored,
     SessionEvent,
@@ -99,6 +109,8 @@ class TrainingSession:
             self.coverage.merge_state(notes["coverage"])
         self.is_interrupted = False
         self._result: TrainingResult | None = None
+        self._ready_at: float | None = None
+        self._is_drafted = False
         self._report_progress: Callable[[str, float], object] = lambda *_: None
 
     def run(
@@ -179,6 +191,7 @@ class TrainingSession:
             coverage=self.coverage,
             frames_added=added + self.trainer.frames_seen,
             interrupted=self.is_interrupted,
+            ready_at=self._ready_at,
             licence=licence_chain(self._notes.get("made_with", ())),
         )
 
@@ -208,6 +221,8 @@ class TrainingSession:
         except ExportRefused as error:  # of the fine-tuned one: that as baked stays
             if self.result.exported is None:
                 self._result = replace(self.result, refusal=str(error))
+                if self._ready_at is not None:
+                    self._run.package.unlink()
         finally:
             self._checkpoints.settle()
         self._checkpoints.wait()
@@ -298,6 +313,8 @@ class TrainingSession:
                     frame, observation=replace(frame.observation, pose=pose)
                 )
         self._revised_poses |= found
+        if self._is_waited_for():  # after the draft
+            return
         for _ in range(min(REVISED_PER_STEP, len(self._revised_poses))):
             number = next(iter(self._revised_poses))
             self.trainer.revise_pose(number, self._revised_poses.pop(number))
@@ -315,7 +332,23 @@ class TrainingSession:
                     yield CheckpointSaved(step=step)
             case Evaluated():
                 self._add_curve_point(event.scores, event.wall_seconds, event.cpu_seconds)
+            case Presentable():
+                yield from self._write_draft()
         yield event
+
+    def _is_waited_for(self) -> bool:
+        """Whether a user waits for the draft of a film whose last frame has come."""
+        source = self._frames
+        return self.meter.grows and source.paced and source.all_came and not self._is_drafted
+
+    def _write_draft(self) -> Iterator[Playable]:
+        """Write a package to be played until a checked one replaces it, unless it is empty."""
+        self._is_drafted = True
+        view = validation_views(self.held_out, self._capture)[0]
+        with self.trainer.paused(), suppress(ExportRefused):
+            write_draft(self.trainer.avatar, self._run.package, view)
+            self._ready_at = time.perf_counter()
+            yield Playable(path=self._run.package)
 
     def _add_curve_point(
         self, scores: tuple[HeldOutScore, ...], wall_s: float, cpu_s: float

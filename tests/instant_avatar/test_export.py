@@ -1,5 +1,6 @@
 """ia-export: a package at any second, from what is on the disk."""
 
+import io
 import json
 import shutil
 import subprocess
@@ -8,9 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
+from avatar.evaluation.image_metrics import psnr
+from avatar.training import checkpoint
+from export.build import write_draft
 from export.package.package_file import read_package
-from export.player import Player, compare_golden_frames
+from export.player import Player, compare_golden_frames, picture_on_white, premultiply
 from instant_avatar import export
 from preprocess.poses.pose_format_registry import read_poses
 
@@ -36,6 +41,22 @@ const { vrm } = (await loader.parseAsync(buffer, "")).userData;
 const bones = Object.keys(vrm.humanoid.humanBones).length;
 console.log(JSON.stringify({ files, complaints, bones, meta: vrm.meta }));
 """
+
+
+def test_a_draft_draws_nearly_what_the_finished_package_draws(run, tmp_path):
+    trainer, _ = checkpoint.load(run / "checkpoint")
+    frame = read_package(run / "avatar.iavatar").manifest.golden[0]
+    draft = tmp_path / "avatar.iavatar"
+    write_draft(trainer.avatar, draft, (frame.pose, frame.camera))
+    for tier in ("hq", "lite"):
+        pictures = [
+            picture_on_white(
+                premultiply(Player.load(path, tier=tier).render(frame.pose, frame.camera))
+            )
+            for path in (draft, run / "avatar.iavatar")
+        ]
+        assert psnr(*pictures) > 30.0
+    assert Image.open(io.BytesIO(read_package(draft).preview)).size == frame.camera.size_px
 
 
 @pytest.fixture

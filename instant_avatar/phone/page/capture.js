@@ -7,7 +7,7 @@ const COUNTDOWN_S = 5;
 const PIECE_MS = 100; // length of what the camera hands over at once
 const SPOKEN_AGAIN_MS = 9000;
 const KINDS = ["video/webm;codecs=h264", "video/mp4;codecs=avc1.42E01E", "video/webm;codecs=vp8", "video/webm", "video/mp4"];
-let adding = "", facing = "environment", stream = null, shown = "";
+let adding = "", making = "", facing = "environment", stream = null, shown = "";
 
 function view(name) {
   for (const id of ["home", "filming", "done"]) $(id).hidden = id !== name;
@@ -32,29 +32,33 @@ function say(text) {
 /** Begin a film and listen to what the server tells of it; resolves when it is this film's turn. */
 async function begin(type, size) {
   view("filming");
-  $("map").replaceChildren(); $("preview").hidden = true; $("seen").textContent = ""; $("progress").value = 0;
+  $("map").replaceChildren(); $("preview").hidden = true; $("preview").removeAttribute("src"); $("seen").textContent = ""; $("progress").value = 0;
   const body = JSON.stringify({ name: $("name").value, type, size, avatar: adding });
-  const { film } = await ask("films", { method: "POST", body });
+  const { film, avatar } = await ask("films", { method: "POST", body });
+  making = avatar;
   const events = new EventSource(`films/${film}/messages`);
   const on = (kind, act) => events.addEventListener(kind, (event) => act(JSON.parse(event.data)));
   on("advice", ({ text, time }) => { say(text); $("advice").dataset.time = time; });
   on("seconds", ({ seconds }) => { $("seconds").textContent = `${seconds.toFixed(0)} s looked at`; });
   on("map", ({ svg, seen }) => { $("map").innerHTML = svg; $("seen").textContent = ` · ${Math.round(100 * seen)} % of you seen`; });
-  on("preview", ({ image }) => { $("preview").src = image; $("preview").hidden = false; });
+  on("preview", ({ image }) => {
+    $("preview").src = image; $("preview").hidden = false;
+    if (making && making === shown) $("poster").src = image;
+  });
   on("progress", ({ text, share }) => { $("progress").value = share; if (!$("done").hidden) $("note").textContent = `${text} …`; });
   on("warning", ({ text }) => warn(text));
   let opened = false;
   on("avatar", ({ name, final }) => {
     if (opened && $("done").hidden) return; // a person films again
     opened = true;
-    open(name, final ? "It is ready." : "It can be played; finer detail follows.");
+    making = "";
+    open(name, final ? "It is ready." : "It can be played; finer detail follows.", final);
   });
-  on("failed", ({ text }) => { finish(); view("home"); warn(text); });
+  on("failed", ({ text }) => { making = shown = ""; finish(); view("home"); warn(text); });
   on("over", () => { events.close(); listEarlier(); });
-  await new Promise((resolve) => on("state", ({ state, behind, text }) => {
+  await new Promise((resolve) => on("state", ({ state, behind }) => {
     if (state === "waiting") say(`Waiting for ${behind.join(", ")} …`);
     if (state === "filming") resolve();
-    if (state === "finishing") say(text);
     if (state === "done" && !$("done").hidden) $("note").textContent = "It is ready.";
   }));
   return film;
@@ -65,6 +69,9 @@ async function transfer(film, source) {
     $("sent").textContent = `${(bytes / 1e6).toFixed(1)} MB sent`;
     if (source instanceof Stored) $("progress").value = bytes / source.end;
   });
+  if (!making) return;
+  say("Making the avatar …");
+  open(making, "Making the avatar …"); // its player starts, and waits for the package
 }
 
 async function upload(file) {
@@ -135,16 +142,18 @@ async function record(film, type) {
 }
 
 /** Show an avatar: its poster until the player has drawn, the older player until a finer one has. */
-function open(name, note) {
+function open(name, note, final = false) {
   finish();
   adding = "";
-  const address = `avatars/${encodeURIComponent(name)}/`;
-  if ($("done").hidden || shown !== name) {
+  const address = `avatars/${encodeURIComponent(name)}/`, isFirst = $("done").hidden || shown !== name;
+  $("offers").inert = Boolean(making);
+  if (isFirst) {
     view("done");
-    $("poster").src = `${address}poster.png`;
     $("poster").hidden = false;
     $("player").src = `${address}?start=lite`;
-  } else {
+  }
+  $("poster").src = making ? $("preview").src : `${address}poster.png`;
+  if (final && !isFirst) {
     const finer = $("player").cloneNode();
     Object.assign(finer, { src: `${address}?start=hq`, className: "coming", id: "" });
     $("player").after(finer);

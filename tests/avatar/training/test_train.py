@@ -12,7 +12,15 @@ import torch
 
 from avatar.config import NOMINAL_STEPS_PER_S, TrainConfig
 from avatar.evaluation.held_out import HeldOutFrame
-from avatar.events import Evaluated, Finished, FrameArrived, FrameLeftOut, Stepped, WaitingForFrame
+from avatar.events import (
+    Evaluated,
+    Finished,
+    FrameArrived,
+    FrameLeftOut,
+    Presentable,
+    Stepped,
+    WaitingForFrame,
+)
 from avatar.render import render
 from avatar.training import train as train_module
 from avatar.training.frame_stream import prepare_frame, prepare_stream
@@ -328,6 +336,13 @@ def test_training_ends_with_the_last_image_of_a_folder_that_grows(rig, clip, tic
     inbox._thread.join()  # all frames are there before the mark
     events = list(train(trainer, inbox, []))
     assert not any(isinstance(event, Evaluated) for event in events)  # a user waits
+    (shown,) = (place for place, event in enumerate(events) if isinstance(event, Presentable))
+    before, after = (
+        sum(isinstance(event, Stepped) for event in part)
+        for part in (events[:shown], events[shown:])
+    )
+    assert before > 0
+    assert after > 0
     assert isinstance(events[-1], Finished)
     assert events[-1].wall_seconds > 0.5
     assert trainer.steps >= train_module.MIN_STEPS_AFTER_LAST_FRAME

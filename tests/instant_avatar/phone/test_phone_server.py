@@ -6,6 +6,7 @@ import re
 import shutil
 import time
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -261,6 +262,23 @@ def test_an_avatar_is_saved_as_vrm_with_the_author_who_was_named(phone, anna):
         length = int.from_bytes(answer.content[12:16], "little")
         scene = json.loads(answer.content[20 : 20 + length])
         assert scene["extensions"]["VRMC_vrm"]["meta"]["authors"] == [author]
+
+
+@pytest.mark.slow
+def test_the_player_waits_for_the_package_that_a_film_makes(phone, queue, run):
+    phone.begin()
+    film = queue.take_next(1.0)
+    with ThreadPoolExecutor() as pool:
+        waiting = pool.submit(phone.ask, "GET", "/avatars/Anna/avatar.iavatar")
+        time.sleep(0.3)
+        assert not waiting.done()
+        film.run.path.mkdir(parents=True)
+        shutil.copy(run / "avatar.iavatar", film.run.path)
+        assert not waiting.done()  # it could be that of an earlier film
+        film.tell("avatar", name="Anna", final=False)
+        assert waiting.result(timeout=60.0).content == film.run.package.read_bytes()
+        queue.finish(film)
+        assert phone.ask("GET", "/avatars/Bea/avatar.iavatar").status == 404
 
 
 @pytest.mark.slow
