@@ -45,8 +45,8 @@ REVERSE_COST_M = 0.08
 """Cost of the limb's other face, metres."""
 FACE_COST_M = 1.0
 """Cost of a face as the source of anything but a face, metres."""
-UNSEEN_COST_M = 0.2
-"""Cost of a source that is unseen itself, metres."""
+OBLIQUE_COST_M = 0.2
+"""Cost of a source that is seen at a right angle to its normal, metres."""
 ALONG_BONE_FACTOR = 4.0
 """Factor of lengths along the bone; none of the head, whose hair comes from above."""
 NECK_SHARE = 0.3
@@ -188,7 +188,7 @@ class UnseenSkin:
         """Finds the sources again, if frames have been added since; returns whether they have."""
         if not self._is_stale:
             return False
-        found = find_sources(self._rig, self._frames, self.evidence.seen, self._middle_x)
+        found = find_sources(self._rig, self._frames, self.evidence, self._middle_x)
         around = (self._neighbors @ found.weight + found.weight) / self._neighbor_counts
         self.sources = found._replace(weight=(found.weight * around).astype(np.float32))
         weights = self.sources.weight[self._seed_of_cell[self._cells]]
@@ -293,9 +293,10 @@ def reflect(
 
 
 def find_sources(
-    rig: Rig, frames: _BoneFrames, seen: Float32[np.ndarray, "seeds"], middle_x: float
+    rig: Rig, frames: _BoneFrames, evidence: SkinEvidence, middle_x: float
 ) -> Sources:
-    """The source of each patch, by the least cost; `seen` is how far each was, in [0, 1]."""
+    """The source of each patch, by the least cost."""
+    seen = evidence.seen
     parts = rig.seed_parts.astype(np.int64)
     best, cost = np.zeros(len(parts), dtype=np.int64), np.full(len(parts), np.inf)
     kind = np.zeros(len(parts), dtype=np.int64)
@@ -307,7 +308,9 @@ def find_sources(
         )
         landed = MIRRORED_PART[parts[sources]] if reflection & 1 else parts[sources]
         extra = MIRROR_COST_M * (reflection & 1) + REVERSE_COST_M * (reflection >> 1)
-        extra = extra + UNSEEN_COST_M * (1.0 - seen[sources])
+        # backdrop stains what is seen obliquely; but hair comes from the crown, seen from below
+        clean = np.where(parts[sources] == HEAD, seen[sources], evidence.cosines[sources])
+        extra = extra + OBLIQUE_COST_M * (1.0 - clean)
         for part in range(len(BONE_OF_PART)):
             here = np.flatnonzero((parts == part) & (seen < 1.0))
             there = np.flatnonzero(landed == part)
