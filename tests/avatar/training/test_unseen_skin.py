@@ -109,6 +109,12 @@ def test_the_back_is_drawn_to_the_front_and_the_front_to_nothing(rig, of_front):
     assert np.abs(apart[:, 1]).mean() < 0.03  # stripes go round
 
 
+def test_the_back_is_drawn_to_what_was_seen_squarely(rig, of_front):
+    """The outline, which lies nearest to the unseen side, is stained by the backdrop."""
+    back = facing(rig, TORSO, -1.0) & (of_front.sources.weight > 0.5)
+    assert np.median(of_front.evidence.cosines[of_front.sources.patch[back]]) > 0.8
+
+
 def test_the_back_of_a_head_is_drawn_to_hair_and_never_to_a_face(rig, of_front, generator):
     head = rig.seeds[rig.seed_parts == HEAD]
     low, top = head[:, 1].min(), head[:, 1].max()
@@ -119,7 +125,7 @@ def test_the_back_of_a_head_is_drawn_to_hair_and_never_to_a_face(rig, of_front, 
     behind = (heights > 0.5) & (heights < 1.0) & (points[:, 2] < middle - 0.03)
     assert behind.sum() > 300
     of_face = (sources[:, 2] > middle) & (sources[:, 1] < low + 0.7 * (top - low))
-    assert of_face[behind].mean() < 0.02
+    assert of_face[behind].mean() < 0.04
     assert (sources[behind, 1] > points[behind, 1]).mean() > 0.6  # it falls
 
 
