@@ -9,7 +9,7 @@ a point whose color and density it is drawn to as far as it is unseen and the so
 
 The source of a patch is the candidate of the least cost: the distance to it, in which lengths along
 the bone count more than those around it, a cost of each kind of reflection, and one of candidates
-that were seen poorly.
+that were seen obliquely: the outline, which lies nearest to the unseen side, is stained most.
 
 A face that was seen from one side alone could have any depth; it is kept near the body model's.
 """
@@ -308,7 +308,7 @@ def find_sources(
         )
         landed = MIRRORED_PART[parts[sources]] if reflection & 1 else parts[sources]
         extra = MIRROR_COST_M * (reflection & 1) + REVERSE_COST_M * (reflection >> 1)
-        # backdrop stains what is seen obliquely; but hair comes from the crown, seen from below
+        # hair comes from the crown, which a level camera sees obliquely
         clean = np.where(parts[sources] == HEAD, seen[sources], evidence.cosines[sources])
         extra = extra + OBLIQUE_COST_M * (1.0 - clean)
         for part in range(len(BONE_OF_PART)):
