@@ -292,9 +292,7 @@ def reflect(
     return out
 
 
-def find_sources(
-    rig: Rig, frames: _BoneFrames, evidence: SkinEvidence, middle_x: float
-) -> Sources:
+def find_sources(rig: Rig, frames: _BoneFrames, evidence: SkinEvidence, middle_x: float) -> Sources:
     """The source of each patch, by the least cost."""
     seen = evidence.seen
     parts = rig.seed_parts.astype(np.int64)
