@@ -200,7 +200,9 @@ def serve(files: dict[str, bytes]) -> Iterator[Browser]:
     server = make_server(files, 8190)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:
-        with tempfile.TemporaryDirectory() as folder, Browser(Path(folder)) as browser:
+        # Chromium may still write while its folder is removed
+        kept = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+        with kept as folder, Browser(Path(folder)) as browser:
             browser.go(f"http://127.0.0.1:{server.server_port}/")
             until(lambda: browser.run("window.ready"), 60.0)
             yield browser

@@ -41,6 +41,9 @@ CODE_CONTRAST = 40.0
 """Density codes above and below the level to which densities are clipped."""
 NORMAL_SMOOTHINGS = 6
 """Averagings of normals over adjacent vertices, as a trained field is not quite smooth."""
+SIMPLIFICATION_GROWTHS = (2, 3, 7)
+"""How fast the permitted error grows from pass to pass: slowly (where edges go that cost least,
+half of the error is left), then faster if more triangles are left than wanted."""
 COLOR_STEP_M = 0.002
 """Step of the rays that give vertices their colors, metres."""
 COLOR_DEPTH_M = 0.03
@@ -160,7 +163,10 @@ def _simplify(
     """Return a surface of fewer triangles, with the normals of the nearest vertices."""
     import fast_simplification  # not needed by the player
 
-    found = fast_simplification.simplify(positions, faces, target_count=triangles)
+    found = positions, faces
+    for growth in SIMPLIFICATION_GROWTHS:
+        if len(found[1]) > triangles:
+            found = fast_simplification.simplify(*found, target_count=triangles, agg=growth)
     nearest = KDTree(positions).query(found[0])[1]
     return found[0].astype(np.float32), normals[nearest], found[1].astype(np.int32)
 
