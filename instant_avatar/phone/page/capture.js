@@ -39,7 +39,10 @@ async function begin(type, size) {
   const events = new EventSource(`films/${film}/messages`);
   const on = (kind, act) => events.addEventListener(kind, (event) => act(JSON.parse(event.data)));
   on("advice", ({ text, time }) => { say(text); $("advice").dataset.time = time; });
-  on("seconds", ({ seconds }) => { $("seconds").textContent = `${seconds.toFixed(0)} s looked at`; });
+  on("seconds", ({ seconds }) => {
+    $("seconds").textContent = `${seconds.toFixed(0)} s looked at`;
+    if (making && making === shown) $("note").textContent = `Making the avatar: ${$("seconds").textContent} …`; // a stored film
+  });
   on("map", ({ svg, seen }) => { $("map").innerHTML = svg; $("seen").textContent = ` · ${Math.round(100 * seen)} % of you seen`; });
   on("preview", ({ image }) => {
     $("preview").src = image; $("preview").hidden = false;
