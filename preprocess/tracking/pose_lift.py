@@ -5,10 +5,12 @@ an upper arm or a thigh twists about itself follows from where the elbow or the 
 distance is the one at which the body covers its key points in the image.
 
 Short stretches in which a tracker took the person's left for the right are repaired first: only
-frames close in time are compared, and only a stretch that both its neighbors contradict is changed.
+frames close in time are compared, and only a stretch that its longer neighbors contradict is
+changed.
 """
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -60,20 +62,23 @@ def repair_swaps(track: KeypointTrack) -> KeypointTrack:
 
 
 def find_swaps(track: KeypointTrack) -> Bool[np.ndarray, "rows"]:
-    """Rows in which left and right are exchanged, by their neighbors."""
+    """Rows in which left and right are exchanged, by their neighbors.
+
+    A stretch ends where left and right change at once, or at a gap, as where a video was cut.
+    """
     across = track.world_m[:, list(COMPARED_POINTS)]
     across = across - track.world_m[:, [point + 1 for point in COMPARED_POINTS]]
-    flat = across.reshape(len(track), -1)
-    near = np.diff(track.frames) <= MAX_GAP_FRAMES
-    turns = np.flatnonzero(near & (_cosines(flat) < MAX_COSINE)) + 1
+    turns = np.flatnonzero(_cosines(across.reshape(len(track), -1)) < MAX_COSINE) + 1
+    gaps = np.flatnonzero(np.diff(track.frames) > MAX_GAP_FRAMES) + 1
     swapped = np.zeros(len(track), dtype=bool)
-    bounds = [0, *turns.tolist(), len(track)]
-    for index in range(1, len(bounds) - 2):
-        start, stop = bounds[index], bounds[index + 1]
-        length = stop - start
-        beside = min(start - bounds[index - 1], bounds[index + 2] - stop)
-        if length <= min(MAX_STRETCH_FRAMES, beside) and not swapped[start - 1]:
-            swapped[start:stop] = True
+    for first, end in pairwise([0, *gaps.tolist(), len(track)]):
+        bounds = [first, *turns[(turns > first) & (turns < end)].tolist(), end]
+        lengths = np.diff(bounds).tolist()
+        for index, (start, stop) in enumerate(pairwise(bounds)):
+            beside = lengths[max(0, index - 1) : index] + lengths[index + 1 : index + 2]
+            is_short = beside and lengths[index] <= min(MAX_STRETCH_FRAMES, *beside)
+            if is_short and not (index and swapped[start - 1]):
+                swapped[start:stop] = True
     return swapped
 
 

@@ -65,6 +65,17 @@ def test_skin_outside_the_mask_or_the_picture_is_not_seen(rig, frame):
     assert not away.seen.any()
 
 
+def test_a_frame_in_which_the_person_is_turned_round_shows_little(rig, frame):
+    evidence, back = SkinEvidence(rig), facing(rig, TORSO, -1.0)
+    evidence.add(frame(turned=np.pi))
+    assert evidence.seen[back].mean() > 0.95
+    front = frame()
+    for _ in range(99):
+        evidence.add(front)
+    assert evidence.seen[back].max() < 0.3
+    assert evidence.seen[facing(rig, TORSO, 1.0)].mean() > 0.95
+
+
 def test_depth_is_known_where_several_sides_were_seen(rig, frame):
     evidence, face = SkinEvidence(rig), facing(rig, HEAD, 1.0)
     for turned in (-0.1, 0.0, 0.1):

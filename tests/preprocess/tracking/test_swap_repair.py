@@ -43,13 +43,21 @@ def _mirrored() -> np.ndarray:
     return order
 
 
-@pytest.mark.parametrize("stretch", [slice(20, 21), slice(20, 30), slice(52, 56)])
+@pytest.mark.parametrize("stretch", [slice(20, 21), slice(20, 30), slice(52, 56), slice(0, 3)])
 def test_a_short_stretch_is_exchanged_back(stretch):
     whole = turning_track(80, 4.0)
     swapped = swap(whole, stretch)
     repaired = repair_swaps(swapped)
     assert np.flatnonzero(find_swaps(swapped)).tolist() == list(range(stretch.start, stretch.stop))
     np.testing.assert_allclose(repaired.image_px, whole.image_px)
+    np.testing.assert_allclose(repaired.world_m, whole.world_m)
+
+
+def test_the_last_frames_before_a_gap_are_exchanged_back():
+    """A person who fades out is turned round."""
+    whole = turning_track(80, 4.0)
+    whole = replace(whole, frames=whole.frames + 16 * (whole.frames >= 50))
+    repaired = repair_swaps(swap(whole, slice(48, 50)))
     np.testing.assert_allclose(repaired.world_m, whole.world_m)
 
 
