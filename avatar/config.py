@@ -31,6 +31,9 @@ NOMINAL_STEPS_PER_S = 50.0
 """Training steps that stand for one second where steps are counted; two cores make about these."""
 MAX_SAMPLE_STEP_M = 0.015
 """Largest distance between samples along a ray, metres; limbs are five times as thick."""
+MAX_FINAL_STEP_M = 0.01
+"""The same at the end of training, metres: samples farther apart leave stripes, which show from the
+sides that were not filmed."""
 HELD_OUT_STRIDE = 10
 """Default stride between held-out frames."""
 
@@ -173,7 +176,7 @@ class TrainConfig:
         config = cls(
             seconds=seconds,
             steps=steps,
-            sample_step_m=min(max(1.2 * sampling_m, 0.004), MAX_SAMPLE_STEP_M),
+            sample_step_m=min(max(1.2 * sampling_m, 0.004), MAX_FINAL_STEP_M),
             finest_m=finest_m,
             table_size=1 << min(max(round(math.log2(entries)), 15), 19 if seconds > 120 else 17),
             pose_uncertainty=pose_uncertainty,
