@@ -220,7 +220,7 @@ def test_unseen_skin_becomes_like_its_sources(rig, clip, generator):
     front = [seen for seen in clip.observations if abs(seen.pose.root_rotation[1]) < 0.8]
     assert len(front) >= 2
     apart = []
-    for weight in (0.0, 0.4):
+    for weight in (0.0, 4.0):
         config = TrainConfig(
             rays=256, finest_m=0.02, table_size=1 << 13, sample_step_m=0.015,
             unseen_weight=weight, refine_poses=False,
@@ -240,8 +240,8 @@ def test_unseen_skin_becomes_like_its_sources(rig, clip, generator):
             float((sources * (colors - source_colors).abs().mean(dim=1)).sum() / sources.sum()),
         ])  # fmt: skip
     (opacity_without, color_without), (opacity_with, color_with) = apart
-    assert opacity_with < 0.95 * opacity_without  # 0.69 to 0.86 with other random numbers
-    assert color_with < 0.75 * color_without  # 0.45 to 0.50
+    assert opacity_with < 0.95 * opacity_without  # 0.87 to 0.89 with other random numbers
+    assert color_with < 0.55 * color_without  # 0.35 to 0.40
 
 
 def test_a_checkpoint_keeps_what_was_seen(rig, frame, tmp_path):
