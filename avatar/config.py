@@ -30,10 +30,11 @@ MAX_LOG_DENSITY_STEP = 4.0
 NOMINAL_STEPS_PER_S = 50.0
 """Training steps that stand for one second where steps are counted; two cores make about these."""
 MAX_SAMPLE_STEP_M = 0.015
-"""Largest distance between samples along a ray, metres; limbs are five times as thick."""
+"""Largest distance between samples along a ray at the beginning of training, metres; limbs are five
+times as thick."""
 MAX_FINAL_STEP_M = 0.01
-"""The same at the end of training, metres: samples farther apart leave stripes, which show from the
-sides that were not filmed."""
+"""Largest distance between samples along a ray at its end, metres: samples farther apart leave
+stripes, which show from the sides that were not filmed."""
 HELD_OUT_STRIDE = 10
 """Default stride between held-out frames."""
 

@@ -42,7 +42,7 @@ def save(trainer: Trainer, folder: Path, *, notes: dict[str, Any] | None = None)
 
 def current_state(trainer: Trainer, *, notes: dict[str, Any] | None = None) -> dict[str, Any]:
     """The content of a checkpoint; its tensors are the trainer's own, and change with it."""
-    occupancy = trainer.avatar.occupancy.density_grid
+    occupancy, evidence = trainer.avatar.occupancy.density_grid, trainer.unseen.evidence
     return {
         "format": CHECKPOINT_FORMAT,
         "config": dataclasses.asdict(trainer.config),
@@ -65,7 +65,9 @@ def current_state(trainer: Trainer, *, notes: dict[str, Any] | None = None) -> d
             frame: torch.from_numpy(gain) for frame, gain in trainer.exposures.by_frame.items()
         },
         "shading": trainer.learner.shading.coefficients,
-        "seen": torch.from_numpy(trainer.unseen.evidence.cosines),
+        "seen": torch.from_numpy(evidence.cosines),
+        "seen_frames": torch.from_numpy(evidence.seen_frames),
+        "evidence_frame_count": evidence.frame_count,
         "notes": notes or {},
     }
 
@@ -135,7 +137,10 @@ def _restored(state: dict[str, Any]) -> Trainer:
     }
     trainer.exposures.restore({frame: gain.numpy() for frame, gain in state["gains"].items()})
     trainer.learner.shading.restore(state["shading"])
-    trainer.unseen.evidence.cosines[:] = state["seen"].numpy()
+    evidence, cosines = trainer.unseen.evidence, state["seen"].numpy()
+    evidence.cosines[:] = cosines
+    evidence.seen_frames[:] = state.get("seen_frames", cosines > 0.0)  # of earlier versions
+    evidence.frame_count = state.get("evidence_frame_count", 1)
     for name in COUNTERS:
         setattr(trainer, name, state["counts"][name])
     return trainer

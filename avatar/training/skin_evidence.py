@@ -23,8 +23,9 @@ which it counts as seen (66°)."""
 BORDER_PX = 0.5, 3.0
 """Distances from the person's outline up to which a pixel shows the background's color, and from
 which the skin's alone: a video has one color for each 2 x 2 pixels, and smears it."""
-GLIMPSE_SHARE = 0.03
-"""Share of frames from which a patch counts as seen: a tracker turns the person round in some."""
+SEEN_FRAME_SHARE = 0.03
+"""Share of the frames that must show a patch squarely for it to count as seen in full: in a few
+frames a tracker may turn the person round."""
 DEPTH_UNKNOWN_SPREAD, DEPTH_KNOWN_SPREAD = 0.3, 0.8
 """Standard deviations of the directions from which a patch was seen, up to which its depth counts
 as unknown, and from which as known, radians: about those of a sixth of a turn, and of a whole."""
@@ -32,12 +33,17 @@ as unknown, and from which as known, radians: about those of a sixth of a turn, 
 
 @final
 class SkinEvidence:
-    """Largest cosine at which each patch of a rig's skin was seen, in [0, 1]; 0 if it never was.
+    """How each patch of a rig's skin was seen; less near the person's outline (`BORDER_PX`).
 
-    It is reduced near the person's outline (`BORDER_PX`).
+    Attributes:
+        cosines: Largest cosine at which it was seen, in [0, 1]; 0 if it never was.
+        seen_frames: Number of frames that showed it squarely; an oblique view counts less.
+        frame_count: Number of all frames.
     """
 
     cosines: Float32[np.ndarray, "seeds"]
+    seen_frames: Float32[np.ndarray, "seeds"]
+    frame_count: int
 
     def __init__(self, rig: Rig) -> None:
         """Starts with every patch unseen."""
@@ -45,7 +51,7 @@ class SkinEvidence:
         self._weights = rig.weights_at(rig.seeds)
         self.cosines = np.zeros(len(rig.seeds), dtype=np.float32)
         self._direction_sums, self._frames = np.zeros((len(rig.seeds), 3)), np.zeros(len(rig.seeds))
-        self._square_frames, self._frame_count = np.zeros(len(rig.seeds)), 0
+        self.seen_frames, self.frame_count = np.zeros(len(rig.seeds), dtype=np.float32), 0
 
     def add(self, frame: TrainingFrame) -> None:
         """Takes in what a frame shows: patches that face the camera, unoccluded, in the mask."""
@@ -68,8 +74,8 @@ class SkinEvidence:
         cosines = cosines * _smooth_step(within, *BORDER_PX)
         cosines = np.where(shown, cosines, 0.0)
         np.maximum(self.cosines, cosines, out=self.cosines)
-        self._square_frames += _smooth_step(cosines, UNSEEN_COSINE, SEEN_COSINE)
-        self._frame_count += 1
+        self.seen_frames += _smooth_step(cosines, UNSEEN_COSINE, SEEN_COSINE)
+        self.frame_count += 1
         canonical = np.einsum("pab,pa->pb", blends[..., :3], to_camera)
         canonical /= np.maximum(np.linalg.norm(canonical, axis=1, keepdims=True), 1e-9)
         self._direction_sums += shown[:, None] * canonical
@@ -78,9 +84,9 @@ class SkinEvidence:
     @property
     def seen(self) -> Float32[np.ndarray, "seeds"]:
         """Degree to which each patch was seen, in [0, 1]: smooth steps of its cosine and share."""
-        shares = self._square_frames / max(self._frame_count, 1)
+        shares = self.seen_frames / max(self.frame_count, 1)
         squarely = _smooth_step(self.cosines, UNSEEN_COSINE, SEEN_COSINE)
-        return squarely * _smooth_step(shares, 0.0, GLIMPSE_SHARE)
+        return squarely * _smooth_step(shares, 0.0, SEEN_FRAME_SHARE)
 
     @property
     def depth_known(self) -> Float32[np.ndarray, "seeds"]:

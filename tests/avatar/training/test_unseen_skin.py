@@ -249,4 +249,7 @@ def test_a_checkpoint_keeps_what_was_seen(rig, frame, tmp_path):
     trainer.add_frame(frame())
     checkpoint.save(trainer, tmp_path)
     loaded, _ = checkpoint.load(tmp_path)
-    np.testing.assert_array_equal(loaded.unseen.evidence.cosines, trainer.unseen.evidence.cosines)
+    kept, seen = loaded.unseen.evidence, trainer.unseen.evidence
+    np.testing.assert_array_equal(kept.cosines, seen.cosines)
+    assert kept.seen[facing(rig, TORSO, 1.0)].mean() > 0.95
+    np.testing.assert_array_equal(kept.seen, seen.seen)
