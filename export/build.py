@@ -47,7 +47,7 @@ from export.package.player_tables import (
 )
 from export.package.table_codec import TableLayout, estimate_brick_bytes
 from export.player import (
-    MIN_CLOSE_FRACTION,
+    MIN_SAME_PSNR,
     PictureDifference,
     Player,
     picture_on_white,
@@ -418,10 +418,10 @@ def check_graph(player: Player, package: AvatarPackage, tier: str, frame: Golden
     difference = PictureDifference.of(drawn, draw_reference(tables, settings, inputs))
     if not difference.matches:
         raise ExportRefused(
-            f"In one view the player's graph ({tier}) is within 2/255 of its reference on only "
-            f"{difference.close_fraction:.2%} of the pixels; {MIN_CLOSE_FRACTION:.1%} are "
-            "required. Nothing was written; the checkpoint is kept. This is a fault of the "
-            "program: please report it with the version of onnxruntime."
+            f"In one view the player's graph ({tier}) is {difference.psnr:.1f} dB from its "
+            f"reference; at least {MIN_SAME_PSNR:.0f} dB are required. Nothing was written; the "
+            "checkpoint is kept. This is a fault of the program: please report it with the version "
+            "of onnxruntime."
         )
     return difference.largest_difference
 

@@ -14,8 +14,7 @@ from capture.camera import Camera
 from export.package.manifest import Manifest
 from export.package.package_file import read_package
 from export.player import (
-    MAX_CLOSE_DIFFERENCE,
-    MIN_CLOSE_FRACTION,
+    MIN_SAME_PSNR,
     Player,
     compare_golden_frames,
     find_provider,
@@ -46,7 +45,7 @@ def verify_package(path: Path, *, provider: str) -> dict[str, Any]:
 
     Returns:
         JSON: the verdict ("same" if all golden frames match, of which there is at least one), and
-        for each frame the largest difference (in 1/255) and the fraction of close pixels.
+        for each frame the largest difference (in 1/255), the fraction of close pixels and the PSNR.
     """
     package = read_package(path, tier=None)
     frames = compare_golden_frames(package, provider=provider)
@@ -61,6 +60,7 @@ def verify_package(path: Path, *, provider: str) -> dict[str, Any]:
             {
                 "largest": round(frame.largest_difference, 3),
                 "close": round(frame.close_fraction, 6),
+                "psnr": round(frame.psnr, 2),
             }
             for frame in frames
         ],
@@ -71,15 +71,14 @@ def verdict_lines(result: dict[str, Any]) -> list[str]:
     """Return a line for each golden frame of a `verify_package`, and the verdict."""
     lines = [
         f"golden frame {number}: "
-        f"{'same' if frame['close'] >= MIN_CLOSE_FRACTION else 'DIFFERENT'} "
-        f"({frame['close']:.2%} within {MAX_CLOSE_DIFFERENCE}/255, largest difference "
-        f"{frame['largest']:.0f}/255)"
+        f"{'same' if frame['psnr'] >= MIN_SAME_PSNR else 'DIFFERENT'} "
+        f"({frame['psnr']:.1f} dB, largest difference {frame['largest']:.0f}/255)"
         for number, frame in enumerate(result["frames"])
     ]
     where = f"{result['provider']}, onnxruntime {result['onnxruntime']}"
     if result["verdict"] == "same":
         return [*lines, f"verdict: same ({where})"]
-    different = sum(frame["close"] < MIN_CLOSE_FRACTION for frame in result["frames"])
+    different = sum(frame["psnr"] < MIN_SAME_PSNR for frame in result["frames"])
     verdict = (
         f"verdict: DIFFERENT; {different} of {len(lines)} golden frames ({where}). Update "
         "onnxruntime, try --provider cpu, or report it with these lines."

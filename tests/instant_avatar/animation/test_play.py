@@ -183,6 +183,7 @@ def test_golden_frames_look_the_same_here(call_play, package, tmp_path):
     assert found["verdict"] == "same"
     assert found["provider"] == "CPUExecutionProvider"
     assert min(frame["close"] for frame in found["frames"]) >= 0.999
+    assert min(frame["psnr"] for frame in found["frames"]) >= 48.0
 
 
 def test_different_golden_frames_set_the_exit_code(call_play, package, tmp_path):
