@@ -21,7 +21,7 @@ from PIL import Image
 from avatar.avatar_model import Avatar
 from avatar.evaluation.image_metrics import psnr
 from avatar.render import render
-from avatar.rig import Rig
+from avatar.rig import Rig, canonical_rotations
 from capture.input_error import InputError
 from export.bake.bake_tables import BakeConfig, ExportRefused, bake_tables, sample_field
 from export.bake.fine_tuning import (
@@ -38,12 +38,22 @@ from export.bake.proxy_surface import FieldFunction
 from export.bake.reference_player import PlayerInputs, draw_reference
 from export.graph.player_graph import build_graph
 from export.package.manifest import LICENCE_NOTE, MAX_GOLDEN_PX, GoldenFrame, Manifest, TierInfo
-from export.package.package_file import AvatarPackage, PackageWriter
+from export.package.package_file import (
+    COARSE_GRAPH,
+    AvatarPackage,
+    PackageWriter,
+    write_package,
+)
 from export.package.player_tables import (
+    BRICK_NODES,
     QUALITY_TIERS,
     THICK_FIELD_TIERS,
+    WEIGHT_SCALE,
+    BrickTable,
     PlayerTables,
     RenderSettings,
+    SkinningGrid,
+    SurfelTable,
 )
 from export.package.table_codec import TableLayout, estimate_brick_bytes
 from export.player import (
@@ -55,6 +65,7 @@ from export.player import (
     straighten,
 )
 from export.player_inputs import fit_camera
+from preprocess.body.kinematics import PARENTS
 
 GRAPH_CHECK_PICTURES = {"hq": 2, "lite": 1}
 """Golden frames on which each tier's graph is compared with its reference, 0.2 s each. They test
@@ -155,8 +166,45 @@ def write_draft(avatar: Avatar, path: Path, view: PosedView) -> None:
         package = _unchecked_package(baking.result(), QUALITY_TIERS, avatar.rig, (), {})
         serialized = executor.map(lambda tier: _serialized_graph(package, tier), QUALITY_TIERS)
         writer.add_tables(baking.result())
-        graphs = dict(zip(QUALITY_TIERS, serialized, strict=True))
+        graphs = dict(zip(QUALITY_TIERS, serialized, strict=True)) | _coarse_graph(package)
         writer.finish(replace(package, graphs=graphs, preview=_encode_png(straighten(drawn))))
+
+
+def write_practice_package(path: Path) -> None:
+    """Write a package of two surfels, as high as a person, and an empty brick.
+
+    A browser that has drawn it has compiled what draws an avatar.
+    """
+    origin = np.zeros(3, np.float32)
+    tables = PlayerTables(
+        surfels=SurfelTable(
+            low=origin - 1.0, extent_m=2.0, spacing_m=0.01,
+            position_codes=np.array([[1 << 15, 0, 1 << 15], [1 << 15, 65535, 1 << 15]], np.uint16),
+            normal_codes=np.array([[0, 0, 127]] * 2, np.int8),
+            thickness_codes=np.full(2, 40, np.uint8),
+        ),
+        bricks=BrickTable(
+            low=origin, voxel_m=0.01, index=np.ones((1, 1, 1), np.int32),
+            voxels=np.zeros((2, *[BRICK_NODES] * 3, 4), np.uint8),
+        ),
+        skinning=SkinningGrid(
+            low=origin - 2.0, step_m=origin + 4.0,
+            index=np.arange(1, 9, dtype=np.int32).reshape(2, 2, 2),
+            weight_codes=np.eye(24, 1, dtype=np.uint16).repeat(9, axis=1) * WEIGHT_SCALE,
+        ),
+        pelvis=origin, reach_m=2.0,
+    )  # fmt: skip
+    manifest = Manifest(
+        rest_joints=np.zeros((24, 3)), parents=np.array(PARENTS),
+        canonical_rotations=canonical_rotations(), tiers=_tier_notes(tables, QUALITY_TIERS),
+        golden=(), metrics={}, sha256={},
+    )  # fmt: skip
+    package = AvatarPackage(
+        manifest=manifest, graphs={}, tables=dict.fromkeys(QUALITY_TIERS, tables), golden=(),
+        preview=_encode_png(np.zeros((1, 1, 4), np.uint8)),
+    )  # fmt: skip
+    graphs = {tier: _serialized_graph(package, tier) for tier in QUALITY_TIERS}
+    write_package(replace(package, graphs=graphs | _coarse_graph(package)), path)
 
 
 def export_field(
@@ -295,6 +343,12 @@ def _serialized_graph(package: AvatarPackage, tier: str) -> bytes:
     return build_graph(package.tables[tier], settings).SerializeToString()
 
 
+def _coarse_graph(package: AvatarPackage) -> dict[str, bytes]:
+    """Build the graph by which a page draws its first picture, of the tables of "lite"."""
+    settings = replace(package.manifest.tiers["lite"].settings, layers=1, max_blocks=1)
+    return {COARSE_GRAPH: build_graph(package.tables["lite"], settings).SerializeToString()}
+
+
 def _prepare_player(package: AvatarPackage, tier: str) -> tuple[bytes, Player]:
     """Build the graph of a tier, and its player."""
     graph = _serialized_graph(package, tier)
@@ -337,7 +391,7 @@ def _checked_package(
     return replace(
         package,
         manifest=replace(manifest, tiers=tiers, metrics={**manifest.metrics, "warnings": warnings}),
-        graphs={tier: graph for tier, (graph, _) in players.items()},
+        graphs={tier: graph for tier, (graph, _) in players.items()} | _coarse_graph(package),
         golden=tuple(golden),
         preview=_encode_png(preview),
     )
@@ -351,15 +405,6 @@ def _unchecked_package(
     metrics: Mapping[str, Any],
 ) -> AvatarPackage:
     """Build the package without graphs, scores and pictures."""
-    notes = {
-        tier: TierInfo(
-            layout=TableLayout.of(tables),
-            settings=rule,
-            psnr_to_renderer=0.0,
-            largest_difference=0.0,
-        )
-        for tier, rule in settings.items()
-    }
     golden = [
         GoldenFrame(pose=pose, camera=fit_camera(camera, MAX_GOLDEN_PX))
         for pose, camera in views[:MAX_GOLDEN_FRAMES]
@@ -369,7 +414,7 @@ def _unchecked_package(
             rest_joints=rig.rest_joints,
             parents=rig.parents,
             canonical_rotations=rig.canonical_rotations,
-            tiers=notes,
+            tiers=_tier_notes(tables, settings),
             golden=tuple(golden),
             metrics=dict(metrics),
             licence=" ".join(
@@ -382,6 +427,17 @@ def _unchecked_package(
         golden=(),
         preview=b"",
     )
+
+
+def _tier_notes(
+    tables: PlayerTables, settings: Mapping[str, RenderSettings]
+) -> dict[str, TierInfo]:
+    """Describe tiers that were not checked."""
+    layout = TableLayout.of(tables)
+    return {
+        tier: TierInfo(layout=layout, settings=rule, psnr_to_renderer=0.0, largest_difference=0.0)
+        for tier, rule in settings.items()
+    }
 
 
 def _encode_png(rgba: UInt8[np.ndarray, "height width 4"]) -> bytes:

@@ -117,7 +117,7 @@ def trace_depth_layer(
         direction_camera=ray, begin=begin, end=end,
         start_canonical=start, direction_canonical=direction,
     )  # fmt: skip
-    if front is not None:
+    if front is not None or context.settings.max_blocks == 1:
         color, light = _composite_in_one_block(context, segment)
     else:
         color, light = march_segments(context, surface.posed, segment, surface.close_up)
@@ -137,7 +137,7 @@ def trace_depth_layer(
 def _composite_in_one_block(
     context: GraphContext, segment: SegmentValues
 ) -> tuple[GraphValue, GraphValue]:
-    """Composite the segments of a further layer; return premultiplied color and transmittance."""
+    """Composite segments in one block; return premultiplied color and transmittance."""
     settings, ones = context.settings, segment.begin * 0.0 + 1.0
     block = composite_samples(
         context, segment, ones, settings.further_layer_samples, settings.max_segment_m

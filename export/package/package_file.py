@@ -22,6 +22,9 @@ MANIFEST_ENTRY = "manifest.json"
 """Entry of the manifest."""
 PREVIEW_ENTRY = "preview.png"
 """Entry of the preview."""
+COARSE_GRAPH = "coarse"
+"""Name of the graph that draws one depth layer in one block: a page's session of it is made in half
+the time, and draws the first picture. Older packages lack it."""
 MAX_UNPACKED_BYTES = 512 << 20
 """Most bytes that the entries of a package hold together; those of an avatar hold 20 MB."""
 ENTRY_TIMESTAMP = (1980, 1, 1, 0, 0, 0)
@@ -33,7 +36,7 @@ class AvatarPackage:
     """Content of a package, from which an avatar is drawn without torch.
 
     Attributes:
-        graphs: ONNX model of each tier; its tables are external.
+        graphs: ONNX model of each tier, and the coarse one (`COARSE_GRAPH`); tables are external.
         tables: Tables of each tier, the same object for all.
         golden: Pictures of `manifest.golden`, straight alpha.
         preview: A PNG.
@@ -47,7 +50,7 @@ class AvatarPackage:
 
 
 def graph_entry(tier: str) -> str:
-    """Return the entry of a tier's graph; "hq" has player.onnx."""
+    """Return the entry of a tier's graph, or of the coarse one; "hq" has player.onnx."""
     return "player.onnx" if tier == "hq" else f"{tier}/player.onnx"
 
 
@@ -196,6 +199,8 @@ def _read_archive(archive: zipfile.ZipFile, path: Path, tier: str | None) -> Ava
     layout = manifest.tiers["hq"].layout
     streams = {name: checked(stream_entry(name)) for name in layout.stream_types()}
     tiers = {name: n for name, n in manifest.tiers.items() if tier in (None, name)}
+    has_coarse = tier is None and graph_entry(COARSE_GRAPH) in manifest.sha256
+    graphs = [*tiers, COARSE_GRAPH] if has_coarse else [*tiers]
     try:
         tables = decode_tables(streams, layout)
         golden = [
@@ -208,7 +213,7 @@ def _read_archive(archive: zipfile.ZipFile, path: Path, tier: str | None) -> Ava
         raise InputError(f"{path} is damaged: {error}. Export it again.") from error
     return AvatarPackage(
         manifest=manifest,
-        graphs={name: checked(graph_entry(name)) for name in tiers},
+        graphs={name: checked(graph_entry(name)) for name in graphs},
         tables=dict.fromkeys(tiers, tables),
         golden=tuple(golden),
         preview=checked(PREVIEW_ENTRY),

@@ -43,7 +43,8 @@ class RenderSettings:
     """Blocks at the nominal spacing; each later block doubles the spacing of the one before."""
     max_blocks: int = 6
     """Blocks per ray; the last covers what remains. Both counts are one more in close-ups
-    (`MIN_FOOTPRINT_PX`), and grow with the number of samples."""
+    (`MIN_FOOTPRINT_PX`), and grow with the number of samples. 1: all rays are drawn as those of
+    further layers are, whatever the number of samples."""
     further_layer_samples: int = 6
     """Density samples of a ray in each layer after the first, in a single block."""
     min_transmittance: float = 0.01

@@ -5,14 +5,15 @@ import json
 import tempfile
 import threading
 from collections import deque
-from collections.abc import Awaitable, Callable
-from contextlib import suppress
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, final
 
 from aiohttp import web
 
 from capture.input_error import InputError
+from export.build import write_practice_package
 from export.package.package_file import read_package
 from export.player_page import (
     ORT_WEB_VERSION,
@@ -35,14 +36,15 @@ COOKIES = {False: "session", True: "session-tls"}
 page without TLS may not replace one of a page with it."""
 MAX_PIECE_BYTES = 8 << 20
 """Largest piece of a film, bytes."""
-MAX_REQUESTS_PER_S = 60
-"""Requests of one browser in a second, above which it must wait."""
+MAX_REQUESTS_PER_S = 120
+"""Requests of one browser in a second, above which it must wait; a player makes twenty."""
 PIECE_TIMEOUT_S = 60.0
 """Longest time that one piece may take, seconds."""
 HEARTBEAT_S = 5.0
 """Longest time without a message to a page, seconds: proxies cut silent connections."""
-POLL_S = 0.02
-"""Interval at which a package is looked for that is waited for, seconds."""
+PRACTICE = "-"
+"""Name of an avatar of two points, which the page's hidden player draws before a film: the browser
+has then compiled what draws the film's avatar. Names of films do not end in a dash."""
 MESHES = ("avatar.glb", "avatar.vrm", "avatar.ply", "avatar.obj")
 """Meshes that the page offers."""
 MESH_TRIANGLES = 20_000
@@ -79,6 +81,7 @@ class PhoneServer:
         self.on_entered: Callable[[], object] = lambda: None
         self._loop = asyncio.new_event_loop()
         self._player: dict[str, bytes] = {}
+        self._practice = b""
         self._requests: dict[str, deque[float]] = {}
         self._exporting = asyncio.Lock()  # meshes are costly: one at a time
         self._listeners: dict[str, set[asyncio.Event]] = {}
@@ -178,8 +181,8 @@ class PhoneServer:
         policy = "default-src 'self'; img-src 'self' data: blob:; media-src 'self' blob:"
         headers = {"Content-Security-Policy": f"{policy}; base-uri 'none'; form-action 'none'"}
         live = "here" if request.secure else "elsewhere" if self._live_port else "no"
-        module = f"runtime/{MODULE_FILE}" if self._player else ""
-        text = text.replace("{{live}}", live).replace("{{module}}", module)
+        practice = f"avatars/{PRACTICE}/?start=lite&practice" if self._player else ""
+        text = text.replace("{{live}}", live).replace("{{practice}}", practice)
         return web.Response(text=text, content_type="text/html", headers=headers)
 
     async def _go_live(self, request: web.Request) -> web.Response:
@@ -196,7 +199,7 @@ class PhoneServer:
         return web.Response(body=path.read_bytes(), headers={"Content-Type": kind})
 
     async def _runtime(self, request: web.Request) -> web.Response:
-        """The player's WebAssembly module, which the page fetches during filming."""
+        """The player's WebAssembly module."""
         if request.match_info["file"] != MODULE_FILE or not self._player:
             raise InputError("There is no such file.")
         return web.Response(body=self._player[WEB_MODULE], headers=HEADERS | KEPT)
@@ -253,17 +256,26 @@ class PhoneServer:
         for listener in self._listeners.get(number, ()):
             listener.set()
 
+    @contextmanager
+    def _listening(self, film: Film) -> Iterator[asyncio.Event]:
+        """Set an event at each message to a film's page."""
+        woken, listeners = asyncio.Event(), self._listeners.setdefault(film.number, set())
+        listeners.add(woken)
+        try:
+            yield woken
+        finally:
+            listeners.discard(woken)
+
     async def _messages(self, request: web.Request) -> web.StreamResponse:
         """Send the newest message of each kind; a slow browser misses older ones."""
-        film, woken, after = self._film(request), asyncio.Event(), 0
+        film, after = self._film(request), 0
         headers = {**HEADERS, "Content-Type": "text/event-stream"}
         answer = web.StreamResponse(headers=headers)
         await answer.prepare(request)
-        listeners = self._listeners.setdefault(film.number, set())
-        listeners.add(woken)
-        try:
+        with suppress(ConnectionError), self._listening(film) as woken:
             while True:
                 is_over = film.is_over
+                woken.clear()
                 for number, kind, content in film.messages(after):
                     after = number
                     text = f"event: {kind}\ndata: {json.dumps(content)}\n\n"
@@ -271,15 +283,11 @@ class PhoneServer:
                 if is_over:
                     await answer.write(b"event: over\ndata: {}\n\n")
                     return answer
-                woken.clear()
                 try:
                     await asyncio.wait_for(woken.wait(), HEARTBEAT_S)
                 except TimeoutError:
                     await answer.write(b": alive\n\n")
-        except ConnectionError:
-            return answer
-        finally:
-            listeners.discard(woken)
+        return answer
 
     async def _avatars(self, request: web.Request) -> web.Response:
         return web.json_response(self._queue.avatars())
@@ -300,9 +308,15 @@ class PhoneServer:
             kind = MIME_TYPES.get(Path(file).suffix, "application/octet-stream")
             body = titled(body, name) if file == "index.html" else body
             return web.Response(body=body, headers={"Content-Type": kind})
+        if name == PRACTICE:
+            self._practice = self._practice or await asyncio.to_thread(_practice_package)
+            return web.Response(body=self._practice)
         film = next((film for film in self._queue if film.place.name == name), None)
-        while film is not None and film.has_turn and not (film.is_playable or film.is_over):
-            await asyncio.sleep(POLL_S)
+        if film is not None:
+            with self._listening(film) as woken:
+                while film.has_turn and not (film.is_playable or film.is_over):
+                    woken.clear()
+                    await woken.wait()
         package = self._queue.package(name)
         saved = {"Content-Disposition": f'attachment; filename="{name}{Path(file).suffix}"'}
         if file == PACKAGE_FILE:
@@ -324,6 +338,13 @@ def _player_files() -> dict[str, bytes]:
     """The files of a player's page with the built-in motion."""
     motion = demo_motion()
     return player_files(motion, pose_rate(motion), compression_level=1)
+
+
+def _practice_package() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / PACKAGE_FILE
+        write_practice_package(path)
+        return path.read_bytes()
 
 
 def _mesh(package: Path, file: str, author: str) -> bytes:

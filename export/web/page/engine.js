@@ -52,20 +52,21 @@ export class Engine {
     return this.taken;
   }
 
-  open(tier) {
-    this.opened[tier] ??= this.prepare(tier).catch((error) => {
+  /** Prepare a tier; its first picture is drawn by another graph, `coarse`, if there is one of that name. */
+  open(tier, coarse) {
+    this.opened[tier] ??= this.prepare(tier, this.graphOf[coarse]).catch((error) => {
       delete this.opened[tier];
       throw error;
     });
     return this.opened[tier];
   }
 
-  async prepare(tier) {
+  async prepare(tier, coarse) {
     this.onProgress({ preparing: true });
     const decoded = this.taken.then(() => this.tables.ask("decode", { tier }));
     const [{ tables }] = await Promise.all([decoded, this.loaded]);
     const held = Object.values(tables).map((table) => table.buffer);
-    await this.graphs.ask("open", { tier, graph: this.graphOf[tier], tables }, held);
+    await this.graphs.ask("open", { tier, graph: this.graphOf[tier], coarse, tables }, held);
   }
 
   close() {

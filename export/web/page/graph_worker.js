@@ -3,7 +3,7 @@
 import { InferenceSession, Tensor, env } from "./runtime/ort.js";
 import { answer } from "./worker_calls.js";
 
-const sessions = {};
+const sessions = {}, finer = {}; // by tier; what to make before each of the next pictures
 
 /** Start the runtime, a WebAssembly module. */
 async function load({ wasm }) {
@@ -14,8 +14,13 @@ async function load({ wasm }) {
   env.logLevel = "error";
 }
 
-async function open({ tier, graph, tables }) {
-  sessions[tier] = await InferenceSession.create(graph, {
+async function open({ tier, graph, coarse, tables }) {
+  sessions[tier] = await sessionOf(coarse ?? graph, tables);
+  if (coarse) finer[tier] = [null, () => sessionOf(graph, tables)];
+}
+
+function sessionOf(graph, tables) {
+  return InferenceSession.create(graph, {
     executionProviders: ["wasm"],
     graphOptimizationLevel: "disabled", // they take longer than they win: half of loading, 2 % of a picture
     executionMode: "parallel", // still one thread, but reuse of memory is not planned: 60 % of loading
@@ -25,6 +30,11 @@ async function open({ tier, graph, tables }) {
 
 async function draw({ tier, bones, camera, width, height, samples }) {
   const whole = (number) => new Tensor("int64", BigInt64Array.of(BigInt(number)), []);
+  const make = finer[tier]?.shift(), coarse = sessions[tier];
+  if (make) {
+    sessions[tier] = await make();
+    await coarse.release();
+  }
   const began = performance.now();
   const { rgba } = await sessions[tier].run({
     bones: new Tensor("float32", bones, [24, 12]),

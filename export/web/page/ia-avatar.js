@@ -76,7 +76,7 @@ export class IaAvatar extends HTMLElement {
     const progress = (news) => { if (!isStale()) this.tell("progress", news); };
     const player = await Player.load(src, motion, progress, (blob) => { if (!isStale()) this.preview(blob); });
     if (!(this.state.tier in player.avatar.tiers)) this.state.tier = "hq";
-    await player.open(this.state);
+    await player.open(this.state, true);
     if (isStale()) return player.engine.close();
     const orbit = new Orbit(player.avatar.look);
     Object.assign(this, { player, orbit });

@@ -170,12 +170,17 @@ function bricks({ blocks, voxels }, { bricks: count, brick_counts }) {
 
 function surfels({ positions, normals, thickness }, { surfels: count, surfel_low, surfel_extent_m }) {
   const f = Math.fround, step = f(surfel_extent_m / 65535);
-  const found = { thickness: Float32Array.from(thickness, (code) => f(code) * f(THICKNESS_STEP_M)) };
+  const floats = (codes, value) => { // three times as fast as Float32Array.from
+    const found = new Float32Array(codes.length);
+    for (let i = 0; i < found.length; i++) found[i] = value(codes[i]);
+    return found;
+  };
+  const found = { thickness: floats(thickness, (code) => f(code) * f(THICKNESS_STEP_M)) };
   [..."xyz"].forEach((letter, axis) => {
     const part = [axis * count, (axis + 1) * count], low = f(surfel_low[axis]);
     const codes = sums(new Uint16Array(positions.buffer).slice(...part));
-    found[`position_${letter}`] = Float32Array.from(codes, (code) => low + f(code * step));
-    found[`normal_${letter}`] = Float32Array.from(new Int8Array(normals.buffer).subarray(...part), (code) => code / 127);
+    found[`position_${letter}`] = floats(codes, (code) => low + f(code * step));
+    found[`normal_${letter}`] = floats(new Int8Array(normals.buffer).subarray(...part), (code) => code / 127);
   });
   return found;
 }

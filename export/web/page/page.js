@@ -16,7 +16,8 @@ export function start() {
   const loading = new Loading(), avatar = $("picture"), { state } = avatar;
   $("name").textContent = document.title;
   state.barPx = BAR_PX;
-  state.tier = new URLSearchParams(location.search).get("start") ?? "hq";
+  const options = new URLSearchParams(location.search);
+  state.tier = options.get("start") ?? "hq";
   avatar.addEventListener("progress", ({ detail }) => loading.onProgress(detail));
   avatar.addEventListener("failed", ({ detail }) => loading.failed(detail.message));
   avatar.addEventListener("picture", ({ detail }) => tell(detail, avatar.player));
@@ -30,6 +31,11 @@ export function start() {
     loading.done();
     if (state.tier !== "hq") tryFull(player, state, avatar.playback);
   });
+  if (options.has("practice")) { // out of sight: draws one coarse picture and one sharp one
+    avatar.toggleAttribute("paused", true);
+    state.chosen = true;
+    avatar.seen(true);
+  } else if (!avatar.loading) avatar.load(); // also where it is not seen yet
   document.addEventListener("keydown", (event) => { // before anything was clicked
     const { key, ctrlKey, metaKey, altKey } = event;
     if (event.target === document.body) avatar.dispatchEvent(new KeyboardEvent("keydown", { key, ctrlKey, metaKey, altKey }));

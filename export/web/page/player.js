@@ -7,6 +7,7 @@ import { fetched, readMotion, unzip } from "./package.js";
 
 const CLOSE = 2; // largest difference of a premultiplied channel between close pixels, in 1/255
 const ALIKE = 0.999; // least fraction of close pixels in pictures that count as the same
+const COARSE = "coarse"; // the graph of one depth layer in one block (export/package/package_file.py)
 const POSE = 75; // numbers in a pose: root rotation, root translation, 23 axis-angles
 
 export class Player {
@@ -37,8 +38,8 @@ export class Player {
     const graphs = {};
     const taken = engine.take({ buffer, graphs, tiers: avatar.tiers });
     onPreview(new Blob([await entries["preview.png"]()], { type: "image/png" }));
-    await Promise.all(Object.keys(avatar.tiers).map(async (tier) => {
-      graphs[tier] = await entries[tier === "hq" ? "player.onnx" : `${tier}/player.onnx`]();
+    await Promise.all([COARSE, ...Object.keys(avatar.tiers)].map(async (tier) => {
+      graphs[tier] = await entries[tier === "hq" ? "player.onnx" : `${tier}/player.onnx`]?.();
     }));
     const standing = new Float32Array(POSE);
     standing.set(avatar.canonical_rotations.flat(), 6);
@@ -60,8 +61,9 @@ export class Player {
     return this.poses.subarray(POSE * row, POSE * (row + 1));
   }
 
-  open({ tier }) {
-    return this.engine.open(tier);
+  /** Prepare a tier; soon: the first picture of "lite" is drawn by a coarser graph, if the package has one. */
+  open({ tier }, soon = false) {
+    return this.engine.open(tier, soon && tier === "lite" && COARSE);
   }
 
   /** The camera, coarser where surfels would leave gaps in a close-up (export/player_inputs.py). */

@@ -7,7 +7,7 @@ const COUNTDOWN_S = 5;
 const PIECE_MS = 100; // length of what the camera hands over at once
 const SPOKEN_AGAIN_MS = 9000;
 const KINDS = ["video/webm;codecs=h264", "video/mp4;codecs=avc1.42E01E", "video/webm;codecs=vp8", "video/webm", "video/mp4"];
-let adding = "", making = "", facing = "environment", stream = null, shown = "";
+let adding = "", making = "", facing = "environment", stream = null, shown = "", playing = "";
 
 function view(name) {
   for (const id of ["home", "filming", "done"]) $(id).hidden = id !== name;
@@ -64,8 +64,17 @@ async function begin(type, size) {
     if (state === "filming") resolve();
     if (state === "done" && !$("done").hidden) $("note").textContent = "It is ready.";
   }));
+  play(avatar);
   return film;
 }
+
+/** Start the player of an avatar; before there is one, it waits for the film's package. */
+function play(name) {
+  playing = name;
+  $("player").src = `avatars/${encodeURIComponent(name)}/?start=lite`;
+}
+
+const hasFailed = () => $("player").contentDocument?.querySelector("#status.failed");
 
 async function transfer(film, source) {
   await send(film, source, (bytes) => {
@@ -74,7 +83,7 @@ async function transfer(film, source) {
   });
   if (!making) return;
   say("Making the avatar …");
-  open(making, "Making the avatar …"); // its player starts, and waits for the package
+  open(making, "Making the avatar …");
 }
 
 async function upload(file) {
@@ -153,7 +162,8 @@ function open(name, note, final = false) {
   if (isFirst) {
     view("done");
     $("poster").hidden = false;
-    $("player").src = `${address}?start=lite`;
+    if (playing !== name || hasFailed()) play(name);
+    playing = "";
   }
   $("poster").src = making ? $("preview").src : `${address}poster.png`;
   if (final && !isFirst) {
@@ -180,7 +190,9 @@ function open(name, note, final = false) {
 
 addEventListener("message", ({ source, origin, data }) => {
   if (origin !== location.origin || data !== "drawn") return;
+  if (source === $("practice")?.contentWindow) return;
   $("poster").hidden = true;
+  $("practice")?.remove(); // the others share what it has compiled
   const finer = document.querySelector(".coming");
   if (finer?.contentWindow !== source) return;
   $("player").remove();
