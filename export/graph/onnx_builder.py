@@ -1,6 +1,6 @@
 """A small writer of ONNX graphs: Python's operators become nodes."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, final
 
 import numpy as np
@@ -312,14 +312,21 @@ class GraphBuilder:
         return [GraphValue(self, name, operands[0].dtype) for name in names]
 
     def model(self) -> onnx.ModelProto:
-        """Return the model; its tables are passed to the runtime separately."""
+        """Return the model; the tables that it uses are passed to the runtime separately."""
+        used = _names_used(self._nodes)
+        initializers = [tensor for tensor in self._initializers if tensor.name in used]
         return helper.make_model(
-            helper.make_graph(
-                self._nodes, "avatar", self._inputs, self._outputs, self._initializers
-            ),
+            helper.make_graph(self._nodes, "avatar", self._inputs, self._outputs, initializers),
             opset_imports=[helper.make_opsetid("", ONNX_OPSET)],
             ir_version=ONNX_IR_VERSION,
         )
+
+
+def _names_used(nodes: Iterable[onnx.NodeProto]) -> set[str]:
+    """Names of all inputs of nodes, and of those in their bodies."""
+    used = {name for node in nodes for name in node.input}
+    bodies = (part.g.node for node in nodes for part in node.attribute)
+    return used.union(*(_names_used(body) for body in bodies))
 
 
 def _scalar_info(value: GraphValue) -> onnx.ValueInfoProto:

@@ -120,7 +120,7 @@ class FilmQueue:
         if suffix is None:
             raise FilmRefused(415, f"{kind or 'A file without a type'} is no video.")
         if size is not None and not 0 < size <= MAX_FILM_BYTES:
-            raise FilmRefused(413, f"A film may have up to {MAX_FILM_BYTES >> 30} GiB.")
+            raise FilmRefused(413, f"A film has 1 byte to {MAX_FILM_BYTES >> 30} GiB.")
         free = shutil.disk_usage(self.folder).free - MIN_FREE_BYTES
         if (size or 0) > free:
             raise FilmRefused(507, "The disk of the computer is too full for this film.")

@@ -78,8 +78,8 @@ class CaptureOptions:
         """Check ranges and files."""
         if not 0 < self.port < (1 << 16) - 1:
             raise InputError(f"--port is {self.port}, but must be from 1 to 65534.")
-        if not 1.0 <= self.silent_seconds < float("inf"):
-            raise InputError(f"--silent-seconds is {self.silent_seconds}, but must be at least 1.")
+        if not 10.0 <= self.silent_seconds < float("inf"):  # the page counts down before it sends
+            raise InputError(f"--silent-seconds is {self.silent_seconds}, but must be at least 10.")
         if self.size < 64:
             raise InputError(f"--size is {self.size}, but must be at least 64 pixels.")
         if (self.cert is None) != (self.key is None):

@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, final
+from urllib.parse import quote
 
 from aiohttp import web
 
@@ -318,7 +319,8 @@ class PhoneServer:
                     woken.clear()
                     await woken.wait()
         package = self._queue.package(name)
-        saved = {"Content-Disposition": f'attachment; filename="{name}{Path(file).suffix}"'}
+        saved_as = quote(name + Path(file).suffix)
+        saved = {"Content-Disposition": f"attachment; filename*=UTF-8''{saved_as}"}
         if file == PACKAGE_FILE:
             return web.FileResponse(package, headers=saved | HEADERS)
         if file == "poster.png":

@@ -18,6 +18,7 @@ function view(name) {
 function warn(text) {
   $("warning").textContent = text;
   $("warning").hidden = false;
+  $("warning").scrollIntoView({ block: "nearest" });
 }
 
 let spoken = "", spokenAt = 0;
@@ -32,7 +33,7 @@ function say(text) {
 /** Begin a film and listen to what the server tells of it; resolves when it is this film's turn. */
 async function begin(type, size) {
   view("filming");
-  $("map").replaceChildren(); $("preview").hidden = true; $("preview").removeAttribute("src"); $("seen").textContent = ""; $("progress").value = 0;
+  $("map").replaceChildren(); $("preview").hidden = true; $("preview").removeAttribute("src"); $("seen").textContent = $("sent").textContent = ""; $("progress").value = 0;
   const body = JSON.stringify({ name: $("name").value, type, size, avatar: adding });
   const { film, avatar } = await ask("films", { method: "POST", body });
   making = avatar;
@@ -46,7 +47,7 @@ async function begin(type, size) {
   on("map", ({ svg, seen }) => { $("map").innerHTML = svg; $("seen").textContent = ` · ${Math.round(100 * seen)} % of you seen`; });
   on("preview", ({ image }) => {
     $("preview").src = image; $("preview").hidden = false;
-    if (making && making === shown) $("poster").src = image;
+    if (making && making === shown) Object.assign($("poster"), { src: image, hidden: false });
   });
   on("progress", ({ text, share }) => { $("progress").value = share; if (!$("done").hidden) $("note").textContent = `${text} …`; });
   on("warning", ({ text }) => warn(text));
@@ -161,7 +162,7 @@ function open(name, note, final = false) {
   $("offers").inert = Boolean(making);
   if (isFirst) {
     view("done");
-    $("poster").hidden = false;
+    $("poster").hidden = Boolean(making) && !$("preview").src;
     if (playing !== name || hasFailed()) play(name);
     playing = "";
   }

@@ -258,7 +258,7 @@ def test_an_avatar_is_saved_as_vrm_with_the_author_who_was_named(phone, anna):
     for query, author in (("?author=Ann%20M.", "Ann M."), ("?author=", "unknown")):
         answer = phone.ask("GET", f"/avatars/Anna/avatar.vrm{query}")
         assert answer.status == 200
-        assert answer.headers["Content-Disposition"] == 'attachment; filename="Anna.vrm"'
+        assert answer.headers["Content-Disposition"] == "attachment; filename*=UTF-8''Anna.vrm"
         length = int.from_bytes(answer.content[12:16], "little")
         scene = json.loads(answer.content[20 : 20 + length])
         assert scene["extensions"]["VRMC_vrm"]["meta"]["authors"] == [author]
