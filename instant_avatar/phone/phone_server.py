@@ -147,6 +147,8 @@ class PhoneServer:
             answer = await handler(request)
         except FilmRefused as refused:
             answer = web.json_response({"message": str(refused)}, status=refused.status)
+            if request.path == "/":  # a person reads it
+                answer = web.Response(text=str(refused), status=refused.status)
         except InputError as error:
             answer = web.json_response({"message": str(error)}, status=404)
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:

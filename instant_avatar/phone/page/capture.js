@@ -11,14 +11,12 @@ let adding = "", making = "", facing = "environment", stream = null, shown = "",
 
 function view(name) {
   for (const id of ["home", "filming", "done"]) $(id).hidden = id !== name;
-  $("warning").hidden = true;
   scrollTo(0, 0);
 }
 
 function warn(text) {
   $("warning").textContent = text;
   $("warning").hidden = false;
-  $("warning").scrollIntoView({ block: "nearest" });
 }
 
 let spoken = "", spokenAt = 0;
@@ -49,11 +47,11 @@ async function begin(type, size) {
     $("preview").src = image; $("preview").hidden = false;
     if (making && making === shown) Object.assign($("poster"), { src: image, hidden: false });
   });
-  on("progress", ({ text, share }) => { $("progress").value = share; if (!$("done").hidden) $("note").textContent = `${text} …`; });
+  on("progress", ({ text, share }) => { $("progress").value = share; if (shown === avatar) $("note").textContent = `${text} …`; });
   on("warning", ({ text }) => warn(text));
   let opened = false;
   on("avatar", ({ name, final }) => {
-    if (opened && $("done").hidden) return; // a person films again
+    if (opened && ($("done").hidden || shown !== name)) return; // a person films again, or looks at another avatar
     opened = true;
     making = "";
     open(name, final ? "It is ready." : "It can be played; finer detail follows.", final);
@@ -63,7 +61,7 @@ async function begin(type, size) {
   await new Promise((resolve) => on("state", ({ state, behind }) => {
     if (state === "waiting") say(`Waiting for ${behind.join(", ")} …`);
     if (state === "filming") resolve();
-    if (state === "done" && !$("done").hidden) $("note").textContent = "It is ready.";
+    if (state === "done" && shown === avatar) $("note").textContent = "It is ready.";
   }));
   play(avatar);
   return film;
@@ -78,13 +76,15 @@ function play(name) {
 const hasFailed = () => $("player").contentDocument?.querySelector("#status.failed");
 
 async function transfer(film, source) {
-  await send(film, source, (bytes) => {
+  const reason = await send(film, source, (bytes) => {
     $("sent").textContent = `${(bytes / 1e6).toFixed(1)} MB sent`;
     if (source instanceof Stored) $("progress").value = bytes / source.end;
   });
-  if (!making) return;
-  say("Making the avatar …");
-  open(making, "Making the avatar …");
+  if (making) {
+    say("Making the avatar …");
+    open(making, "Making the avatar …");
+  }
+  if (reason) warn(reason);
 }
 
 async function upload(file) {
@@ -235,4 +235,5 @@ for (const kind of ["dragover", "dragleave", "drop"]) {
     if (kind === "drop") upload(event.dataTransfer.files[0]);
   });
 }
+for (const kind of ["click", "drop"]) addEventListener(kind, () => { $("warning").hidden = true; }, true); // seen
 listEarlier();

@@ -58,7 +58,7 @@ export async function ask(path, options = {}) {
   }
 }
 
-/** Send a film to its end; the server names the piece that it needs next. */
+/** Send a film to its end; the server names the piece that it needs next, and why a film ended early. */
 export async function send(film, source, onProgress) {
   const path = `films/${film}`;
   let state = { next: 0 };
@@ -66,13 +66,13 @@ export async function send(film, source, onProgress) {
     const piece = await source.slice(state.next);
     if (!piece) {
       state = await ask(`${path}/end?size=${source.end}`, { method: "POST" });
-      if (state.ended) return;
+      if (state.ended) return state.reason;
       continue;
     }
     const sent = await ask(`${path}?offset=${state.next}`, { method: "PUT", body: piece, once: true });
     if (!sent) await pause(500);
     state = sent ?? await ask(path); // what came through before the break counts
     onProgress(state.received);
-    if (state.ended) return;
+    if (state.ended) return state.reason;
   }
 }

@@ -1,5 +1,6 @@
 """The phone page in headless Chromium, whose fake camera plays a film of the actor."""
 
+import shutil
 import signal
 import subprocess
 import sys
@@ -70,6 +71,51 @@ def test_the_plain_page_leads_to_that_with_tls_and_opens_again_after_it(tmp_path
                 until(lambda: "Film an avatar" in browser.text(), 60.0)
             finally:
                 server.close()
+
+
+def test_the_page_stays_with_what_a_person_looks_at(run, tmp_path):
+    queue, access = FilmQueue(tmp_path / "out", 30.0), AccessControl()
+    (queue.folder / "Anna" / "run").mkdir(parents=True)
+    shutil.copy(run / "avatar.iavatar", queue.folder / "Anna" / "run")
+    server = PhoneServer(queue, access, None)
+    server.start("127.0.0.1", [(8745, None)])
+    with Browser(tmp_path / "browser", size=(360, 740)) as browser:
+        browser.emulate(scheme="light", size=(360, 740))
+        browser.go(f"http://127.0.0.1:8745/?token={access.token}")
+        until(lambda: "Anna" in browser.text(), 60.0)
+        browser.run(
+            """(() => {
+              const held = new DataTransfer();
+              held.items.add(new File(["film"], "film.mp4", { type: "video/mp4" }));
+              const input = document.getElementById("stored");
+              input.files = held.files;
+              input.dispatchEvent(new Event("change"));
+            })()"""
+        )
+        film = queue.take_next(60.0)
+        until(lambda: "Making the avatar" in browser.text(), 60.0)
+        assert browser.run("document.getElementById('poster').hidden")  # there is no picture yet
+        film.run.path.mkdir()
+        shutil.copy(run / "avatar.iavatar", film.run.path)
+        film.tell("warning", text="The phone fell silent.")
+        film.tell("avatar", name=film.place.name, final=False)
+        until(lambda: "It can be played" in browser.text(), 60.0)
+        until(lambda: not browser.run("!!document.getElementById('practice')"), 120.0)  # drawn
+        assert "The phone fell silent." in browser.text()
+        bottom = "document.getElementById('warning').getBoundingClientRect().bottom"
+        assert browser.run(f"{bottom} <= innerHeight")
+        browser.click("Another person")
+        until(lambda: browser.run("document.querySelectorAll('#avatars button').length") == 1, 60.0)
+        browser.click("Anna")
+        until(lambda: browser.run("document.getElementById('title').textContent") == "Anna", 60.0)
+        film.tell("progress", text="scoring", share=0.5)
+        film.tell("avatar", name=film.place.name, final=True)
+        film.tell("advice", text="last", time=0.0)
+        until(lambda: browser.run("document.getElementById('advice').textContent") == "last", 60.0)
+        assert browser.run("document.getElementById('title').textContent") == "Anna"
+        assert "scoring" not in browser.text()
+        assert "fell silent" not in browser.text()
+    server.close()
 
 
 def test_a_film_of_the_pages_camera_becomes_an_avatar_in_its_player(camera_film, tmp_path):

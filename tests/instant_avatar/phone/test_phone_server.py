@@ -73,7 +73,9 @@ class Phone:
 def test_a_token_opens_the_page_once(phone):
     old = phone.access.token
     assert phone.ask("GET", f"/?token={old}", cookie="").status == 303
-    assert phone.ask("GET", f"/?token={old}", cookie="").status == 403
+    refused = phone.ask("GET", f"/?token={old}", cookie="")
+    assert refused.status == 403
+    assert refused.content.decode() == phone_server.REFUSED
     page = phone.ask("GET", "/")
     assert page.status == 200
     assert page.headers["Cross-Origin-Embedder-Policy"] == "require-corp"
