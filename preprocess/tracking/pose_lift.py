@@ -4,16 +4,14 @@ The root follows from the trunk's four key points, limbs from the directions bet
 an upper arm or a thigh twists about itself follows from where the elbow or the knee bends to. The
 distance is the one at which the body covers its key points in the image.
 
-Short stretches in which a tracker took the person's left for the right are repaired first: only
-frames close in time are compared, and only a stretch that its longer neighbors contradict is
-changed.
+Stretches in which a tracker took the person's left for the right are repaired first: only frames
+close in time are compared, and of two parts that contradict each other the shorter is changed.
 """
 
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose, Motion
@@ -22,12 +20,23 @@ from preprocess.body.parametric_body import ShapedBody
 from preprocess.poses.motion_builder import fill_gaps, place_by_pixels
 from preprocess.tracking.keypoints import HIPS, MIN_PRESENCE, MIRRORED_POINTS, KeypointTrack
 
-COMPARED_POINTS = (11, 13, 23, 25, 27)
+LEFT_POINTS = [11, 13, 23, 25, 27]
 """Left shoulder, elbow, hip, knee and ankle."""
-MAX_COSINE = -0.4
-"""Cosine between the directions from right to left of two frames below which one is swapped."""
-MAX_STRETCH_FRAMES = 15
-"""Longest stretch that is repaired, frames."""
+RIGHT_POINTS = [12, 14, 24, 26, 28]
+"""Those on the right."""
+EXCHANGE_COST = 0.4
+"""Cost of an exchange between two rows, where that of a half turn is 1."""
+ALL_EXCHANGED_COST = 1.2
+"""Cost of exchanging left and right in all rows of a film: the shorter part is the wrong one."""
+MIN_DISTANCE_SHARE = 0.5
+"""Distance between left and right, share of its median, below which a row tells them not apart:
+between two guesses, key points of both sides lie in the middle."""
+CUT_MOTION = 3.0
+"""Motion in the image, relative to that of the frames around, at which a film may have been cut."""
+LEAST_MOTION = 0.01
+"""Motion from row to row of a person at rest, body sizes."""
+NEAR_ROWS = 3
+"""Rows before and after an exchange whose motion counts as usual."""
 MAX_GAP_FRAMES = 3
 """Frames between two rows beyond which they are not compared."""
 TRUNK_POINTS = (11, 12, *HIPS)
@@ -49,7 +58,7 @@ PLACED_POINTS = (23, 24, 25, 26, 27, 28, 11, 12, 13, 14, 15, 16)
 
 
 def repair_swaps(track: KeypointTrack) -> KeypointTrack:
-    """Exchange left and right in short stretches that both sides contradict."""
+    """Exchange left and right where a tracker took one for the other."""
     swapped = find_swaps(track)
     order = np.where(swapped[:, None], MIRRORED_POINTS, np.arange(33))
     rows = np.arange(len(track))[:, None]
@@ -62,30 +71,53 @@ def repair_swaps(track: KeypointTrack) -> KeypointTrack:
 
 
 def find_swaps(track: KeypointTrack) -> Bool[np.ndarray, "rows"]:
-    """Rows in which left and right are exchanged, by their neighbors.
+    """Rows in which left and right are exchanged: the sequence of least cost (Viterbi 1967).
 
-    A stretch ends where left and right change at once, or at a gap, as where a video was cut.
+    Nobody turns half round between two frames while staying in the same place. Between two rows, a
+    turn costs (1 - cosine) / 2 of the directions from right to left before and after it, and so
+    does the rest of an exchange; both count nothing over a gap and little over a cut.
     """
-    across = track.world_m[:, list(COMPARED_POINTS)]
-    across = across - track.world_m[:, [point + 1 for point in COMPARED_POINTS]]
-    turns = np.flatnonzero(_cosines(across.reshape(len(track), -1)) < MAX_COSINE) + 1
-    gaps = np.flatnonzero(np.diff(track.frames) > MAX_GAP_FRAMES) + 1
-    swapped = np.zeros(len(track), dtype=bool)
-    for first, end in pairwise([0, *gaps.tolist(), len(track)]):
-        bounds = [first, *turns[(turns > first) & (turns < end)].tolist(), end]
-        lengths = np.diff(bounds).tolist()
-        for index, (start, stop) in enumerate(pairwise(bounds)):
-            beside = lengths[max(0, index - 1) : index] + lengths[index + 1 : index + 2]
-            is_short = beside and lengths[index] <= min(MAX_STRETCH_FRAMES, *beside)
-            if is_short and not (index and swapped[start - 1]):
-                swapped[start:stop] = True
-    return swapped
+    across = track.world_m[:, LEFT_POINTS] - track.world_m[:, RIGHT_POINTS]
+    distances = np.linalg.norm(across, axis=2)
+    across /= np.maximum(np.median(distances, axis=0), 1e-9)[:, None] if len(track) else 1.0
+    across = across.reshape(len(track), -1)
+    sizes = np.linalg.norm(across, axis=1)
+    kept = np.flatnonzero(sizes >= MIN_DISTANCE_SHARE * np.median(sizes)) if len(track) else []
+    if len(kept) < 2:
+        return np.zeros(len(track), dtype=bool)
+    across /= np.maximum(sizes, 1e-9)[:, None]
+    cosines = (across[kept[1:]] * across[kept[:-1]]).sum(axis=1)
+    link = _continuity(track, kept)
+    turn, exchange = link * (1.0 - cosines) / 2.0, link * ((1.0 + cosines) / 2.0 + EXCHANGE_COST)
+    row_cost = np.array([0.0, ALL_EXCHANGED_COST / len(kept)])
+    costs, crossed = row_cost, np.zeros((len(kept), 2), dtype=bool)
+    for row, (stay, cross) in enumerate(zip(turn, exchange, strict=True), start=1):
+        crossed[row] = costs[::-1] + cross < costs + stay
+        costs = np.minimum(costs + stay, costs[::-1] + cross) + row_cost
+    is_swapped = np.zeros(len(kept), dtype=bool)
+    is_swapped[-1] = costs[1] < costs[0]
+    for row in range(len(kept) - 1, 0, -1):
+        is_swapped[row - 1] = is_swapped[row] ^ crossed[row, int(is_swapped[row])]
+    before = np.maximum(np.searchsorted(kept, np.arange(len(track)), side="right") - 1, 0)
+    is_against = (across * across[kept[before]]).sum(axis=1) < 0.0
+    return is_swapped[before] ^ is_against
 
 
-def _cosines(rows: Float[np.ndarray, "rows n"]) -> Float[np.ndarray, "gaps"]:
-    """Cosine between each row and the next."""
-    size = np.maximum(np.linalg.norm(rows, axis=1), 1e-9)
-    return (rows[1:] * rows[:-1]).sum(axis=1) / (size[1:] * size[:-1])
+def _continuity(track: KeypointTrack, rows: Int[np.ndarray, "rows"]) -> Float[np.ndarray, "rows-1"]:
+    """Degree to which the person moves as usual from row to row, in [0, 1]; 0 over a gap.
+
+    Both sides' middles are compared, which an exchange leaves where they are.
+    """
+    middles = 0.5 * (track.image_px[rows][:, LEFT_POINTS] + track.image_px[rows][:, RIGHT_POINTS])
+    size = np.linalg.norm(middles - middles.mean(axis=1, keepdims=True), axis=2).mean(axis=1)
+    moved = np.linalg.norm(np.diff(middles, axis=0), axis=2).mean(axis=1)
+    moved /= np.maximum(size[:-1], 1e-9) * np.diff(rows)
+    beside = [*range(-NEAR_ROWS, 0), *range(1, NEAR_ROWS + 1)]
+    places = np.arange(len(moved))[:, None] + beside
+    usual = np.median(moved[np.abs(places) % max(len(moved), 1)], axis=1)
+    gaps = np.concatenate([[0], np.cumsum(np.diff(track.frames) > MAX_GAP_FRAMES)])
+    link = np.exp(-((moved / (CUT_MOTION * np.maximum(usual, LEAST_MOTION))) ** 2))
+    return link * (np.diff(gaps[rows]) == 0)
 
 
 def lift_keypoints(track: KeypointTrack, shaped: ShapedBody, camera: Camera) -> Motion:

@@ -43,8 +43,8 @@ def _mirrored() -> np.ndarray:
     return order
 
 
-@pytest.mark.parametrize("stretch", [slice(20, 21), slice(20, 30), slice(52, 56), slice(0, 3)])
-def test_a_short_stretch_is_exchanged_back(stretch):
+@pytest.mark.parametrize("stretch", [slice(20, 21), slice(20, 55), slice(52, 56), slice(0, 25)])
+def test_the_shorter_part_is_exchanged_back(stretch):
     whole = turning_track(80, 4.0)
     swapped = swap(whole, stretch)
     repaired = repair_swaps(swapped)
@@ -59,6 +59,28 @@ def test_the_last_frames_before_a_gap_are_exchanged_back():
     whole = replace(whole, frames=whole.frames + 16 * (whole.frames >= 50))
     repaired = repair_swaps(swap(whole, slice(48, 50)))
     np.testing.assert_allclose(repaired.world_m, whole.world_m)
+
+
+def test_key_points_between_two_guesses_hide_no_exchange():
+    """On the way from one guess to another, both sides lie in the middle."""
+    whole = turning_track(80, 4.0)
+    swapped = swap(whole, slice(30, 60))
+    middle = 0.5 * (whole.world_m[60] + whole.world_m[60][_mirrored()])
+    swapped.world_m[60] = middle + 0.2 * (swapped.world_m[59] - middle)
+    assert np.flatnonzero(find_swaps(swapped)).tolist() == list(range(30, 61))
+
+
+def test_a_cut_to_the_other_side_is_no_exchange():
+    front = turning_track(80, 1.0)
+    back = swap(front, slice(0, 80))
+    shift = np.where(np.arange(80) >= 60, 30.0, 0.0)[:, None, None]
+    film = replace(
+        front,
+        image_px=np.concatenate([front.image_px[:60], back.image_px[60:]]) + shift,
+        world_m=np.concatenate([front.world_m[:60], back.world_m[60:]]),
+    )
+    assert not find_swaps(film).any()
+    assert find_swaps(replace(film, image_px=film.image_px - shift)).any()
 
 
 def test_two_stretches_are_exchanged_back():
