@@ -7,18 +7,22 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32, Int64
-from scipy.ndimage import distance_transform_edt, maximum_filter, uniform_filter
+from scipy.ndimage import binary_fill_holes, distance_transform_edt, maximum_filter, uniform_filter
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from preprocess.body.body_pose import BodyPose
-from preprocess.body.body_surface import vertex_normals
+from preprocess.body.body_surface import vertex_normals, visible_from_anywhere
 from preprocess.body.kinematics import body_from_rest, world_from_body
-from preprocess.body.parametric_body import ShapedBody
+from preprocess.body.parametric_body import BodyModel, ShapedBody
 
 PART_OF_JOINT = np.array(
     [0, 1, 2, 0, 3, 4, 0, 5, 6, 0, 5, 6, 7, 0, 0, 7, 8, 9, 10, 11, 12, 13, 12, 13]
 )
 """Body part, of 14, that each joint moves; root finding starts once in every near part."""
+HEAD_PART = 7
+"""The head among those parts."""
 SEED_SPACING_M = 0.02
 """Edge of the voxels that hold one seed each, metres."""
 SKINNING_CELL_M = 0.023
@@ -90,8 +94,10 @@ class Rig:
         vertices = np.einsum("vab,vb->va", blended[:, :3, :3], shaped.vertices) + blended[:, :3, 3]
         low = (vertices.min(axis=0) - BOX_MARGIN_M).astype(np.float32)
         high = (vertices.max(axis=0) + BOX_MARGIN_M).astype(np.float32)
-        seeds = _seed_vertices(vertices, body.weights)
         normals = vertex_normals(vertices, body.faces)
+        outer = _outer_vertices(vertices, normals, body)
+        vertices, normals, weights = vertices[outer], normals[outer], body.weights[outer]
+        seeds = _seed_vertices(vertices, weights)
         distance, inside = skin_distance_volume(
             vertices, normals, low, high, DISTANCE_CELL_M, BOX_MARGIN_M + 0.02
         )
@@ -102,12 +108,12 @@ class Rig:
             box_low=low,
             box_high=high,
             weights=skinning_weight_volume(
-                vertices, body.weights, low, high, SKINNING_CELL_M, BOX_MARGIN_M + 0.05
+                vertices, weights, low, high, SKINNING_CELL_M, BOX_MARGIN_M + 0.05
             ),
             skin_distance=distance,
             inside_skin=inside,
             seeds=vertices[seeds].astype(np.float32),
-            seed_parts=PART_OF_JOINT[body.weights[seeds].argmax(axis=1)].astype(np.int32),
+            seed_parts=PART_OF_JOINT[weights[seeds].argmax(axis=1)].astype(np.int32),
             seed_normals=normals[seeds].astype(np.float32),
         )
 
@@ -187,6 +193,29 @@ class Rig:
             share = np.where(corner, part, 1.0 - part).prod(axis=1, keepdims=True)
             weights += self.weights[tuple((base + corner).T)] * share
         return weights
+
+
+def _outer_vertices(
+    vertices: Float[np.ndarray, "vertices 3"],
+    normals: Float[np.ndarray, "vertices 3"],
+    body: BodyModel,
+) -> Int[np.ndarray, "outer"]:
+    """Vertices without a head's eyeballs, tongue and mouth: what is behind them is not outside.
+
+    Of a head's vertices, these are the largest connected part of those that are seen from afar.
+    """
+    head = np.flatnonzero(PART_OF_JOINT[body.weights.argmax(axis=1)] == HEAD_PART)
+    shown = visible_from_anywhere(
+        vertices[head], normals[head], cell_m=DISTANCE_CELL_M, tolerance_m=0.002, min_cosine=0.6
+    )
+    is_shown = np.zeros(len(vertices), dtype=bool)
+    is_shown[head[shown]] = True
+    faces = body.faces[is_shown[body.faces].all(axis=1)]
+    links = faces.ravel(), np.roll(faces, 1, axis=1).ravel()
+    shape = (len(vertices), len(vertices))
+    _, part = connected_components(coo_array((np.ones(faces.size), links), shape=shape))
+    sizes = np.bincount(part, weights=is_shown)
+    return np.delete(np.arange(len(vertices)), head[part[head] != sizes.argmax()])
 
 
 def _seed_vertices(
@@ -304,7 +333,8 @@ def skin_distance_volume(
 
     distance_m, under = np.moveaxis(_exact_near_skin(axes, search, SEARCHED_WITHIN_M), -1, 0)
     within = distance_m < reach_m
-    return np.where(within, distance_m, np.float32(1.0)), within & (under > 0.5)
+    inside = np.asarray(binary_fill_holes(within & (under > 0.5)))
+    return np.where(within, distance_m, np.float32(1.0)), inside
 
 
 def _exact_near_skin(

@@ -6,7 +6,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from avatar.rig import PART_OF_JOINT
-from preprocess.body.body_surface import vertex_areas, vertex_normals, visible_points
+from preprocess.body.body_surface import (
+    vertex_areas,
+    vertex_normals,
+    visible_from_anywhere,
+    visible_points,
+)
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.observation import Observation
 
@@ -68,9 +73,9 @@ class SkinPatches:
         normals = mean(normals)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
         points, parts, sides = mean(shaped.vertices), parts[first], sides[first]
-        shown = _visible_from_anywhere(points, normals) & ~(
-            np.isin(parts, FOOT_PARTS) & (normals[:, 1] < MAX_SOLE_NORMAL_Y)
-        )
+        shown = visible_from_anywhere(
+            points, normals, cell_m=PATCH_M, tolerance_m=OCCLUSION_TOLERANCE_M, min_cosine=0.3
+        ) & ~(np.isin(parts, FOOT_PARTS) & (normals[:, 1] < MAX_SOLE_NORMAL_Y))
         return cls(
             points=points[shown],
             normals=normals[shown],
@@ -90,26 +95,6 @@ def _side_of_vertex(
     across = np.where(is_arm, y, x)
     sideways = np.where(is_arm, np.where(y > 0.0, 4, 5), np.where(x > 0.0, 2, 3))
     return np.where(np.abs(z) >= np.abs(across), np.where(z > 0.0, 0, 1), sideways)
-
-
-def _visible_from_anywhere(
-    points: Float32[np.ndarray, "patches 3"], normals: Float32[np.ndarray, "patches 3"]
-) -> Bool[np.ndarray, "patches"]:
-    """Mask of the patches that are seen from around the T-pose, from above and below as well."""
-    shown = np.zeros(len(points), dtype=bool)
-    for direction in np.ndindex(3, 3, 3):
-        to_eye = np.array(direction, dtype=np.float64) - 1.0
-        if not to_eye.any():
-            continue
-        to_eye /= np.linalg.norm(to_eye)
-        right = np.cross(to_eye, [0.0, 1.0, 0.0] if abs(to_eye[1]) < 0.9 else [1.0, 0.0, 0.0])
-        plane = points @ np.column_stack([right, np.cross(right, to_eye)])
-        cosine = normals @ to_eye
-        found = visible_points(
-            plane, -points @ to_eye, cosine, cell_m=PATCH_M, tolerance_m=OCCLUSION_TOLERANCE_M
-        )
-        shown |= found & (cosine > 0.3)
-    return shown
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

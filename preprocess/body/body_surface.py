@@ -106,6 +106,35 @@ def visible_points(
     return faces & (depth <= nearest[flat] + tolerance_m + slope)
 
 
+def visible_from_anywhere(
+    points: Float[np.ndarray, "points 3"],
+    normals: Float[np.ndarray, "points 3"],
+    *,
+    cell_m: float,
+    tolerance_m: float,
+    min_cosine: float,
+) -> Bool[np.ndarray, "points"]:
+    """Points of a closed surface that are seen from afar, from one of 26 directions around.
+
+    `min_cosine` is that of the angle to the normal, below which a view does not count; the others
+    are as in `visible_points`.
+    """
+    shown = np.zeros(len(points), dtype=bool)
+    for direction in np.ndindex(3, 3, 3):
+        to_eye = np.array(direction, dtype=np.float64) - 1.0
+        if not to_eye.any():
+            continue
+        to_eye /= np.linalg.norm(to_eye)
+        right = np.cross(to_eye, [0.0, 1.0, 0.0] if abs(to_eye[1]) < 0.9 else [1.0, 0.0, 0.0])
+        plane = points @ np.column_stack([right, np.cross(right, to_eye)])
+        cosine = normals @ to_eye
+        found = visible_points(
+            plane, -points @ to_eye, cosine, cell_m=cell_m, tolerance_m=tolerance_m
+        )
+        shown |= found & (cosine > min_cosine)
+    return shown
+
+
 SKIN_POINTS = 8000
 """Points sampled on the skin: about three per pixel of a person `SILHOUETTE_PERSON_PX` high."""
 SILHOUETTE_PERSON_PX = 96

@@ -77,14 +77,13 @@ def find_swaps(track: KeypointTrack) -> Bool[np.ndarray, "rows"]:
     turn costs (1 - cosine) / 2 of the directions from right to left before and after it, and so
     does the rest of an exchange; both count nothing over a gap and little over a cut.
     """
-    across = track.world_m[:, LEFT_POINTS] - track.world_m[:, RIGHT_POINTS]
-    distances = np.linalg.norm(across, axis=2)
-    across /= np.maximum(np.median(distances, axis=0), 1e-9)[:, None] if len(track) else 1.0
-    across = across.reshape(len(track), -1)
-    sizes = np.linalg.norm(across, axis=1)
-    kept = np.flatnonzero(sizes >= MIN_DISTANCE_SHARE * np.median(sizes)) if len(track) else []
-    if len(kept) < 2:
+    if len(track) < 2:
         return np.zeros(len(track), dtype=bool)
+    across = track.world_m[:, LEFT_POINTS] - track.world_m[:, RIGHT_POINTS]
+    usual = np.median(np.linalg.norm(across, axis=2), axis=0)
+    across = (across / np.maximum(usual, 1e-9)[:, None]).reshape(len(track), -1)
+    sizes = np.linalg.norm(across, axis=1)
+    kept = np.flatnonzero(sizes >= MIN_DISTANCE_SHARE * np.median(sizes))
     across /= np.maximum(sizes, 1e-9)[:, None]
     cosines = (across[kept[1:]] * across[kept[:-1]]).sum(axis=1)
     link = _continuity(track, kept)

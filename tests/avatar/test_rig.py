@@ -2,16 +2,20 @@
 
 import numpy as np
 import pytest
+from scipy.ndimage import binary_fill_holes
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from avatar.rig import (
     DISTANCE_CELL_M,
+    HEAD_PART,
     PART_OF_JOINT,
     SEARCHED_WITHIN_M,
+    _outer_vertices,
     canonical_rotations,
 )
 from preprocess.body.body_pose import BodyPose
+from preprocess.body.body_surface import vertex_normals
 from preprocess.body.kinematics import PARENTS
 
 
@@ -144,10 +148,24 @@ def test_the_distance_is_that_to_the_nearest_vertex(rig, skin, rng):
     assert (found[expected > 0.2] == 1.0).all()
 
 
-def test_seeds_are_skin_and_leave_no_part_of_it_unseeded(rig, skin):
+def test_a_head_is_solid(rig):
+    """Behind its eyes, nostrils and lips there is no air."""
+    head = rig.seeds[rig.seed_parts == HEAD_PART]
+    low, high = (np.floor((end(head, axis=0) - rig.box_low) * rig.cells_per_m).astype(int)
+                 for end in (np.min, np.max))  # fmt: skip
+    inside = rig.inside_skin[low[0] : high[0] + 1, low[1] : high[1] + 1, low[2] : high[2] + 1]
+    assert 0.3 < inside.mean() < 0.9
+    for axis in range(3):
+        for piece in np.moveaxis(inside, axis, 0):
+            np.testing.assert_array_equal(binary_fill_holes(piece), piece)
+
+
+def test_seeds_are_skin_and_leave_no_part_of_it_unseeded(rig, skin, shaped):
+    on_outside = _outer_vertices(skin, vertex_normals(skin, shaped.body.faces), shaped.body)
     seeds = KDTree(rig.seeds)
     on_skin, _ = KDTree(skin).query(rig.seeds)
-    reach, nearest = seeds.query(skin)
+    outer = skin[on_outside]
+    reach, nearest = seeds.query(outer)
     assert on_skin.max() < 1e-6
     assert reach.max() < 0.02 * np.sqrt(3.0)  # a voxel's diagonal
     assert set(rig.seed_parts) == set(PART_OF_JOINT)
