@@ -80,8 +80,7 @@ def find_swaps(track: KeypointTrack) -> Bool[np.ndarray, "rows"]:
     if len(track) < 2:
         return np.zeros(len(track), dtype=bool)
     across = track.world_m[:, LEFT_POINTS] - track.world_m[:, RIGHT_POINTS]
-    usual = np.median(np.linalg.norm(across, axis=2), axis=0)
-    across = (across / np.maximum(usual, 1e-9)[:, None]).reshape(len(track), -1)
+    across = across.reshape(len(track), -1)
     sizes = np.linalg.norm(across, axis=1)
     kept = np.flatnonzero(sizes >= MIN_DISTANCE_SHARE * np.median(sizes))
     across /= np.maximum(sizes, 1e-9)[:, None]
