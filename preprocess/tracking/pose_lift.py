@@ -73,9 +73,9 @@ def repair_swaps(track: KeypointTrack) -> KeypointTrack:
 def find_swaps(track: KeypointTrack) -> Bool[np.ndarray, "rows"]:
     """Rows in which left and right are exchanged: the sequence of least cost (Viterbi 1967).
 
-    Nobody turns half round between two frames while staying in the same place. Between two rows, a
-    turn costs (1 - cosine) / 2 of the directions from right to left before and after it, and so
-    does the rest of an exchange; both count nothing over a gap and little over a cut.
+    A person does not turn half round between two frames and stay in the same place. Between two
+    rows, a turn costs (1 - cosine) / 2 of the directions from right to left before and after it,
+    and so does the rest of an exchange; both count nothing over a gap and little over a cut.
     """
     if len(track) < 2:
         return np.zeros(len(track), dtype=bool)
