@@ -136,10 +136,7 @@ class CorrespondenceCheck:
 
     @classmethod
     def for_pose(
-        cls,
-        rig: Rig,
-        joint_rotations: Float[np.ndarray, "23 3"],
-        cells: CorrespondenceGrid,
+        cls, rig: Rig, joint_rotations: Float[np.ndarray, "23 3"], cells: CorrespondenceGrid
     ) -> "CorrespondenceCheck":
         """Checks the corners of every full cell of a pose's culled grid."""
         bones = rig.body_from_canonical(joint_rotations)[:, :3].reshape(24, 12)

@@ -18,12 +18,7 @@ from torch import Tensor
 
 from avatar.config import TrainConfig
 from avatar.kernels import numba_priors, operations
-from avatar.kernels.operands import (
-    FEATURES_PER_LEVEL,
-    HIDDEN_WIDTH,
-    HashLevels,
-    NetworkLayers,
-)
+from avatar.kernels.operands import FEATURES_PER_LEVEL, HIDDEN_WIDTH, HashLevels, NetworkLayers
 
 INITIAL_LOG_DENSITY = 0.0
 """Raw density of an untrained field: 1 per metre, a fog thin enough to be cleared quickly."""

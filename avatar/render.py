@@ -22,12 +22,7 @@ from avatar.correspondence_grid import (
     screen_bounds,
 )
 from avatar.kernels import operations
-from avatar.kernels.operands import (
-    CorrespondenceTables,
-    DensityGrid,
-    MarchSettings,
-    RayBatch,
-)
+from avatar.kernels.operands import CorrespondenceTables, DensityGrid, MarchSettings, RayBatch
 from avatar.radiance_field import RadianceField
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose

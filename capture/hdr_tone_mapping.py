@@ -8,30 +8,22 @@ from jaxtyping import Float32, UInt8, UInt16
 
 PQ = 16
 """Transfer characteristics of SMPTE ST 2084 (code of ITU-T H.273)."""
-
 HLG = 18
 """Transfer characteristics of ARIB STD-B67 (code of ITU-T H.273)."""
-
 HDR_TRANSFERS = frozenset({PQ, HLG})
 """Codes of all HDR transfer curves."""
-
 WHITE_NITS = 203.0
 """Luminance of diffuse white in HDR (ITU-R BT.2408), which maps to white; cd/m²."""
-
 PEAK_NITS = 1000.0
 """Luminance of the brightest highlight that stays distinct; cd/m²."""
-
 TONE_MAP_KNEE = 0.75
 """Fraction of white from which light is compressed, so that the peak becomes white."""
-
 BT709_FROM_BT2020 = np.array(
     [[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]], np.float32
 )
 """Linear BT.709 from linear BT.2020 (ITU-R BT.2087)."""
-
 STRIP_ROWS = 16
 """Rows that are converted at once: those of a 4K image stay in the processor's cache."""
-
 LUT_SIZE = 4096
 """Entries of the table from code values to linear light (12 bits)."""
 

@@ -16,13 +16,10 @@ from capture.source import ASSUMED_FPS, Frame, FrameSelection, FrameSource
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"})
 """File endings of images that are read."""
-
 ALPHA_SAMPLES = 5
 """Number of images, evenly spread, whose alpha channel is examined."""
-
 ALPHA_SUFFIXES = frozenset({".png", ".webp", ".bmp", ".tif", ".tiff"})
 """File endings of images that can have an alpha channel."""
-
 MIN_TRANSPARENT_FRACTION = 0.01
 """Fraction of transparent pixels from which an alpha channel is a mask (not rounded corners)."""
 

@@ -18,21 +18,15 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from capture.image_folder import (
-    any_has_cutout_alpha,
-    list_images,
-    read_image,
-)
+from capture.image_folder import any_has_cutout_alpha, list_images, read_image
 from capture.inbox import Inbox
 from capture.input_error import InputError
 from capture.source import ASSUMED_FPS, Frame, FrameSelection, FrameSource, PacingClock
 
 CAMERA_PREFIX = "camera:"
 """Start of an argument that names a camera instead of a file."""
-
 MAX_QUEUED_FRAMES = 16
 """Most frames that wait, so that one whose pose is late does not cost the next ones."""
-
 MAX_READ_FAILURES = 16
 """Consecutive failures that mean the end: the camera was unplugged, or the stream is over."""
 
@@ -167,16 +161,12 @@ def _open_device(address: str) -> cv2.VideoCapture:
 
 DONE_FILE_NAME = "DONE"
 """Name of the file whose presence means that no more images will come."""
-
 IDLE_TIMEOUT_S = 10.0
 """Time without a new image after which the source ends, seconds."""
-
 POLL_INTERVAL_S = 0.05
 """Shortest time between two looks at the folder, seconds."""
-
 DAMAGED_AFTER_S = 2.0
 """Time without a change after which an unreadable image counts as damaged, seconds."""
-
 MAX_STEP_S = 1.0
 """Longest time between two images that is taken from their time stamps, seconds."""
 

@@ -14,10 +14,8 @@ from capture.video import VIDEO_SUFFIXES, VideoFile
 
 HEIC_SUFFIXES = frozenset({".heic", ".heif"})
 """File endings of phone images that OpenCV does not read."""
-
 NON_VIDEO_SUFFIXES = HEIC_SUFFIXES | {".txt", ".npz", ".npy", ".pkl", ".json", ".zip", ".pt"}
 """Endings of files that are named as a video by mistake."""
-
 SIDE_VIDEO_PREFIXES = ("mask", "preview", "skeleton")
 """Starts of the names of videos that lie beside the one that is meant."""
 

@@ -18,13 +18,10 @@ VIDEO_SUFFIXES = frozenset(
     {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".ts", ".wmv"}
 )
 """File endings of videos that are read."""
-
 CONTAINERS_WITH_FRAME_COUNT = frozenset({".mp4", ".mov", ".m4v", ".avi", ".3gp"})
 """Containers that count their frames; of others the count is an estimate from the duration."""
-
 MAX_PIXEL_STRETCH = 0.02
 """Relative difference of a pixel's width and height from which it is worth a word."""
-
 MAX_DECODE_FAILURES = 16
 """Decoding failures in a row that end a video; one damaged packet does not."""
 

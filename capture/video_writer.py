@@ -53,10 +53,7 @@ H264 = VideoCodec(
 )
 """For .mp4."""
 VP9 = VideoCodec(
-    name="libvpx-vp9",
-    pixel_format="yuv420p",
-    options=_VP9,
-    description="VP9, which browsers play",
+    name="libvpx-vp9", pixel_format="yuv420p", options=_VP9, description="VP9, which browsers play"
 )
 """For .webm."""
 VP9_ALPHA = VideoCodec(

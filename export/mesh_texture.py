@@ -22,7 +22,6 @@ GUTTER_PX = 12
 first three mipmaps do not mix."""
 SUBPIXEL_BITS = 8
 """Bits of a corner's place within a texel when triangles are drawn."""
-
 ColorAt = Callable[
     [Float32[np.ndarray, "points 3"], Float32[np.ndarray, "points 3"]],
     UInt8[np.ndarray, "points 3"],

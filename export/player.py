@@ -71,9 +71,7 @@ class PictureDifference:
         return self.psnr >= MIN_SAME_PSNR
 
 
-def premultiply(
-    rgba: UInt8[np.ndarray, "height width 4"],
-) -> Float32[np.ndarray, "height width 4"]:
+def premultiply(rgba: UInt8[np.ndarray, "height width 4"]) -> Float32[np.ndarray, "height width 4"]:
     """Convert a straight 8-bit picture to premultiplied floats in [0, 1]."""
     picture = rgba.astype(np.float32) / np.float32(255.0)
     picture[..., :3] *= picture[..., 3:]
@@ -149,12 +147,7 @@ class Player:
 
     @classmethod
     def load(
-        cls,
-        path: Path | str,
-        *,
-        tier: str = "hq",
-        threads: int = 1,
-        provider: str = "cpu",
+        cls, path: Path | str, *, tier: str = "hq", threads: int = 1, provider: str = "cpu"
     ) -> "Player":
         """Read a package and prepare its player.
 

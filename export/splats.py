@@ -113,10 +113,7 @@ def build_splats(
 
 
 def _lay_shell(
-    mesh: SkinnedMesh,
-    shell: Shell,
-    surface: KDTree,
-    bones: Float[np.ndarray, "24 4 4"] | None,
+    mesh: SkinnedMesh, shell: Shell, surface: KDTree, bones: Float[np.ndarray, "24 4 4"] | None
 ) -> tuple[np.ndarray, ...]:
     """Positions, axes times standard deviations, colors and opacities of a shell's Gaussians."""
     found = KDTree(mesh.positions).query(mesh.positions, 1 + NEIGHBORS)

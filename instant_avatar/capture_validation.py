@@ -19,11 +19,7 @@ from preprocess.alignment.correction_search import (
     CorrectionSearch,
 )
 from preprocess.alignment.corrections import undo_pose_delay
-from preprocess.alignment.keypoint_objective import (
-    KeypointObjective,
-    TrackedImage,
-    track_images,
-)
+from preprocess.alignment.keypoint_objective import KeypointObjective, TrackedImage, track_images
 from preprocess.alignment.silhouette_objective import (
     GOOD_IOU,
     SAMPLED_FRAMES,

@@ -24,7 +24,6 @@ KEYPOINT_COLOR, PAPER_COLOR, INK_COLOR = (0, 220, 220), (245, 245, 245), (40, 40
 """RGB colors of the sheet."""
 LABEL_PX = 26
 """Height of a row's label."""
-
 Rgb = UInt8[np.ndarray, "height width 3"]
 AlphaMask = Float32[np.ndarray, "height width"]
 

@@ -183,11 +183,7 @@ def _build_mesh(
         textured = False
         console.info("note: colors of vertices instead of a texture, which needs xatlas.")
     with console.status("extracting the surface"):
-        mesh = extract_mesh(
-            package.tables["hq"],
-            triangles=arguments.triangles,
-            textured=textured,
-        )
+        mesh = extract_mesh(package.tables["hq"], triangles=arguments.triangles, textured=textured)
         if arguments.to == "glb":
             content = _encode_animated(mesh, package.manifest, motion, name)
             if arguments.out.suffix.lower() == ".gltf":
@@ -217,10 +213,9 @@ def _encode_static(mesh: SkinnedMesh, kind: str) -> bytes:
     """Encode the canonical pose; colors are sRGB, as programs take a PLY's to be."""
     import trimesh  # slow to import
 
-    options: dict[str, Any] = {
-        "ply": {"vertex_normal": True},
-        "obj": {"include_normals": True},
-    }[kind]
+    options: dict[str, Any] = {"ply": {"vertex_normal": True}, "obj": {"include_normals": True}}[
+        kind
+    ]
     solid = trimesh.Trimesh(
         vertices=mesh.positions,
         faces=mesh.faces,

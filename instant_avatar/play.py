@@ -89,13 +89,7 @@ def _render_clip(arguments: PlayArguments, console: Console) -> int:
                     drawn.close()
                     return
 
-        count = write_clip(
-            out,
-            pictures(),
-            fps=fps,
-            blend=blend,
-            replace=arguments.overwrite,
-        )
+        count = write_clip(out, pictures(), fps=fps, blend=blend, replace=arguments.overwrite)
     console.info(f"Rendered {_describe_clip(shots, count, fps)}; {description}:")
     print(out)  # noqa: T201 - paths go to stdout, for scripts
     return DONE if count == total else INTERRUPTED
@@ -129,11 +123,7 @@ def _run_benchmark(arguments: PlayArguments, console: Console) -> int:
     _print_package_warnings(player, console)
     shots, _ = plan_render(arguments, player, console)
     result = benchmark_player(
-        player,
-        shots,
-        load_ms=load_ms,
-        tier=arguments.tier,
-        workers=arguments.workers or 1,
+        player, shots, load_ms=load_ms, tier=arguments.tier, workers=arguments.workers or 1
     )
     if arguments.json is not None:
         write_text_atomically(arguments.json, result.to_json(), replace=arguments.overwrite)

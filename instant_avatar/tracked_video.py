@@ -29,7 +29,6 @@ DOUBT_COLOR = (255, 60, 60)
 """RGB color of doubts."""
 LEFT_JOINTS = frozenset({1, 4, 7, 10, 13, 16, 18, 20, 22})
 """Joints of SMPL's tree on the person's left; the next one is that on the right."""
-
 Rgb = UInt8[np.ndarray, "height width 3"]
 
 

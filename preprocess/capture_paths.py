@@ -15,7 +15,6 @@ POSE_FILE_NAMES = [
     "vibe_output.pkl",
 ]
 """Names under which poses lie in a capture folder."""
-
 MASK_NAMES = ["masks", "masks.npz", "masks.npy", "masks.mp4", "masks.json"]
 """Names under which masks lie in a capture folder."""
 

@@ -56,7 +56,6 @@ def _mismatch_hint(rows: int, count: int) -> str:
 
 MAX_TIME_OFFSET_S = 0.05
 """Largest distance of a pose from its frame, seconds."""
-
 MIN_MATCHED_FRACTION = 0.1
 """Fraction of the frames, or of the poses, that must be associated by their times."""
 
@@ -178,7 +177,6 @@ def frame_numbers_from_names(names: Iterable[str]) -> list[int]:
 
 MAX_INTERPOLATED_FRAMES = 12
 """Longest run of frames without a camera that is interpolated."""
-
 MIN_NUMBERED_COVERAGE = 0.9
 """Fraction of a video's frames that consecutive numbers must reach to be frame numbers."""
 

@@ -37,7 +37,6 @@ LICENCES = {
     },
 }  # fmt: skip
 """Programs as `Motion.program` names them, and families of bodies."""
-
 BUILT_IN_MASKS = "estimated by BlazePose"
 """Origin of the built-in segmenter's masks."""
 

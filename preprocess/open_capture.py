@@ -12,12 +12,7 @@ from capture.source import Frame, FrameSource, PacingClock, RealtimePlayback, Tr
 from capture.source_opening import open_live_source, open_source
 from preprocess.alignment.capture_geometry import CaptureGeometry, rescale_motion
 from preprocess.body.body_pose import Motion
-from preprocess.body.parametric_body import (
-    BodyModel,
-    ShapedBody,
-    load_body_model,
-    read_shaped_body,
-)
+from preprocess.body.parametric_body import BodyModel, ShapedBody, load_body_model, read_shaped_body
 from preprocess.body.proportion_space import shape_for_motion
 from preprocess.cameras.camera_file import (
     ASSUMED_CAMERA_SOURCE,
@@ -59,12 +54,7 @@ from preprocess.poses.plausibility import (
     require_plausible,
 )
 from preprocess.poses.pose_format_registry import read_poses
-from preprocess.tracked_stream import (
-    LiveTracking,
-    TrackedMasks,
-    TrackedObservations,
-    TrackedStream,
-)
+from preprocess.tracked_stream import LiveTracking, TrackedMasks, TrackedObservations, TrackedStream
 from preprocess.tracking.keypoints import PersonKeypoints
 from preprocess.tracking.video_tracking import MaskRefinement
 

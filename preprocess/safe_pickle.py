@@ -159,7 +159,6 @@ ALLOWED: dict[tuple[str, str], Callable[..., Any]] = {
     },
 }  # fmt: skip
 """All that a pickle may name, by exact module and name, and what is called instead."""
-
 _PythonUnpickler: Any = pickle._Unpickler  # type: ignore[attr-defined]
 
 

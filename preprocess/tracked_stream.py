@@ -37,12 +37,7 @@ from preprocess.fitting.tracked_frames import (
     reduced_size_px,
 )
 from preprocess.masks.mask_sources import MaskSource
-from preprocess.observation import (
-    DroppedFrame,
-    Observation,
-    join_frame,
-    shrink_to_longer_side,
-)
+from preprocess.observation import DroppedFrame, Observation, join_frame, shrink_to_longer_side
 from preprocess.observation_source import ObservationSource
 from preprocess.plugins import PersonTracker
 from preprocess.tracking.keypoints import PersonKeypoints

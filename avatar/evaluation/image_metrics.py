@@ -138,7 +138,6 @@ def ssim(
 
 SharpnessVerdict = Literal["sharp", "soft", "blurred", "failed"]
 """Verdicts from the best to the worst."""
-
 MAX_SHARP_BLUR = 0.0075
 """Largest equivalent blurs of sharp and soft images, as shares of the person's height."""
 MAX_SOFT_BLUR = 0.0125

@@ -94,9 +94,7 @@ def render_unfilmed_views(
     ]
 
 
-def half_transparent_share(
-    pictures: Sequence[Float32[np.ndarray, "height width 4"]],
-) -> float:
+def half_transparent_share(pictures: Sequence[Float32[np.ndarray, "height width 4"]]) -> float:
     """Share of the person's pixels that are half transparent, in [0, 1].
 
     Outlines alone make 5 to 8 % of a person of `VIEW_PX`. An avatar of which nothing is seen counts

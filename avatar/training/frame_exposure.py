@@ -21,7 +21,6 @@ from avatar.training.replay_buffer import TrainingBatch
 
 ChannelGains = Float32[np.ndarray, "3"]
 """Factor of each color channel of a frame against the neutral avatar."""
-
 MIN_PERSON_ALPHA = 0.5
 """Alpha, in the frame and in the rendering, above which a ray counts."""
 MEMORY_RAYS = 1000.0

@@ -33,12 +33,7 @@ from avatar.events import (
 from avatar.kernels import operations
 from avatar.render import render
 from avatar.rig import Rig
-from avatar.training.frame_stream import (
-    RedundantFrame,
-    StreamItem,
-    TrainingFrame,
-    rebuild_frame,
-)
+from avatar.training.frame_stream import RedundantFrame, StreamItem, TrainingFrame, rebuild_frame
 from avatar.training.pose_optimizer import FIRST_CORRECTION_STEPS
 from avatar.training.trainer import Trainer, cosine_decay
 from avatar.training.training_pixels import RayView
@@ -174,10 +169,7 @@ class _FrameIntake:
     """Hands arriving frames to the trainer, and tracks the end of the stream."""
 
     def __init__(
-        self,
-        trainer: Trainer,
-        inbox: Inbox[StreamItem],
-        held_out: list[HeldOutFrame],
+        self, trainer: Trainer, inbox: Inbox[StreamItem], held_out: list[HeldOutFrame]
     ) -> None:
         self._trainer, self._inbox, self._held_out = trainer, inbox, held_out
         self._began = trainer.scheduled_seconds

@@ -54,10 +54,7 @@ class OccupancySampler:
     """
 
     def __init__(
-        self,
-        occupancy: OccupancyGrid,
-        config: TrainConfig,
-        unseen: UnseenSkin | None = None,
+        self, occupancy: OccupancyGrid, config: TrainConfig, unseen: UnseenSkin | None = None
     ) -> None:
         """Reads `occupancy` and `unseen` at every call; their owner keeps them up to date."""
         self._unseen = unseen if config.unseen_weight else None

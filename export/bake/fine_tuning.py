@@ -25,19 +25,13 @@ from export.bake.voxel_cells import (
     quantize_bricks,
     share_codes_within_budget,
 )
-from export.package.player_tables import (
-    BRICK_SIZE,
-    BrickTable,
-    PlayerTables,
-    RenderSettings,
-)
+from export.package.player_tables import BRICK_SIZE, BrickTable, PlayerTables, RenderSettings
 from export.player import picture_on_white
 from export.player_inputs import fit_camera
 from preprocess.body.body_pose import BodyPose
 
 MAX_SEGMENTS = 1_600_000
 """Add no picture beyond this number of segments; rays through fog have many."""
-
 PosedView = tuple[BodyPose, Camera]
 """A pose and a camera that looks at it."""
 RgbaPicture = Float32[np.ndarray, "height width 4"]
@@ -126,7 +120,6 @@ THICK_FIELD_PICTURES = 8
 each takes twice as long to draw."""
 PROBE_PICTURES = 6
 """Pictures near the views that are compared with `TARGET_DB`."""
-
 ExportProgress = Callable[[float], None]
 """Receives the fraction of the work that is done, from 0 to 1."""
 
@@ -242,10 +235,7 @@ def is_below_target(inputs: FineTuningInputs) -> bool:
 
 
 def fine_tune(
-    inputs: FineTuningInputs,
-    *,
-    max_pictures: int,
-    progress: ExportProgress = lambda _: None,
+    inputs: FineTuningInputs, *, max_pictures: int, progress: ExportProgress = lambda _: None
 ) -> FineTuningResult:
     """Fine-tune bricks until the player shows more of what the renderer shows.
 

@@ -14,12 +14,7 @@ from jaxtyping import Bool, Float, Float32, Int, Int64, UInt8
 
 from avatar.kernels.kernel_compiler import compile_kernel
 from avatar.rig import Rig
-from export.bake.voxel_grid import (
-    blur_grid,
-    dilate,
-    remove_floaters_and_cavities,
-    resample_grid,
-)
+from export.bake.voxel_grid import blur_grid, dilate, remove_floaters_and_cavities, resample_grid
 from export.package.player_tables import BRICK_SIZE, LOG_DENSITY_RANGE
 
 F32, I32 = np.float32, np.int32

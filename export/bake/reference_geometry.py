@@ -44,8 +44,7 @@ def compression_factor(
 
 
 def invert_jacobians(
-    settings: RenderSettings,
-    jacobian: Float32[np.ndarray, "rays 3 3"],
+    settings: RenderSettings, jacobian: Float32[np.ndarray, "rays 3 3"]
 ) -> tuple[Float32[np.ndarray, "rays 3 3"], Bool[np.ndarray, "rays"]]:
     """Return inverse Jacobians, and which of them are sound; the others are arbitrary."""
     inverse, volume = invert_matrices(jacobian)

@@ -267,9 +267,7 @@ def _pose_surface(
     from_eye = np.einsum("nij,nj->ni", inverse, splatted)
     facing = np.einsum("ni,ni->n", tables.surfels.normals, from_eye)
     return _PosedSurface(
-        nodes=there,
-        positions=splatted,
-        facing=np.where(flat, 0.0, facing).astype(np.float32),
+        nodes=there, positions=splatted, facing=np.where(flat, 0.0, facing).astype(np.float32)
     )
 
 

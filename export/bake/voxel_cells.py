@@ -43,9 +43,7 @@ def brick_chunks(voxels: int) -> list[slice]:
 
 
 def prune_octrees(
-    codes: Float[np.ndarray, "voxels channels"],
-    weights: Float[np.ndarray, "voxels"],
-    price: float,
+    codes: Float[np.ndarray, "voxels channels"], weights: Float[np.ndarray, "voxels"], price: float
 ) -> Int64[np.ndarray, "voxels"]:
     """Choose the cells that minimize squared error plus price times the number of cells.
 
@@ -136,10 +134,7 @@ def choose_cells(
 
 
 def share_codes(
-    codes: VoxelCodes,
-    update: SirtUpdate,
-    baked: Float32[np.ndarray, "voxels"],
-    cells: VoxelCells,
+    codes: VoxelCodes, update: SirtUpdate, baked: Float32[np.ndarray, "voxels"], cells: VoxelCells
 ) -> VoxelCodes:
     """Give all voxels of a cell their weighted mean; other arguments as of `choose_cells`."""
     weights = _error_weights(update, baked)

@@ -167,10 +167,7 @@ class BlockValues:
 
 
 def march_segments(
-    context: GraphContext,
-    posed: GraphValue,
-    segment: SegmentValues,
-    close_up: GraphValue,
+    context: GraphContext, posed: GraphValue, segment: SegmentValues, close_up: GraphValue
 ) -> tuple[GraphValue, GraphValue]:
     """Composite rays front to back; return premultiplied color and transmittance, in [0, 1].
 

@@ -255,9 +255,7 @@ def _median_of_nine(values: list[GraphValue]) -> GraphValue:
     middle = [_median_of_three(*three) for three in threes]
     greatest = [a.maximum(b, c) for a, b, c in threes]
     return _median_of_three(
-        least[0].maximum(*least[1:]),
-        _median_of_three(*middle),
-        greatest[0].minimum(*greatest[1:]),
+        least[0].maximum(*least[1:]), _median_of_three(*middle), greatest[0].minimum(*greatest[1:])
     )
 
 

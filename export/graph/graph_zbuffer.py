@@ -4,18 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from export.graph.graph_skinning import (
-    GraphContext,
-    PosedSurfels,
-    faces_camera,
-)
+from export.graph.graph_skinning import GraphContext, PosedSurfels, faces_camera
 from export.graph.onnx_builder import GraphValue
-from export.package.player_tables import (
-    DEPTH_CODES,
-    HOLE_SPACINGS,
-    SURFEL_BITS,
-    SURFEL_MASK,
-)
+from export.package.player_tables import DEPTH_CODES, HOLE_SPACINGS, SURFEL_BITS, SURFEL_MASK
 
 EMPTY_KEY = np.int32(2**31 - 1)
 """Key of a pixel that no surfel covers."""

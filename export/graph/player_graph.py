@@ -12,12 +12,7 @@ from export.graph.graph_ray_setup import (
     pixel_rays,
     trace_depth_layer,
 )
-from export.graph.graph_skinning import (
-    CameraValues,
-    GraphContext,
-    pose_nodes,
-    pose_surfels,
-)
+from export.graph.graph_skinning import CameraValues, GraphContext, pose_nodes, pose_surfels
 from export.graph.graph_zbuffer import (
     EMPTY_KEY,
     SplatWindow,

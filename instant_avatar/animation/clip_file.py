@@ -23,7 +23,6 @@ CLIP_SUFFIXES = (".webm", ".mp4", ".gif", ".webp", ".png")
 """Suffixes of the files that can be written; a name without one is a folder of frames."""
 MAX_GIF_FPS = 50.0
 """Frame rate above which browsers slow a GIF down."""
-
 Rgba = UInt8[np.ndarray, "height width 4"]
 Rgb = UInt8[np.ndarray, "height width 3"]
 BackgroundBlend = Callable[[Rgba], Rgb]

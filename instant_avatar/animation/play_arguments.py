@@ -230,10 +230,7 @@ class PlayArguments:
 ALL_ARGUMENTS = frozenset(field.name for field in fields(PlayArguments))
 """Names of all arguments."""
 MODES = {
-    "verify": (
-        "renders the golden frames as stored",
-        frozenset({"provider", "json", "overwrite"}),
-    ),
+    "verify": ("renders the golden frames as stored", frozenset({"provider", "json", "overwrite"})),
     "web": (
         "shows a page with its own camera, size and choice of tiers",
         frozenset({"poses", "person", "out", "fps", "speed"}),

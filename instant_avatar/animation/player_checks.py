@@ -13,12 +13,7 @@ import onnxruntime
 from capture.camera import Camera
 from export.package.manifest import Manifest
 from export.package.package_file import read_package
-from export.player import (
-    MIN_SAME_PSNR,
-    Player,
-    compare_golden_frames,
-    find_provider,
-)
+from export.player import MIN_SAME_PSNR, Player, compare_golden_frames, find_provider
 from preprocess.body.body_pose import BodyPose
 
 

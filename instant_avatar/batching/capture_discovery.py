@@ -32,7 +32,6 @@ BATCH_OPTIONS = ("out", "resume", "overwrite", "json", "view", "live", "realtime
 """Options of ia-ingest that a batch sets itself, or that need a person or a camera."""
 COST_OPTIONS = ("video", "threads")
 """Options that do not change the avatar; with others it is learnt again."""
-
 Options = tuple[dict[str, str], tuple[str, ...]]
 """Options of ia-ingest: paths, absolute or URLs, by option, and the words of all others."""
 Row = tuple[str, str, Options, Mapping[str, ListedFile]]

@@ -18,7 +18,6 @@ TEMPLATE_FOLDERS = (Path(__file__).parent, Path(__file__).parents[1] / "report")
 """Folders of the page's template, and of the style of all pages."""
 STATUSES = ("failed", "refused", "waiting", "done")
 """States of a capture, the worst first."""
-
 Results = Mapping[str, AttemptRecord | None]
 """The result of each capture by its name; None for one that waits."""
 

@@ -10,11 +10,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from capture.atomic_files import (
-    RESERVED_PREFIX,
-    check_replaceable_folder,
-    is_stream,
-)
+from capture.atomic_files import RESERVED_PREFIX, check_replaceable_folder, is_stream
 from capture.input_error import InputError, quote_command
 from capture.source import FrameSource
 from capture.source_opening import describe_recording, open_source

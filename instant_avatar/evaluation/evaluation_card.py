@@ -7,11 +7,7 @@ from importlib.metadata import version
 from avatar.evaluation.perceptual import Lpips
 from instant_avatar.cli.hardware import describe_machine
 from instant_avatar.evaluation.frame_scoring import LARGEST_SHOWN_ERROR, choose_shown
-from instant_avatar.evaluation.score_table import (
-    AvatarEvaluation,
-    compare_avatars,
-    table_cells,
-)
+from instant_avatar.evaluation.score_table import AvatarEvaluation, compare_avatars, table_cells
 from instant_avatar.report.page_rendering import render_template
 
 POSES = {

@@ -25,7 +25,6 @@ PremultipliedImage = Float32[np.ndarray, "height width 4"]
 """RGBA with premultiplied alpha."""
 FrameRenderer = Callable[[Observation], PremultipliedImage]
 """Renders the pose of a frame with its camera."""
-
 BACKGROUNDS = {"white": 1.0, "black": 0.0}
 """Gray behind the person, by name."""
 METRICS = (

@@ -44,11 +44,7 @@ from avatar.training.held_out_pose_fitting import fit_test_poses
 from avatar.training.trainer import Trainer
 from export.build import ExportReport
 from instant_avatar.cli.console import Console
-from instant_avatar.report.report_schema import (
-    CurvePoint,
-    EarlierVideoStats,
-    finite_mean,
-)
+from instant_avatar.report.report_schema import CurvePoint, EarlierVideoStats, finite_mean
 from instant_avatar.run.run_folder import RunFolder
 from instant_avatar.run.stream_meter import StreamMeter
 
@@ -66,7 +62,6 @@ FRAMES_PER_FIT = 6
 """Frames whose poses are fitted together; no more are fitted once the time is up."""
 KEPT_RENDERINGS = 6
 """Renderings that are kept for the report's page."""
-
 WhiteImage = UInt8[np.ndarray, "height width 3"]
 
 

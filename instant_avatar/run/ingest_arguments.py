@@ -24,16 +24,12 @@ from preprocess.plugins import segmenter_name
 
 PROGRAM = "ia-ingest"
 """Name of the command."""
-
 REFERENCE_LONGER_SIDE_PX = 540
 """Longer side of the images whose detail can be learned in `DEFAULT_SECONDS`, pixels."""
-
 DEFAULT_SECONDS = 60.0
 """Training time without --seconds, --steps or --realtime."""
-
 MIN_SECONDS = 0.1
 """Least --seconds; every frame is trained on at least once in any case."""
-
 VIEW_PORT = 8008
 """Port of the live viewer where --view names none."""
 

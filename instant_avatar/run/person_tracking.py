@@ -43,7 +43,6 @@ MAX_PRINTED_STRETCHES = 8
 """Doubtful stretches that are printed; reports hold all of them."""
 MAX_FRAMES = 600
 """Most frames that are tracked unless --frames says which; of longer videos every nth."""
-
 SAME_PERSON = 0.15
 """Mean distance of one person's key points, found twice in a frame, in the person's size."""
 

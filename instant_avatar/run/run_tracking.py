@@ -100,12 +100,7 @@ def _with_grade(imported: ImportedCapture, stored: dict[str, Any]) -> ImportedCa
 
 
 def _track(
-    inputs: CaptureInputs,
-    run: RunFolder,
-    console: Console,
-    stop: threading.Event,
-    *,
-    resume: bool,
+    inputs: CaptureInputs, run: RunFolder, console: Console, stop: threading.Event, *, resume: bool
 ) -> PersonTracking:
     """Track the person into the run's folder; leave no empty folder if that fails."""
     run.tracking.mkdir(parents=True, exist_ok=True)

@@ -53,11 +53,7 @@ from instant_avatar.run.session_events import (
     SessionEvent,
     Started,
 )
-from instant_avatar.run.snapshot_writer import (
-    CheckpointWriter,
-    validation_views,
-    write_packages,
-)
+from instant_avatar.run.snapshot_writer import CheckpointWriter, validation_views, write_packages
 from instant_avatar.run.stream_meter import StreamMeter
 from preprocess.body.body_pose import BodyPose
 from preprocess.licence_chain import licence_chain

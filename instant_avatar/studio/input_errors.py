@@ -177,7 +177,6 @@ FOCAL_ERROR = (0.08, 0.12)
 """Least and largest error of the focal length, as a share, in either direction."""
 FACING_FLIPS, WRIST_FLIPS = 1, 2
 """Short mistakes of a film: front taken for back, and a hand turned over."""
-
 TRUNK, ENDS = (0, 3, 6, 9, 12, 13, 14, 15), (7, 8, 10, 11, 20, 21, 22, 23)
 MIRRORED = (0, 2, 1, 3, 5, 4, 6, 8, 7, 9, 11, 10, 12, 14, 13, 15, 17, 16, 19, 18, 21, 20, 23, 22)
 """The joint on the other side of each."""

@@ -22,7 +22,6 @@ from instant_avatar.studio.procedural_albedo import albedo_at
 
 RenderedFrame = tuple[UInt8[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]
 """A picture of the actor before a background, and the exact soft mask."""
-
 NO_FACE = -1
 
 
@@ -154,7 +153,6 @@ LAMP_STRENGTH = 0.42
 """Light of the lamp, as a factor of color."""
 SKY_DIRECTIONS = 32
 """Directions from which light comes."""
-
 SHADOW_BIAS_M = 0.02
 """Depth behind another surface at which half of the light has gone; no surface shades itself."""
 

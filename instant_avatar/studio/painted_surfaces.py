@@ -33,9 +33,7 @@ def paint_backdrop(kind: Backdrop, camera: Camera, generator: np.random.Generato
 
 
 def add_foot_shadows(
-    background: Rgb,
-    feet_world: Float[np.ndarray, "feet 3"],
-    camera: Camera,
+    background: Rgb, feet_world: Float[np.ndarray, "feet 3"], camera: Camera
 ) -> Rgb:
     """The backdrop with soft shadows on the floor around points of the feet."""
     height, width = background.shape[:2]
@@ -85,11 +83,7 @@ def _planks(large: Rgb, horizon: int, generator: np.random.Generator) -> None:
 
 
 def _shelf(
-    large: Rgb,
-    corner: tuple[int, int],
-    wide: int,
-    floor: int,
-    generator: np.random.Generator,
+    large: Rgb, corner: tuple[int, int], wide: int, floor: int, generator: np.random.Generator
 ) -> None:
     left, top = corner
     cv2.rectangle(large, (left, top), (left + wide, floor), (104, 74, 52), -1)
@@ -128,10 +122,7 @@ def _window(large: Rgb, corner: tuple[int, int], size: tuple[int, int]) -> None:
 
 
 def _picture(
-    large: Rgb,
-    corner: tuple[int, int],
-    size: tuple[int, int],
-    generator: np.random.Generator,
+    large: Rgb, corner: tuple[int, int], size: tuple[int, int], generator: np.random.Generator
 ) -> None:
     (x, y), (wide, tall) = corner, size
     cv2.rectangle(large, (x, y), (x + wide, y + tall), (52, 46, 44), -1)

@@ -29,10 +29,8 @@ TONE, LIPS, HAIR_TONE, IRIS, CLOTH, STRIPE, TRIM, DENIM, DENIM_STRIPE, THREAD, U
 
 SrgbColor = tuple[float, float, float]
 """sRGB in [0, 1]."""
-
 SYMMETRY_PLANE_X = -0.002
 """The template's plane of symmetry."""
-
 STRIPE_M = 0.04
 """Width of a stripe of shirt and trousers."""
 

@@ -148,11 +148,7 @@ def _choose_motion(actor: Actor, config: ShootConfig) -> Motion:
 
 
 def _film(
-    folder: Path,
-    scene: PhoneScene,
-    truth: Motion,
-    config: ShootConfig,
-    done: Callable[[int], None],
+    folder: Path, scene: PhoneScene, truth: Motion, config: ShootConfig, done: Callable[[int], None]
 ) -> None:
     """video.mp4, masks/, and what is exact of them in truth/."""
     (folder / "masks").mkdir()

@@ -289,10 +289,8 @@ WALK_DISTANCE_HEIGHTS = 1.52
 HANDHELD_HEIGHT_M = 1.4
 STANDING_DISTANCE_M = 3.4
 """Distance from which the camera that stands still sees raised arms, too."""
-
 NEAR_FOOT_OFFSET_M = 0.2
 """Distance by which the nearer foot is closer to the camera than the body center, metres."""
-
 SHAKE_M, SHAKE_DEG = 0.012, 0.6
 """Standard deviation of the hand's trembling, for each axis."""
 SHAKE_FRAMES = 2.5

@@ -20,7 +20,6 @@ from preprocess.poses.plausibility import lost_pose_warnings, plausibility_warni
 
 FULL_WINDOW = (0.0, 0.0, 1.0, 1.0)
 """Window of a video that shows exactly the masks' image."""
-
 MIN_JUMP_M = 0.25
 """Least step of the root between frames that is a jump, metres."""
 MIN_JUMP_RAD = np.deg2rad(40.0)

@@ -48,7 +48,6 @@ MIRRORED_JOINTS = [
     for name in JOINT_NAMES[1:]
 ]  # fmt: skip
 """Row of each joint's other side among the 23 joint rotations."""
-
 CatalogEntries = Iterator[tuple[str, str, GeometryChange]]
 """Causes, what was wrong, and the changes that undo it."""
 Rotation3 = Float[np.ndarray, "3 3"]

@@ -187,9 +187,7 @@ def best_per_cause(candidates: Iterable[CorrectionCandidate]) -> tuple[Correctio
 
 
 def is_significant(
-    candidate: CorrectionCandidate,
-    geometry: CaptureGeometry,
-    scores: Float[np.ndarray, "samples"],
+    candidate: CorrectionCandidate, geometry: CaptureGeometry, scores: Float[np.ndarray, "samples"]
 ) -> bool:
     """Check whether a candidate gains enough, frame by frame, over the current scores."""
     gains = candidate.frame_scores - np.nan_to_num(scores)

@@ -19,7 +19,6 @@ CAUSES = (
     "video_mirrored", "video_offset", "video_crop",
 )  # fmt: skip
 """Names of the mistakes in commands and files; of equal candidates the first cause is named."""
-
 GeometryChange = Callable[[CaptureGeometry], CaptureGeometry]
 MAX_CENTER_OFFSET = 0.45
 """Largest shift of the principal point, as a fraction of the image's sides."""

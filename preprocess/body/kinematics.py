@@ -14,7 +14,6 @@ JOINT_NAMES = (
 """Joints in the order of all arrays."""
 HEAD_JOINT = JOINT_NAMES.index("head")
 """Joint at the base of the skull."""
-
 PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
 """Parent of each joint, before its children; -1 for the root."""
 
@@ -102,10 +101,8 @@ def world_from_body(
 
 SHARED_JOINTS = 22
 """Root and body joints that SMPL, SMPL+H and SMPL-X have in common, in one order."""
-
 SMPL_JOINTS = 24
 """Number of SMPL's joints, the root included."""
-
 SUPPORTED_JOINT_COUNTS = (22, 24, 52, 55)
 """Numbers of joints that a pose may have: without hands, SMPL, SMPL+H, SMPL-X."""
 

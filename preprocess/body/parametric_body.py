@@ -158,10 +158,8 @@ def smpl_rest_joints() -> Float[np.ndarray, "24 3"]:
 
 REQUIRED_BODY_KEYS = ("v_template", "shapedirs", "weights", "kintree_table", "f")
 """Keys of SMPL's body files that must exist."""
-
 BODY_KEYS = (*REQUIRED_BODY_KEYS, "J_regressor", "J", "J_shapedirs", "posedirs")
 """All keys of body files that are read."""
-
 Arrays = dict[str, Shaped[np.ndarray, "..."]]
 
 

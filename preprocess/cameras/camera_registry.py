@@ -5,16 +5,10 @@ from pathlib import Path
 from capture.input_error import InputError
 from preprocess.cameras.colmap_model import find_colmap_model, read_colmap_model
 from preprocess.cameras.named_camera import NamedCamera
-from preprocess.cameras.scanning_apps import (
-    find_polycam,
-    read_json_cameras,
-    read_polycam,
-    read_r3d,
-)
+from preprocess.cameras.scanning_apps import find_polycam, read_json_cameras, read_polycam, read_r3d
 
 JSON_NAMES = ("transforms.json", "transforms_train.json", "metadata", "metadata.json")
 """Names of files with cameras, of nerfstudio, NeRF and Record3D, in a folder."""
-
 READABLE_FORMATS = (
     "an .npz (intrinsic, extrinsic, height, width), a COLMAP model (the folder of cameras.bin and "
     "images.bin, or .txt), a transforms.json of nerfstudio or instant-ngp, Record3D's .r3d or its "

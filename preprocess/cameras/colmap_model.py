@@ -14,28 +14,20 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from capture.image_folder import natural_sort_key
-from preprocess.cameras.named_camera import (
-    NamedCamera,
-    checked_camera,
-    image_name,
-)
+from preprocess.cameras.named_camera import NamedCamera, checked_camera, image_name
 from preprocess.file_content import explain_damage
 
 MODEL_SUBFOLDERS = (".", "sparse/0", "0", "sparse", "colmap/sparse/0", "dense/sparse")
 """Places of models in a folder, as COLMAP, nerfstudio and others leave them."""
-
 CAMERA_MODELS = {
     "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8,
     "OPENCV_FISHEYE": 8, "FULL_OPENCV": 12,
 }  # fmt: skip
 """Number of parameters of COLMAP's camera models, in the order of their numbers."""
-
 DISTORTION_START = {"SIMPLE_RADIAL": 3, "RADIAL": 3, "OPENCV": 4, "FULL_OPENCV": 4}
 """First of OpenCV's distortion coefficients among the parameters, of the models that have some."""
-
 Lens = tuple[str, tuple[int, int], list[float]]
 """A camera model's name, width and height, and its parameters."""
-
 ImageRow = tuple[str, str, list[float]]
 """An image's name, its camera's number, and its camera-from-world: qw qx qy qz tx ty tz."""
 

@@ -21,31 +21,24 @@ from preprocess.file_content import explain_damage, read_untrusted_file
 
 INTRINSICS = "intri.yml"
 """EasyMocap's file of camera matrices and distortions."""
-
 EXTRINSICS = "extri.yml"
 """EasyMocap's file of rotations and translations."""
-
 ZJU = "annots.npy"
 """ZJU-MoCap's file of all cameras."""
-
 OPENCV_MATRIX_PATTERN = re.compile(
     r"^(\w+):\s*!!opencv-matrix\s+rows:\s*(\d+)\s+cols:\s*(\d+)\s+dt:\s*\w+\s+data:\s*\[([^\]]*)\]",
     re.MULTILINE,
 )
 """A matrix in OpenCV's YAML. OpenCV's own reader writes beyond its memory on damaged files."""
-
 EASYMOCAP_KEYS = (
     ("K", "K"), ("R", "R"), ("R", "Rot"), ("T", "T"), ("D", "D"), ("D", "dist"), ("W", "W"),
     ("H", "H"),
 )  # fmt: skip
 """A camera's parts and their prefixes in EasyMocap's files; the last that is there counts."""
-
 IMAGE_SIZE_PATTERN = re.compile(r"^([HW]_\w+):\s*([0-9.]+)\s*$", re.MULTILINE)
 """Width or height of a camera's images in OpenCV's YAML."""
-
 MAX_PARENT_FOLDERS = 3
 """Number of folders above an image whose names may be its camera's."""
-
 StudioCamera = Mapping[str, Float[np.ndarray, "rows columns"]]
 """K, R, T, and perhaps D (distortion), W and H, by these names."""
 

@@ -14,7 +14,6 @@ from preprocess.body.kinematics import rigid_transform
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Camera axes: y up and z back become y down and z forward."""
-
 MAX_IMAGE_SIDE_PX = 16_384
 """Longest side of an image."""
 

@@ -30,15 +30,12 @@ SUPPORTED_CAMERA_MODELS = (
     "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FULL", "perspective",
 )  # fmt: skip
 """Camera models of transforms.json that OpenCV's distortion can express."""
-
 MAX_CENTER_OFFSET = 0.1
 """Largest offset of a principal point from the image's center; a fraction of the image's size."""
-
 POLYCAM_SUBFOLDERS = (
     "keyframes/corrected_cameras", "keyframes/cameras", "corrected_cameras", "cameras", ".",
 )  # fmt: skip
 """Folders of Polycam's cameras, the optimised ones first."""
-
 POLYCAM_KEYS = tuple(f"t_{row}{column}" for row in range(3) for column in range(4))
 """Polycam's keys of the upper three rows of world-from-camera."""
 
@@ -78,9 +75,7 @@ def _read_transforms(content: dict[str, Any], size_px: tuple[int, int] | None) -
 
 
 def _transforms_camera(
-    numbers: dict[str, Any],
-    applied: Float[np.ndarray, "4 4"],
-    size_px: tuple[int, int] | None,
+    numbers: dict[str, Any], applied: Float[np.ndarray, "4 4"], size_px: tuple[int, int] | None
 ) -> Camera:
     """One frame's camera; what the frame does not say, the file does."""
     lens = "a fisheye" if numbers.get("is_fisheye") else numbers.get("camera_model", "OPENCV")

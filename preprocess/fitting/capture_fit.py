@@ -18,9 +18,7 @@ from preprocess.file_content import read_npz
 
 
 def correct_pose(
-    pose: BodyPose,
-    correction: Float[np.ndarray, "75"],
-    camera_from_world: Float[np.ndarray, "4 4"],
+    pose: BodyPose, correction: Float[np.ndarray, "75"], camera_from_world: Float[np.ndarray, "4 4"]
 ) -> BodyPose:
     """A pose with a correction: rotations in the joints' axes, translation in the camera's."""
     given = Rotation.from_rotvec(np.concatenate([pose.root_rotation[None], pose.joint_rotations]))

@@ -136,9 +136,7 @@ class ClipPoses:
         return PosedJoints(turns, places)
 
 
-def rotation_vectors(
-    matrices: Float[np.ndarray, "*batch 3 3"],
-) -> Float[np.ndarray, "*batch 3"]:
+def rotation_vectors(matrices: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch 3"]:
     """Axis-angles of exact rotation matrices, radians."""
     flat = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_rotvec()
     return flat.reshape(matrices.shape[:-1])
@@ -156,7 +154,6 @@ def _pose_sigma() -> Float[np.ndarray, "75"]:
 POSE_SIGMA = _pose_sigma()
 """Prior standard deviation of a frame's correction: root and joint rotations, root position. These
 are the units of a frame's parameters in the equations."""
-
 MIRRORED_AXES = (1.0, -1.0, -1.0)
 """An axis-angle of a left joint times this is that of the right one."""
 LEFT_PRIORS = {

@@ -146,10 +146,7 @@ def _find_start(
 
 
 def _place(
-    geometry: CaptureGeometry,
-    shaped: ShapedBody,
-    divisor: float,
-    shift_m: Float[np.ndarray, "3"],
+    geometry: CaptureGeometry, shaped: ShapedBody, divisor: float, shift_m: Float[np.ndarray, "3"]
 ) -> CaptureGeometry:
     """Divide each pelvis's distance from its own camera, then shift it in the root's axes."""
     eyes = geometry.camera_centers()[geometry.camera_rows()]

@@ -13,12 +13,7 @@ from jaxtyping import Float, Int
 from preprocess.body.kinematics import JOINT_NAMES, rotation_matrices
 from preprocess.body.parametric_body import load_body_model
 from preprocess.body.proportion_space import ProportionSpace
-from preprocess.fitting.clip_poses import (
-    POSE_SIGMA,
-    ClipPoses,
-    GivenPosePrior,
-    HumanPosePrior,
-)
+from preprocess.fitting.clip_poses import POSE_SIGMA, ClipPoses, GivenPosePrior, HumanPosePrior
 from preprocess.fitting.keypoint_rows import KEYPOINT_JOINTS, KEYPOINT_OFFSETS_M, AttachedPoints
 from preprocess.fitting.normal_equations import ChainEquations
 from preprocess.tracking.pose_lift import PLACED_JOINTS, PLACED_POINTS, lift_pose

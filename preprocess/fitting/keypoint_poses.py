@@ -18,12 +18,7 @@ from capture.source import Frame
 from capture.source_opening import reopen
 from preprocess.alignment.silhouette_objective import spaced_indices
 from preprocess.capture_session import Capture
-from preprocess.fitting.clip_fitting import (
-    TRACKED_WEIGHTS,
-    ClipFitter,
-    ClipFrame,
-    FitParameters,
-)
+from preprocess.fitting.clip_fitting import TRACKED_WEIGHTS, ClipFitter, ClipFrame, FitParameters
 from preprocess.fitting.clip_poses import ClipPoses
 from preprocess.observation import associate_cameras
 from preprocess.tracking.keypoints import MIN_PRESENCE, KeypointTrack, PersonKeypoints

@@ -40,7 +40,6 @@ FIRST_ITERATIONS = (5, 5)
 """Iterations over the first frames, with key points alone and then with outlines."""
 FRAME_ITERATIONS = (1, 1)
 """Iterations for each later frame, with key points alone and then with outlines."""
-
 REVISED_FRAMES = 32
 """New frames after which the poses of all of them are fitted again."""
 OVERLAP_FRAMES = 16

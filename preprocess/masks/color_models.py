@@ -47,7 +47,6 @@ MAX_UNLIKE_FRACTION = 0.2
 """Largest squared difference from the plate in a window, relative to the plate's own variance."""
 MIN_KNOWN_FRACTION = 0.7
 """Least fraction of a window that must be known."""
-
 Pixels = Float32[np.ndarray, "pixels"]
 PixelMask = Bool[np.ndarray, "height width"]
 DARK_LEVEL, BRIGHT_LEVEL = 80.0, 180.0
@@ -99,9 +98,7 @@ class PlateColors(NamedTuple):
 
 
 def plate_density(
-    colors: Float32[np.ndarray, "3 pixels"],
-    mean: Float32[np.ndarray, "3 pixels"],
-    variance: Pixels,
+    colors: Float32[np.ndarray, "3 pixels"], mean: Float32[np.ndarray, "3 pixels"], variance: Pixels
 ) -> Pixels:
     """Density of colors where the background is known, as it is or in the person's shadow.
 

@@ -13,12 +13,7 @@ from jaxtyping import Float, Float32, Shaped
 from PIL import Image, ImageOps
 
 from capture.camera import same_aspect_ratio
-from capture.image_folder import (
-    IMAGE_SUFFIXES,
-    has_cutout_alpha,
-    natural_sort_key,
-    refuse_pipe,
-)
+from capture.image_folder import IMAGE_SUFFIXES, has_cutout_alpha, natural_sort_key, refuse_pipe
 from capture.input_error import InputError
 from capture.source import FrameSelection
 from capture.video import VIDEO_SUFFIXES, DecodedFrame, VideoFile
@@ -77,7 +72,6 @@ def _coverage(alpha: Float32[np.ndarray, "height width"]) -> Float[np.ndarray, "
 
 POLARITY_SAMPLES = 9
 """Number of masks from which polarity and kind are detected."""
-
 MaskReader = Callable[[int], Float32[np.ndarray, "height width"]]
 """From a row to the mask as stored."""
 

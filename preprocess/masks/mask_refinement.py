@@ -40,7 +40,6 @@ WORKING_SCALE = 2.0
 the frame, or smaller by a whole number."""
 RESCALE_MARGIN = 0.4
 """Distance of that number from the best before it changes."""
-
 OUTER_BAND, INNER_BAND = 6.0, 6.0
 """Reach of the band outside and inside the mask's border, in the network's pixels."""
 MARGIN = 2.0
@@ -49,7 +48,6 @@ SURE_PERSON, SURE_PERSON_DEPTH = 0.9, 1.5
 """Probability, and distance from the border, of pixels that teach the person's colors."""
 SURE_BACKGROUND, SURE_BACKGROUND_DISTANCE = 0.1, 2.5
 """Probability, and distance from the border, of pixels that teach the background's colors."""
-
 HISTOGRAM_WEIGHT = 0.75
 """Weight of the log ratio of a color's frequencies on the person and around them."""
 HISTOGRAM_MEMORY = 0.9
@@ -61,14 +59,12 @@ BIN_DENSITY = 32.0
 that of a bin of 16 levels in `color_density`'s unit."""
 MAX_LOG_RATIO = 8.0
 """Bound of the log likelihood ratio of person and background."""
-
 FILTER_RADIUS_PX = 3
 """Radius of the guided filter's windows in the working image, px."""
 FILTER_TOLERANCE = 5.0
 """Standard deviation of colors, in levels, that the guided filter does not follow."""
 PERSON_FREE_ALPHA = 0.05
 """Alpha below which a pixel enters the background plate."""
-
 Plane = Float32[np.ndarray, "height width"]
 Channels = Float32[np.ndarray, "3 height width"]
 PixelMask = Bool[np.ndarray, "height width"]

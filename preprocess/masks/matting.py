@@ -20,13 +20,11 @@ BORDER_SHIFTS_PX = np.linspace(-1.6, 1.6, 9, dtype=np.float32)
 """Displacements of the border that are averaged, px."""
 BORDER_BAND_PX = 2.2
 """Largest distance from the mask's border of a pixel that is refined, px."""
-
 COLOR_AXES = np.array(
     [[0.45, 0.35, -0.118], [0.88, -0.293, -0.232], [0.171, -0.057, 0.35]], np.float32
 )
 """Brightness, red and blue of a color, as columns. The last two count less: videos store them at
 half the resolution, so at a border they are the neighbors' too."""
-
 OUTLIER_PROBABILITY = 0.2
 """Probability of a foreground color that the appearance model does not predict."""
 OUTLIER_SPREAD = 50.0
@@ -43,7 +41,6 @@ NEARBY_PX = 3
 """Edge of the window in which it does, in twice the working image's pixels."""
 NEARBY_SPREAD = 14.0
 """Standard deviation of a color that the window's mean misses, in levels."""
-
 Plane = Float32[np.ndarray, "height width"]
 
 

@@ -38,14 +38,12 @@ KEY_ALIASES = {
     "camera": ("cam_extrinsics", "extrinsics"),
 }
 """Names of the same numbers in other programs: ExAvatar, ARAH, EMDB, CLIFF, HumanNeRF and more."""
-
 SMPLX_KEYS = frozenset(
     {"left_hand_pose", "lhand_pose", "jaw_pose", "leye_pose", "expression", "expr"}
 )
 """Keys of which one is enough to know the body."""
 MODEL_BY_JOINT_COUNT = {52: "smpl", 55: "smplx"}
 """Bodies by the number of joints of a pose, hands and face included."""
-
 SIBLING_KEYS = ("frame", "time", "valid", "K", "camera")
 """Keys that may lie beside `smpl`."""
 RECOGNIZED_KEYS = (
@@ -55,7 +53,6 @@ RECOGNIZED_KEYS = (
 """Keys that are read of a file; all others are left there."""
 CLIFF_FOCAL = RelativeFocalLength(ratio=1.0, reference="diagonal")
 """The camera in which CLIFF's `global_t` is."""
-
 SCALE_TOLERANCE = 0.01
 """A stated scale that is nearer to 1 says nothing."""
 
@@ -141,10 +138,8 @@ ROTATION_MATRIX_SIZES = frozenset(9 * joints for joints in (1, 21, 22, 23, 24, 5
 """Numbers in a row of rotation matrices; 63 of body_pose are axis-angles."""
 ROTATION_KEYS = ("global_orient", "body_pose", "thetas", "poses")
 """Keys of rotations."""
-
 ROW_SHAPES = {"transl": (3,), "K": (3, 3), "camera": (4, 4), "betas": (-1,)}
 """Shape of one row of each other array."""
-
 ROW_KEYS = (*ROTATION_KEYS, *ROW_SHAPES, "frame", "time", "valid")
 """All keys that are read of one row."""
 

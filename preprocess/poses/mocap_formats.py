@@ -20,13 +20,10 @@ AIST_FPS = 60.0
 """Poses per second of all AIST++ motions, by their documentation."""
 SMPLX_ROW_SIZE = 165
 """Numbers a row that only SMPL-X has: 55 joints."""
-
 EASYMOCAP_KEYS = {"Rh", "Th", "poses"}
 """Keys by which a file of EasyMocap is recognised."""
-
 SLAHMR_KEYS = frozenset({"root_orient", "pose_body", "trans"})
 """Keys by which a file of SLAHMR is recognised."""
-
 DPW_KEYS = frozenset({"poses", "trans", "cam_poses", "cam_intrinsics"})
 """Keys by which a file of 3DPW is recognised."""
 
@@ -163,8 +160,7 @@ def parse_slahmr(content: Any, prefer_world: bool = False) -> MotionByPerson | N
         intrinsic = np.asarray(content["cam_intrinsics"], dtype=np.float64)
         return {
             str(number): _with_cameras(
-                build_motion([poses], places, betas=shape, space="world", lens=intrinsic),
-                cameras,
+                build_motion([poses], places, betas=shape, space="world", lens=intrinsic), cameras
             )
             for number, ((poses, places), shape) in enumerate(zip(rows, shapes, strict=True))
         }

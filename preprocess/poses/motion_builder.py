@@ -183,7 +183,6 @@ def interpolate_rows(
 
 SMPLX_PELVIS = np.array([0.0031, -0.3514, 0.0120])
 """Pelvis of SMPL-X's neutral mean shape at rest, metres (its joint regressor's)."""
-
 FOCAL_TOLERANCE = 0.01
 """Focal lengths and principal points nearer than this share are one."""
 
@@ -222,9 +221,7 @@ def anchor_at_pelvis(motion: Motion, joints: Float[np.ndarray, "24 3"]) -> Motio
     anchor = np.zeros(3) if motion.anchor == "origin" else joints[1:3].mean(axis=0)
     turned = rotation_matrices(motion.root_rotations) @ (pelvis - anchor)
     return replace(
-        motion,
-        anchor="pelvis",
-        root_translations=motion.root_translations + turned - pelvis,
+        motion, anchor="pelvis", root_translations=motion.root_translations + turned - pelvis
     )
 
 
@@ -242,9 +239,7 @@ def transform_motion(
 
 
 def refocus_translation(
-    joints: Float[np.ndarray, "24 3"],
-    intrinsic: Float[np.ndarray, "3 3"],
-    camera: Camera,
+    joints: Float[np.ndarray, "24 3"], intrinsic: Float[np.ndarray, "3 3"], camera: Camera
 ) -> Float[np.ndarray, "3"]:
     """Shift of a body so that another camera sees it where the tracker's saw it.
 
@@ -258,9 +253,7 @@ def refocus_translation(
 
 
 def place_by_pixels(
-    joints: Float[np.ndarray, "joints 3"],
-    pixels: Float[np.ndarray, "joints 2"],
-    camera: Camera,
+    joints: Float[np.ndarray, "joints 3"], pixels: Float[np.ndarray, "joints 2"], camera: Camera
 ) -> Float[np.ndarray, "3"]:
     """Shift of a body so that a camera sees its joints at given pixels.
 

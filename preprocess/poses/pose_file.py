@@ -17,16 +17,12 @@ POSE_KEY_LAYOUTS = (
     ("poses", "trans"),
 )
 """The keys that may hold the poses, first match wins; one array of 72 starts with the root."""
-
 CAMERA_KEYS = ("camera_from_world", "w2c", "camera")
 """Keys of camera-from-world, best first."""
-
 MAX_MAGNITUDE = 1e9
 """Largest magnitude of an angle or a translation; numbers beyond it mean a damaged file."""
-
 MAX_PROPORTION = 100.0
 """Largest magnitude of a coefficient of proportions, in prior standard deviations."""
-
 Arrays = dict[str, Shaped[np.ndarray, "..."]]
 
 
@@ -147,9 +143,7 @@ def _per_row(arrays: Arrays, key: str, count: int) -> Float[np.ndarray, "poses"]
 
 
 def _valid(
-    arrays: Arrays,
-    numbers: Float[np.ndarray, "poses 75"],
-    times: Float[np.ndarray, "poses"] | None,
+    arrays: Arrays, numbers: Float[np.ndarray, "poses 75"], times: Float[np.ndarray, "poses"] | None
 ) -> Bool[np.ndarray, "poses"]:
     """Rows that are finite, of a size that angles and places have, and not marked as lost."""
     valid = np.asarray((np.abs(np.nan_to_num(numbers, nan=np.inf)) < MAX_MAGNITUDE).all(axis=1))

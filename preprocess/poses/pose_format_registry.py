@@ -34,12 +34,7 @@ TRACKERS: dict[str, Callable[[Any, bool], MotionByPerson | None]] = {
 """Trackers by name, in the order in which they try to read a file."""
 
 
-def read_poses(
-    path: Path,
-    *,
-    person: str | None = None,
-    prefer_world: bool = False,
-) -> Motion:
+def read_poses(path: Path, *, person: str | None = None, prefer_world: bool = False) -> Motion:
     """Poses from a file, or a folder of files, of any tracker that is known (docs/formats.md).
 
     Of several people the one with most poses is chosen, and the note names the others. Short gaps

@@ -289,9 +289,7 @@ def _nearest_to_rest(
 
 
 def _match_rest(
-    points: Float[np.ndarray, "24 3"],
-    target: Float[np.ndarray, "24 3"],
-    columns: Sequence[int],
+    points: Float[np.ndarray, "24 3"], target: Float[np.ndarray, "24 3"], columns: Sequence[int]
 ) -> Float[np.ndarray, "24 3 3"]:
     """SMPL's joint rotations, in the world, that bring its limbs onto those of a reference pose.
 

@@ -16,23 +16,17 @@ from preprocess.poses.motion_builder import MotionByPerson, build_motion, stack_
 
 WHAM_FOCAL = RelativeFocalLength(ratio=1.0, reference="diagonal")
 """WHAM's focal length where none was given."""
-
 VIBE_FOCAL = RelativeFocalLength(ratio=0.85)
 """Any would do: weak perspective has none, and the depth follows from it. A phone's is taken."""
-
 GVHMR_VIEWS = ("smpl_params_incam", "smpl_params_global")
 PROMPTHMR_VIEWS = ("smplx_cam", "smplx_world")
 """Keys of the poses in the camera and in the world."""
-
 TRAM_KEYS = {"pred_rotmat", "pred_trans", "frame"}
 """Keys by which a file of TRAM is recognised."""
-
 PHALP_FOCAL = RelativeFocalLength(ratio=5000.0 / 256.0)
 """PHALP's focal length: 5,000 px on a square of 256 px."""
-
 ROMP_PERSPECTIVE_FOCAL = RelativeFocalLength(ratio=443.4 / 512.0)
 """The camera of ROMP's and BEV's perspective fit: 60 degrees over the padded square."""
-
 ROMP_WEAK_PERSPECTIVE_FOCAL = RelativeFocalLength(ratio=1.0)
 """The camera in which z = 2 / s puts a point where weak perspective with the scale s does."""
 

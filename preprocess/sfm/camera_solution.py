@@ -157,33 +157,24 @@ class CameraSolution:
 
 MIN_REGISTERED_FRACTION = 0.9
 """Fraction of the key frames that must have a camera."""
-
 MAX_REPROJECTION_PX = 0.6
 """Largest median reprojection error, pixels."""
-
 MAX_TURNING_ERROR = 0.0015
 """Largest mean reprojection error of a camera that only turns: a hand turns it, and takes it along
 by centimetres; a fraction of the longer side."""
-
 MIN_TURN_DEG = 5.0
 """Smallest turn that tells a focal length."""
-
 MIN_OBSERVATION_RATIO = 0.4
 """Fewest observations of a camera, as a fraction of the median camera's: with fewer it may rest on
 a few wrong matches."""
-
 FOCAL_RANGE = (0.5, 2.0)
 """Plausible focal lengths, as fractions of the image's longer side."""
-
 MIN_TRIANGULATION_ANGLE_DEG = 1.0
 """Smallest angle between the views of the median point; below it depth is a guess."""
-
 MIN_SPARSE_POINTS = 60
 """Fewest points of a model."""
-
 JUMP_SIGMAS = 6.0
 """Deviation of a rotation from its neighbors' mean that counts as a jump; standard deviations."""
-
 JUMP_DEG = 1.0
 """Deviation of a rotation from its neighbors' mean that counts as a jump; degrees."""
 

@@ -49,16 +49,12 @@ from preprocess.sfm.turning_camera import solve_turning_camera
 
 MIN_PARALLAX_FRACTION = 0.02
 """Fraction of matched image pairs that must show parallax, not one plane or a mere rotation."""
-
 MAX_TRACKED_POINT_ERROR_PX = 3.0
 """Largest distance of tracked points from their projection by a key frame's own camera, pixels."""
-
 MIN_TRACKED_KEYFRAMES = 0.5
 """Fraction of the key frames that points must be tracked into."""
-
 MIN_SOLVED_FRAMES = 0.5
 """Fraction of the frames that must have a camera in the end."""
-
 MAX_IGNORED_DISTORTION_PX = 0.3
 """Distortion of the corners below which a lens counts as free of distortion, pixels."""
 

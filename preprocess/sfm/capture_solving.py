@@ -21,7 +21,6 @@ from preprocess.sfm.metric_world import MetricPlacement, place_in_metric_world, 
 
 BODY_MARGIN = 0.06
 """Margin for clothes and hair around the posed body; a fraction of its height in the image."""
-
 MASK_THRESHOLD = 0.2
 """Opacity from which a pixel of a mask counts as the person."""
 

@@ -28,23 +28,17 @@ from preprocess.sfm.camera_solution import SparseModel
 
 MAX_KEYFRAMES = 60
 """Most key frames of a video."""
-
 MIN_TARGET_KEYFRAMES = 24
 """Number of key frames that is chosen from a short video, if it has that many frames."""
-
 MIN_KEYFRAME_SPACING = 4
 """Frames per key frame beyond that number: the frames between are placed as well as key frames, in
 a tenth of the time."""
-
 MIN_KEYFRAMES = 8
 """Fewest key frames that can be solved."""
-
 FEATURE_IMAGE_PX = 960
 """Longer side of the images that features are detected in, pixels."""
-
 PERSON_MARGIN = 0.015
 """Width of the ignored border around the person; a fraction of the image's width."""
-
 PersonMaskFn = Callable[[Frame, tuple[int, int]], Bool[np.ndarray, "height width"] | None]
 """Pixels of the person in a frame, in an image of a given size; None if unknown."""
 
@@ -137,19 +131,14 @@ def write_keyframes(keys: Iterator[SfmKeyframe], images: Path, masks: Path) -> l
 
 MAX_EXHAUSTIVE_IMAGES = 40
 """Largest number of key frames of which every pair is matched, which closes loops."""
-
 MAX_INITIAL_PAIRS = 50
 """Most pairs that it tries to start with; without parallax it would try for minutes."""
-
 MIN_MATCHES = 15
 """Fewest matches of an image pair that is used."""
-
 STATED_FOCAL_TOLERANCE = 0.02
 """Relative difference to the solved focal length within which the stated one is used."""
-
 IMAGES_PER_THREAD = 4
 """Images per thread between two reports of progress."""
-
 ProgressFn = Callable[[float], None]
 """Called now and then with how much of a stage is done, in [0, 1]."""
 

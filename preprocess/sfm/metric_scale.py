@@ -19,22 +19,16 @@ from preprocess.sfm.camera_solution import SparseModel
 
 MAX_TILT_DEG = 20.0
 """Largest angle between the floor's normal and the first guess of up, degrees."""
-
 PLANE_TOLERANCE = 0.01
 """Distance within which points belong to a plane; a fraction of their median camera distance."""
-
 MIN_POINTS = 40
 """Fewest points that a floor is fitted to."""
-
 MIN_INLIER_FRACTION = 0.05
 """Fraction of the points below the cameras that must lie on the floor."""
-
 MAX_FRACTION_BELOW = 0.05
 """Largest fraction of the points that may lie below the floor."""
-
 RANSAC_ITERATIONS = 2000
 """Number of planes through three points that are tried."""
-
 MIN_VIEWS = 3
 """Fewest cameras that must see a point."""
 
@@ -126,31 +120,22 @@ def _refine_plane(
 
 SIGMA_GROUND_M = 0.06
 """Standard deviation of a sole's height above the floor by a tracker's depth, metres."""
-
 SIGMA_PLACE_M = 0.20
 """Standard deviation of a person from its usual place, metres."""
-
 IRLS_ITERATIONS = 5
 """Rounds of reweighted least squares."""
-
 HUBER_THRESHOLD = 1.345
 """Residual beyond which a cue counts less; standard deviations (95 % efficiency)."""
-
 MAX_CUE_DIFFERENCE = 0.10
 """Relative difference of both cues beyond which the person walks and only the ground counts."""
-
 MAX_GROUND_SPREAD = 0.25
 """Largest relative spread of the frames' own scales by ground contact (robust deviation)."""
-
 MAX_WANDER_M = 0.35
 """Largest r.m.s. distance of the person from its place, if that is the only cue; metres."""
-
 MIN_FRAMES = 5
 """Fewest frames with a pose and a camera."""
-
 SOLE_THICKNESS_M = 0.01
 """Usual height of a body's bare sole above the floor, from barefoot to a shoe of 3 cm; metres."""
-
 MIN_CAMERA_PATH_M = 0.3
 """Shortest path of the camera for which the second cue counts, metres."""
 

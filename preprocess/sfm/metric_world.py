@@ -172,10 +172,7 @@ def _person_in_cameras(
 
 
 def _estimate_up(
-    solved: CameraSolution,
-    motion: Motion,
-    frames: Int[np.ndarray, "poses"],
-    usable: np.ndarray,
+    solved: CameraSolution, motion: Motion, frames: Int[np.ndarray, "poses"], usable: np.ndarray
 ) -> Float[np.ndarray, "3"]:
     """Up as the person stands, unless the cameras are held quite otherwise."""
     assert solved.model is not None

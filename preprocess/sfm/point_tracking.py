@@ -23,16 +23,12 @@ from preprocess.sfm.colmap_mapping import SfmKeyframe, to_grayscale
 
 WINDOW = (17, 17)
 """Size of the patch around a point, pixels."""
-
 LEVELS = 4
 """Levels of the pyramid without a guess."""
-
 LEVELS_WITH_GUESS = 3
 """Levels of the pyramid with a guess of where a point is."""
-
 MAX_ROUND_TRIP_PX = 0.7
 """Largest distance of a point that was tracked there and back, pixels; beyond it is lost."""
-
 GrayImage = UInt8[np.ndarray, "height width"]
 
 
@@ -86,16 +82,12 @@ def _optical_flow(
 
 MAX_CORNERS = 400
 """Most points of the background that are tracked."""
-
 MIN_TRACKED_FRACTION = 0.3
 """Fraction of the points that must be tracked for a static camera."""
-
 MAX_STATIC_MOTION = 0.005
 """Largest shift of a static background; a fraction of the image's longer side (5 px of 960)."""
-
 MIN_TRACKED_POINTS = 12
 """Fewest points that must be tracked for a static camera."""
-
 COMPARED_KEYFRAMES = 12
 """Number of key frames that are compared with the first."""
 
@@ -127,16 +119,12 @@ def measure_background_motion(keys: list[SfmKeyframe]) -> float:
 
 MIN_PNP_POINTS = 20
 """Fewest tracked points that a camera is placed by."""
-
 MAX_PNP_POINTS = 600
 """Most points that are tracked from a key frame."""
-
 INLIER_PX = 2.0
 """Largest reprojection error of an inlier, pixels."""
-
 MIN_INLIER_FRACTION = 0.5
 """Fraction of the tracked points that must be inliers."""
-
 RESECTION_ITERATIONS = 10
 """Rounds of reweighted least squares for the turn of a camera; far points weigh less."""
 

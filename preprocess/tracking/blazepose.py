@@ -293,10 +293,7 @@ class BlazePoseTracker:
             self._looks.learn(colors_of(rgb, found.keypoints))
 
     def _is_same(
-        self,
-        rgb: UInt8[np.ndarray, "height width 3"],
-        person: PersonSquare,
-        other: PersonSquare,
+        self, rgb: UInt8[np.ndarray, "height width 3"], person: PersonSquare, other: PersonSquare
     ) -> bool:
         """Check whether a detection near the person is the person; remember another one's looks.
 

@@ -230,9 +230,7 @@ def grade_tracking(
 
 
 def _reasons_by_frame(
-    keypoints: KeypointTrack,
-    frame_times_s: Mapping[int, float],
-    iou_of_frame: Mapping[int, float],
+    keypoints: KeypointTrack, frame_times_s: Mapping[int, float], iou_of_frame: Mapping[int, float]
 ) -> dict[int, list[str]]:
     """Reasons why frames are doubtful, by their numbers."""
     reasons: dict[int, list[str]] = {}

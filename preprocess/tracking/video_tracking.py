@@ -56,7 +56,6 @@ class TrackingProblem(Enum):
 NOT_FOUND, ANOTHER_NEAR = "person not found", "another person near"
 DISAGREEING = "body and mask that disagree"
 """Reasons for which tracked frames are not learnt from."""
-
 PROBLEM_BITS = {problem: 1 << place for place, problem in enumerate(TrackingProblem)}
 """The bit of each problem in the numbers that files hold."""
 
@@ -135,10 +134,7 @@ class MaskRefinement(Protocol):
     """Makes the mask of a frame from a network's coarse one, frame by frame, in order."""
 
     def __call__(
-        self,
-        rgb: UInt8[np.ndarray, "height width 3"],
-        mask: CroppedMask,
-        size_px: tuple[int, int],
+        self, rgb: UInt8[np.ndarray, "height width 3"], mask: CroppedMask, size_px: tuple[int, int]
     ) -> Float32[np.ndarray, "rows columns"]:
         """Estimate how far each pixel is person, in [0, 1], at a size."""
         ...
