@@ -20,6 +20,8 @@ from avatar.config import TrainConfig
 from avatar.kernels import numba_priors, operations
 from avatar.kernels.operands import FEATURES_PER_LEVEL, HIDDEN_WIDTH, HashLevels, NetworkLayers
 
+RawPoints = Float32[Tensor, "points 4"]
+"""Log density and color of points, before their activations."""
 INITIAL_LOG_DENSITY = 0.0
 """Raw density of an untrained field: 1 per metre, a fog thin enough to be cleared quickly."""
 POINTS_PER_CHUNK = 1 << 13
@@ -31,7 +33,7 @@ class Activations(NamedTuple):
 
     points: Float32[Tensor, "points 3"]
     features: Float32[Tensor, "points width"]
-    raw: Float32[Tensor, "points 4"]
+    raw: RawPoints
 
 
 @final
@@ -130,7 +132,7 @@ class RadianceField:
         return grad_features
 
     @torch.no_grad()
-    def raw_outputs_at(self, points: Float32[Tensor, "points 3"]) -> Float32[Tensor, "points 4"]:
+    def raw_outputs_at(self, points: Float32[Tensor, "points 3"]) -> RawPoints:
         """Raw outputs at any number of canonical points, in chunks."""
         chunks = [self.forward(chunk).raw for chunk in points.split(POINTS_PER_CHUNK)]
         return torch.cat(chunks) if chunks else points.new_empty(0, 4)
@@ -153,33 +155,25 @@ VISIBLE_LOG_DENSITY = 2.0
 
 
 def _gradient(
-    add: Callable[..., None],
-    raw: Float32[Tensor, "points 4"],
-    *arguments: Float32[np.ndarray, "..."] | float,
-) -> Float32[Tensor, "points 4"]:
+    add: Callable[..., None], raw: RawPoints, *arguments: Float32[np.ndarray, "..."] | float
+) -> RawPoints:
     """What a kernel of `numba_priors` adds to zeros."""
     grad = torch.zeros_like(raw)
     add(raw.numpy(), *(np.float32(argument) for argument in arguments), grad.numpy())
     return grad
 
 
-def empty_space_gradient(
-    raw: Float32[Tensor, "points 4"], weight: float
-) -> Float32[Tensor, "points 4"]:
+def empty_space_gradient(raw: RawPoints, weight: float) -> RawPoints:
     """Gradient of the mean α in space that should be empty (the paper's §3.4)."""
     return _gradient(numba_priors.empty_space, raw, weight)
 
 
-def interior_gradient(
-    raw: Float32[Tensor, "points 4"], weight: float
-) -> Float32[Tensor, "points 4"]:
+def interior_gradient(raw: RawPoints, weight: float) -> RawPoints:
     """Gradient of the mean -log α in the interior; cross-entropy acts at zero opacity as well."""
     return _gradient(numba_priors.interior, raw, weight, MIN_OPACITY)
 
 
-def log_density_l1_gradient(
-    raw: Float32[Tensor, "points 4"], weight: float
-) -> Float32[Tensor, "points 4"]:
+def log_density_l1_gradient(raw: RawPoints, weight: float) -> RawPoints:
     """Gradient of the mean log density where it is above 0.
 
     Density that a ray needs withstands the small gradient; under Adam, density that no ray needs
@@ -215,9 +209,7 @@ def _sample_pairs(
     return pairs
 
 
-def density_tv_gradient(
-    raw: Float32[Tensor, "points 4"], weight: float
-) -> Float32[Tensor, "points 4"]:
+def density_tv_gradient(raw: RawPoints, weight: float) -> RawPoints:
     """Gradient of the mean |α - α'| over pairs of points.
 
     The total variation of a solid is its surface area (Rudin, Osher and Fatemi 1992); of all
@@ -228,9 +220,7 @@ def density_tv_gradient(
     return _gradient(numba_priors.density_tv, raw, weight)
 
 
-def double_well_gradient(
-    raw: Float32[Tensor, "points 4"], weight: float
-) -> Float32[Tensor, "points 4"]:
+def double_well_gradient(raw: RawPoints, weight: float) -> RawPoints:
     """Gradient of the mean α (1 - α), which vanishes where space is opaque or empty.
 
     Together with the total variation it minimises fog and surface area, as between two phases of a
@@ -240,11 +230,8 @@ def double_well_gradient(
 
 
 def density_slope_gradient(
-    raw: Float32[Tensor, "points 4"],
-    points: Float32[Tensor, "points 3"],
-    max_slope_per_m: float,
-    weight: float,
-) -> Float32[Tensor, "points 4"]:
+    raw: RawPoints, points: Float32[Tensor, "points 3"], max_slope_per_m: float, weight: float
+) -> RawPoints:
     """Gradient of the mean of max(0, |s - s'| - k · |x - x'|), and of density in excess.
 
     A few images in slightly wrong poses are explained as well by a razor-sharp surface that is
@@ -259,16 +246,12 @@ def density_slope_gradient(
     )  # fmt: skip
 
 
-def color_tv_gradient(
-    raw: Float32[Tensor, "points 4"], weight: float
-) -> Float32[Tensor, "points 4"]:
+def color_tv_gradient(raw: RawPoints, weight: float) -> RawPoints:
     """Gradient of the mean |c - c'| of visible pairs, as in `density_tv_gradient`."""
     return _gradient(numba_priors.color_tv, raw, VISIBLE_LOG_DENSITY, weight)
 
 
-def source_gradient(
-    raw: Float32[Tensor, "points 4"], weights: Float32[Tensor, "pairs"], weight: float
-) -> Float32[Tensor, "points 4"]:
+def source_gradient(raw: RawPoints, weights: Float32[Tensor, "pairs"], weight: float) -> RawPoints:
     """Gradient of the cross-entropy of points to their sources, in opacity and in color.
 
     Cross-entropy acts where a point is empty and its source is not, too. The sources stand still.

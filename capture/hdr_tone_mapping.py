@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 
+from capture.source import RgbImage
+
 PQ = 16
 """Transfer characteristics of SMPTE ST 2084 (code of ITU-T H.273)."""
 HLG = 18
@@ -28,9 +30,7 @@ LUT_SIZE = 4096
 """Entries of the table from code values to linear light (12 bits)."""
 
 
-def tone_map_hdr(
-    rgb: UInt16[np.ndarray, "height width 3"], curve: int
-) -> UInt8[np.ndarray, "height width 3"]:
+def tone_map_hdr(rgb: UInt16[np.ndarray, "height width 3"], curve: int) -> RgbImage:
     """8-bit sRGB of a 16-bit image in BT.2020 with an HDR curve.
 
     Light is linearised, white scaled to `WHITE_NITS` and colors converted to BT.709; above the knee

@@ -12,7 +12,7 @@ from jaxtyping import UInt8
 from PIL import Image, ImageOps
 
 from capture.input_error import InputError
-from capture.source import ASSUMED_FPS, Frame, FrameSelection, FrameSource
+from capture.source import ASSUMED_FPS, Frame, FrameSelection, FrameSource, RgbImage
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"})
 """File endings of images that are read."""
@@ -49,9 +49,7 @@ def refuse_pipe(path: Path) -> None:
         )
 
 
-def read_image(
-    path: Path,
-) -> tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"] | None]:
+def read_image(path: Path) -> tuple[RgbImage, UInt8[np.ndarray, "height width"] | None]:
     """One image as RGB, upright by its EXIF tag, and its alpha channel if it has one.
 
     An InputError if it cannot be decoded, or is not complete.

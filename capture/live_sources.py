@@ -21,7 +21,7 @@ from jaxtyping import UInt8
 from capture.image_folder import any_has_cutout_alpha, list_images, read_image
 from capture.inbox import Inbox
 from capture.input_error import InputError
-from capture.source import ASSUMED_FPS, Frame, FrameSelection, FrameSource, PacingClock
+from capture.source import ASSUMED_FPS, Frame, FrameSelection, FrameSource, PacingClock, RgbImage
 
 CAMERA_PREFIX = "camera:"
 """Start of an argument that names a camera instead of a file."""
@@ -134,7 +134,7 @@ class CameraDevice(FrameSource):
                 "learnt until then is kept."
             )
 
-    def _frame(self, index: int, due_s: float, bgr: UInt8[np.ndarray, "height width 3"]) -> Frame:
+    def _frame(self, index: int, due_s: float, bgr: RgbImage) -> Frame:
         rgb = cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
         return Frame(index=index, time_s=due_s - self._first_at, rgb=rgb, due_s=due_s)
 
@@ -247,7 +247,7 @@ class WatchedImageFolder(FrameSource):
         """End the watch, also in the middle of a wait."""
         self._pace.stop()
 
-    def _first(self) -> UInt8[np.ndarray, "height width 3"]:
+    def _first(self) -> RgbImage:
         """The first image that can be read."""
         deadline = self._pace.now() + self._idle_s
         while True:
@@ -285,9 +285,7 @@ class WatchedImageFolder(FrameSource):
 
     def _complete(
         self, path: Path
-    ) -> (
-        tuple[UInt8[np.ndarray, "height width 3"], UInt8[np.ndarray, "height width"] | None] | None
-    ):
+    ) -> tuple[RgbImage, UInt8[np.ndarray, "height width"] | None] | None:
         """An image once it is whole, and its alpha channel; None if it never is."""
         state, since = None, self._pace.now()
         while not self._pace.stopped:

@@ -8,10 +8,14 @@ from pathlib import Path
 from typing import final
 
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float32, UInt8
 
 from capture.input_error import InputError
 
+RgbImage = UInt8[np.ndarray, "height width 3"]
+"""Colors of an image, from 0 to 255."""
+AlphaMask = Float32[np.ndarray, "height width"]
+"""Opacity of the person at each pixel, in [0, 1]."""
 ASSUMED_FPS = 30.0
 """Frames or poses per second where no file says: folders of images, poses without times."""
 MAX_WARNINGS = 100
@@ -33,7 +37,7 @@ class Frame:
 
     index: int
     time_s: float
-    rgb: UInt8[np.ndarray, "height width 3"]
+    rgb: RgbImage
     flags: frozenset[str] = frozenset()
     alpha: UInt8[np.ndarray, "height width"] | None = None
     due_s: float | None = None

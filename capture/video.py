@@ -7,12 +7,11 @@ from typing import Any, NamedTuple
 import av
 import numpy as np
 from av.error import FFmpegError
-from jaxtyping import UInt8
 
 from capture.hdr_tone_mapping import HDR_TRANSFERS, tone_map_hdr
 from capture.image_folder import refuse_pipe
 from capture.input_error import InputError, quote_command
-from capture.source import Frame, FrameSelection, FrameSource
+from capture.source import Frame, FrameSelection, FrameSource, RgbImage
 
 VIDEO_SUFFIXES = frozenset(
     {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".ts", ".wmv"}
@@ -37,7 +36,7 @@ class DecodedFrame(NamedTuple):
     time_s: float
     after_gap: bool
 
-    def rgb(self, longer_px: int | None = None) -> UInt8[np.ndarray, "height width 3"] | None:
+    def rgb(self, longer_px: int | None = None) -> RgbImage | None:
         """Convert to upright 8-bit RGB, reduced to a longer side first; None if that fails."""
         curve, longer = int(self.frame.color_trc), max(self.frame.width, self.frame.height)
         scale = 1.0 if longer_px is None else min(1.0, longer_px / longer)

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
 
 from capture.atomic_files import OutputFileList, atomic_file
 from capture.camera import same_aspect_ratio
 from capture.input_error import InputError
+from capture.source import AlphaMask, RgbImage
 from instant_avatar.capture_validation import CaptureValidation
 from preprocess.alignment.capture_geometry import FULL_WINDOW, CaptureGeometry
 from preprocess.alignment.keypoint_objective import TrackedImage
@@ -24,8 +24,6 @@ KEYPOINT_COLOR, PAPER_COLOR, INK_COLOR = (0, 220, 220), (245, 245, 245), (40, 40
 """RGB colors of the sheet."""
 LABEL_PX = 26
 """Height of a row's label."""
-Rgb = UInt8[np.ndarray, "height width 3"]
-AlphaMask = Float32[np.ndarray, "height width"]
 
 
 def write_contact_sheet(
@@ -57,7 +55,9 @@ def write_contact_sheet(
     return True
 
 
-def _draw_row(check: CaptureValidation, geometry: CaptureGeometry, title: str, iou: float) -> Rgb:
+def _draw_row(
+    check: CaptureValidation, geometry: CaptureGeometry, title: str, iou: float
+) -> RgbImage:
     body = MeshSilhouette(check.capture.shaped)
     masks = check.capture.masks
     mask_of = masks.in_order_at_worst().read if isinstance(masks, StoredMasks) else None
@@ -76,7 +76,7 @@ def _draw_cell(
     seen: CaptureGeometry,
     body: MeshSilhouette,
     mask_of: Callable[[int, tuple[int, int]], AlphaMask] | None,
-) -> Rgb:
+) -> RgbImage:
     """Draw one frame with both outlines.
 
     `seen` is `geometry` in the video's own frame numbers (`CaptureGeometry.in_video_frames`).
@@ -109,13 +109,13 @@ def _draw_cell(
     return picture
 
 
-def _draw_outline(picture: Rgb, alpha: AlphaMask, color: tuple[int, int, int]) -> None:
+def _draw_outline(picture: RgbImage, alpha: AlphaMask, color: tuple[int, int, int]) -> None:
     shape = (alpha > 0.5).astype(np.uint8)
     outlines, _ = cv2.findContours(shape, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(picture, outlines, -1, color, 2, cv2.LINE_AA)
 
 
-def _draw_text(picture: Rgb, text: str, x: int) -> None:
+def _draw_text(picture: RgbImage, text: str, x: int) -> None:
     y = LABEL_PX - 8
     for color, thick in ((PAPER_COLOR, 3), (INK_COLOR, 1)):
         cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.5, color, thick, cv2.LINE_AA)

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
 
 from capture.atomic_files import atomic_file
+from capture.source import RgbImage
 from capture.video_writer import H264, write_video
 from instant_avatar.contact_sheet import BODY_COLOR, MASK_COLOR
 from preprocess.body.body_surface import SkinPoints, splat_silhouette
@@ -29,7 +29,6 @@ DOUBT_COLOR = (255, 60, 60)
 """RGB color of doubts."""
 LEFT_JOINTS = frozenset({1, 4, 7, 10, 13, 16, 18, 20, 22})
 """Joints of SMPL's tree on the person's left; the next one is that on the right."""
-Rgb = UInt8[np.ndarray, "height width 3"]
 
 
 def write_tracked_video(path: Path, capture: Capture, doubts: Mapping[int, str]) -> int:
@@ -44,7 +43,7 @@ def write_tracked_video(path: Path, capture: Capture, doubts: Mapping[int, str])
         return write_video(part, _draw_frames(capture, doubts), fps, H264)
 
 
-def _draw_frames(capture: Capture, doubts: Mapping[int, str]) -> Iterator[Rgb]:
+def _draw_frames(capture: Capture, doubts: Mapping[int, str]) -> Iterator[RgbImage]:
     skin = SkinPoints.of(capture.shaped)
     for item in capture.observations():
         if not isinstance(item, Observation):
@@ -79,18 +78,20 @@ def _joint_color(joint: int) -> tuple[int, int, int]:
     return RIGHT_COLOR if joint - 1 in LEFT_JOINTS else MIDDLE_COLOR
 
 
-def _draw_bone(image: Rgb, one: np.ndarray, other: np.ndarray, color: tuple[int, int, int]) -> None:
+def _draw_bone(
+    image: RgbImage, one: np.ndarray, other: np.ndarray, color: tuple[int, int, int]
+) -> None:
     ends = [tuple(int(v) for v in np.clip(16.0 * end, -1e6, 1e6)) for end in (one, other)]
     cv2.line(image, ends[0], ends[1], (20, 20, 20), 5, cv2.LINE_AA, shift=4)
     cv2.line(image, ends[0], ends[1], color, 3, cv2.LINE_AA, shift=4)
 
 
-def _draw_outline(image: Rgb, inside: np.ndarray, color: tuple[int, int, int]) -> None:
+def _draw_outline(image: RgbImage, inside: np.ndarray, color: tuple[int, int, int]) -> None:
     found, _ = cv2.findContours(inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(image, found, -1, color, 1, cv2.LINE_AA)
 
 
-def _draw_text(image: Rgb, text: str, doubtful: bool) -> None:
+def _draw_text(image: RgbImage, text: str, doubtful: bool) -> None:
     """Write lines at the top, on a dark ground, as many as the width asks for."""
     letters = max(12, (image.shape[1] - 12) // LETTER_PX)
     lines = textwrap.wrap(text, letters)

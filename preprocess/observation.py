@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import UInt8
 
 from capture.camera import Camera
 from capture.input_error import InputError
-from capture.source import Frame, FrameSource
+from capture.source import AlphaMask, Frame, FrameSource
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.frame_association import associate_by_order, associate_by_time
@@ -29,7 +29,7 @@ class Observation:
     """
 
     frame: Frame
-    alpha: Float32[np.ndarray, "height width"]
+    alpha: AlphaMask
     pose: BodyPose
     camera: Camera
     filmed_rgb: UInt8[np.ndarray, "rows columns 3"] | None = None

@@ -8,12 +8,9 @@ register one as an entry point.
 from importlib.metadata import entry_points
 from typing import Any, Protocol, runtime_checkable
 
-import numpy as np
-from jaxtyping import Float32, UInt8
-
 from capture.camera import Camera
 from capture.input_error import InputError
-from capture.source import Frame
+from capture.source import AlphaMask, Frame, RgbImage
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.tracking.keypoints import PersonKeypoints
@@ -30,7 +27,7 @@ DEFAULT_SEGMENTER = "blazepose"
 class PersonTracker(Protocol):
     """Follows one person, frame by frame, in the order of the frames."""
 
-    def __call__(self, rgb: UInt8[np.ndarray, "height width 3"]) -> PersonKeypoints | None:
+    def __call__(self, rgb: RgbImage) -> PersonKeypoints | None:
         """Find the person in the next frame; None where there is none."""
         ...
 
@@ -39,9 +36,7 @@ class PersonTracker(Protocol):
 class Segmenter(Protocol):
     """Segments the person, frame by frame, in the order of the frames."""
 
-    def __call__(
-        self, frame: Frame, pose: BodyPose, camera: Camera
-    ) -> Float32[np.ndarray, "height width"]:
+    def __call__(self, frame: Frame, pose: BodyPose, camera: Camera) -> AlphaMask:
         """Estimate how far each pixel is person, in [0, 1].
 
         Args:

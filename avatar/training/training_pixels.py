@@ -4,9 +4,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Int, Int32, UInt8
+from jaxtyping import Bool, Int, Int32, UInt8
 
 from capture.camera import Camera
+from capture.source import AlphaMask, RgbImage
 
 NEAR_MASK_SHARE = 0.035
 """Distance from the mask within which pixels are near the person, in image heights."""
@@ -78,9 +79,7 @@ class TrainingPixels(NamedTuple):
 
 
 def premultiplied_rgba(
-    rgb: UInt8[np.ndarray, "height width 3"],
-    alpha: Float32[np.ndarray, "height width"],
-    near: Bool[np.ndarray, "height width"],
+    rgb: RgbImage, alpha: AlphaMask, near: Bool[np.ndarray, "height width"]
 ) -> UInt8[np.ndarray, "near 4"]:
     """Color times alpha, and alpha, of the pixels near the person, in 8 bits."""
     places = np.flatnonzero(near)
@@ -94,9 +93,7 @@ def premultiplied_rgba(
     return np.ascontiguousarray(rounded.T)
 
 
-def near_person_mask(
-    alpha: Float32[np.ndarray, "height width"],
-) -> Bool[np.ndarray, "height width"]:
+def near_person_mask(alpha: AlphaMask) -> Bool[np.ndarray, "height width"]:
     """The pixels near the person."""
     kernel = np.ones((max(5, int(NEAR_MASK_SHARE * len(alpha)) | 1),) * 2, dtype=np.uint8)
     return cv2.dilate((alpha > 0).astype(np.uint8), kernel) > 0

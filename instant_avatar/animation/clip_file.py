@@ -14,6 +14,7 @@ from PIL import Image, ImageColor
 from capture.atomic_files import atomic_file, atomic_folder
 from capture.image_folder import read_image, write_png
 from capture.input_error import InputError
+from capture.source import RgbImage
 from capture.video_writer import H264, VP9, VP9_ALPHA, write_video
 from instant_avatar.cli.shared_options import check_output_file, check_output_folder
 
@@ -24,8 +25,7 @@ CLIP_SUFFIXES = (".webm", ".mp4", ".gif", ".webp", ".png")
 MAX_GIF_FPS = 50.0
 """Frame rate above which browsers slow a GIF down."""
 Rgba = UInt8[np.ndarray, "height width 4"]
-Rgb = UInt8[np.ndarray, "height width 3"]
-BackgroundBlend = Callable[[Rgba], Rgb]
+BackgroundBlend = Callable[[Rgba], RgbImage]
 """Composites an image with straight alpha over a background."""
 
 
@@ -51,15 +51,13 @@ def background_compositor(color_or_path: str) -> BackgroundBlend:
     return lambda rgba: _composite_over(rgba, cropped(rgba.shape[1], rgba.shape[0]))
 
 
-def _composite_over(rgba: Rgba, behind: Rgb) -> Rgb:
+def _composite_over(rgba: Rgba, behind: RgbImage) -> RgbImage:
     alpha = rgba[..., 3:].astype(np.uint16)
     mixed = rgba[..., :3] * alpha + behind * (255 - alpha) + 127
     return (mixed // 255).astype(np.uint8)
 
 
-def _crop_to_cover(
-    image: UInt8[np.ndarray, "_ _ 3"], width: int, height: int
-) -> UInt8[np.ndarray, "height width 3"]:
+def _crop_to_cover(image: UInt8[np.ndarray, "_ _ 3"], width: int, height: int) -> RgbImage:
     rows, columns = image.shape[:2]
     scale = max(width / columns, height / rows)
     wide, high = max(width, round(columns * scale)), max(height, round(rows * scale))
@@ -91,7 +89,7 @@ class ClipFormat:
     """
 
     description: str
-    write: Callable[[Path, Iterator[Rgb | Rgba], float], int]
+    write: Callable[[Path, Iterator[RgbImage | Rgba], float], int]
 
 
 def clip_format(path: Path, *, transparent: bool) -> ClipFormat:
@@ -136,12 +134,12 @@ def write_clip(
         return encoding.write(part, iter(shown), fps)
 
 
-def _write_image(path: Path, images: Iterator[Rgb | Rgba], fps: float) -> int:
+def _write_image(path: Path, images: Iterator[RgbImage | Rgba], fps: float) -> int:
     write_png(path, next(images))
     return 1
 
 
-def _write_frames(folder: Path, images: Iterator[Rgb | Rgba], fps: float) -> int:
+def _write_frames(folder: Path, images: Iterator[RgbImage | Rgba], fps: float) -> int:
     count = 0
     for image in images:
         write_png(folder / f"{count:04d}.png", image)
@@ -149,21 +147,21 @@ def _write_frames(folder: Path, images: Iterator[Rgb | Rgba], fps: float) -> int
     return count
 
 
-def _write_gif(path: Path, images: Iterator[Rgb | Rgba], fps: float) -> int:
+def _write_gif(path: Path, images: Iterator[RgbImage | Rgba], fps: float) -> int:
     """Write a palette per frame: 46 dB on white, against 38 dB with one palette for all."""
     frames = [Image.fromarray(_binarize_alpha(image)) for image in images]
     disposal = 2 if frames[0].mode == "RGBA" else 0
     return _save_animation(path, frames, min(fps, MAX_GIF_FPS), tick_ms=10, disposal=disposal)
 
 
-def _binarize_alpha(image: Rgb | Rgba) -> Rgb | Rgba:
+def _binarize_alpha(image: RgbImage | Rgba) -> RgbImage | Rgba:
     if image.shape[2] == 3:
         return image
     opaque = image[..., 3:] > 127
     return np.where(opaque, image | np.array([0, 0, 0, 255], np.uint8), np.uint8(0))
 
 
-def _write_webp(path: Path, images: Iterator[Rgb | Rgba], fps: float) -> int:
+def _write_webp(path: Path, images: Iterator[RgbImage | Rgba], fps: float) -> int:
     frames = [Image.fromarray(image) for image in images]
     return _save_animation(path, frames, fps, tick_ms=1, quality=90, method=3)
 

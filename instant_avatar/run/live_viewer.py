@@ -22,6 +22,7 @@ from avatar.events import Finished
 from avatar.render import render
 from avatar.rig import canonical_rotations
 from capture.camera import Camera
+from capture.source import RgbImage
 from export.bake.bake_tables import ExportRefused
 from instant_avatar.animation.driving_motion import demo_motion, pose_rate
 from instant_avatar.animation.web_server import HOST
@@ -189,7 +190,7 @@ class ViserPage:
             for number, camera in cameras.items()
         }
 
-    def show_render(self, browser: int, image: UInt8[np.ndarray, "height width 3"]) -> None:
+    def show_render(self, browser: int, image: RgbImage) -> None:
         """Show a rendering in one browser."""
         client = self._server.get_clients().get(browser)
         if client is not None:
@@ -199,7 +200,7 @@ class ViserPage:
         """Show the state of training, and what to film next."""
         self._status.content, self._advice.content = status, advice
 
-    def show_frame(self, image: UInt8[np.ndarray, "height width 3"]) -> None:
+    def show_frame(self, image: RgbImage) -> None:
         """Show the newest frame."""
         self._frame.image = image
 
@@ -374,7 +375,7 @@ def _quality_text(session: TrainingSession) -> str:
 
 def render_preview(
     avatar: Avatar, pose: BodyPose, camera: Camera, *, cells: CorrespondenceGrid
-) -> UInt8[np.ndarray, "height width 3"]:
+) -> RgbImage:
     """Render the avatar in its current state over the page's background.
 
     The camera also defines the image size; `cells` is the correspondence grid of the pose.
@@ -386,7 +387,7 @@ def render_preview(
     return np.clip(mixed + 0.5, 0.0, 255.0).astype(np.uint8)
 
 
-def _thumbnail(rgb: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "_ _ 3"]:
+def _thumbnail(rgb: RgbImage) -> UInt8[np.ndarray, "_ _ 3"]:
     """Return a frame as high as the panel shows it, in a strip as wide as the panel."""
     scale = FRAME_HEIGHT_PX / rgb.shape[0]
     how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_LINEAR

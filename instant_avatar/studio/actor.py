@@ -15,6 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, KDTree
 
 from capture.camera import Camera
+from capture.source import AlphaMask
 from instant_avatar.studio.lighting import (
     LAMP_STRENGTH,
     ClothingCut,
@@ -352,7 +353,7 @@ class Actor:
 
     def render_rgb_alpha(
         self, pose: BodyPose, camera: Camera, supersampling: int = 4
-    ) -> tuple[Float32[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]:
+    ) -> tuple[Float32[np.ndarray, "height width 3"], AlphaMask]:
         """Return the color of each pixel's covered part, and the covered fraction, in [0, 1]."""
         seen = rasterize(
             self.vertices(pose), self.faces, camera, supersampling=supersampling, cut=self.cut

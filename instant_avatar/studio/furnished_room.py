@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32, Int64, UInt8
 
 from capture.camera import Camera
+from capture.source import RgbImage
 from instant_avatar.studio.lighting import rasterize
 
 RoomStyle = Literal["room", "tiles"]
@@ -147,7 +148,7 @@ class FurnishedRoom:
 
     def render(
         self, camera: Camera, feet_world: Float[np.ndarray, "feet 3"], number: int
-    ) -> UInt8[np.ndarray, "height width 3"]:
+    ) -> RgbImage:
         """Render the room with soft shadows around the feet, and noise by the image's `number`."""
         seen = rasterize(self.points, self.triangles, camera, supersampling=SUPERSAMPLING)
         triangle, (b, c) = np.maximum(seen.face, 0), np.moveaxis(seen.barycentric, -1, 0)

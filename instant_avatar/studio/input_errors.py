@@ -11,10 +11,11 @@ from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
 from capture.camera import Camera
+from capture.source import AlphaMask
 from preprocess.body.body_pose import Motion
 from preprocess.body.body_surface import signed_distance_px
 from preprocess.body.kinematics import PARENTS, axis_angles_from_matrices, rotation_matrices
@@ -26,13 +27,13 @@ BORDER_NOISE_SCALE_PX = 6.0
 
 
 def add_mask_noise(
-    alpha: Float32[np.ndarray, "height width"],
+    alpha: AlphaMask,
     noise_px: float,
     generator: np.random.Generator,
     *,
     grown_px: float = 0.0,
     soft_px: float = 1.0,
-) -> Float32[np.ndarray, "height width"]:
+) -> AlphaMask:
     """Move the border of the exact mask in and out by smooth noise of this standard deviation.
 
     The whole border is moved outwards by `grown_px`; its ramp from 0 to 1 is `soft_px` wide.
@@ -120,12 +121,8 @@ class SegmenterErrors:
             self._lost[start : start + int(self._generator.integers(2, 8)), side] = True
 
     def apply(
-        self,
-        alpha: Float32[np.ndarray, "height width"],
-        row: int,
-        hands_px: Float[np.ndarray, "2 2"],
-        px_per_m: float,
-    ) -> Float32[np.ndarray, "height width"]:
+        self, alpha: AlphaMask, row: int, hands_px: Float[np.ndarray, "2 2"], px_per_m: float
+    ) -> AlphaMask:
         """Return a frame's mask with errors.
 
         `hands_px` are the left and the right hand; `px_per_m` is the scale at the actor.
@@ -150,9 +147,7 @@ class SegmenterErrors:
         return wrong.astype(np.float32)
 
 
-def _disc(
-    shape: tuple[int, int], middle_px: Float[np.ndarray, "2"], radius_px: float
-) -> Float32[np.ndarray, "height width"]:
+def _disc(shape: tuple[int, int], middle_px: Float[np.ndarray, "2"], radius_px: float) -> AlphaMask:
     """1 inside a circle, 0 outside, a pixel soft."""
     y, x = np.mgrid[0 : shape[0], 0 : shape[1]] + 0.5
     away = np.hypot(x - middle_px[0], y - middle_px[1])

@@ -13,14 +13,15 @@ from dataclasses import dataclass
 from typing import NamedTuple, final
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32, UInt8
+from jaxtyping import Float, Float32, Int32
 
 from avatar.kernels.kernel_compiler import compile_kernel
 from capture.camera import Camera
+from capture.source import AlphaMask, RgbImage
 from instant_avatar.studio.outfit import is_visible
 from instant_avatar.studio.procedural_albedo import albedo_at
 
-RenderedFrame = tuple[UInt8[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]
+RenderedFrame = tuple[RgbImage, AlphaMask]
 """A picture of the actor before a background, and the exact soft mask."""
 NO_FACE = -1
 
@@ -227,9 +228,7 @@ def _directional_camera(
 
 
 def _visibility(
-    points: Float[np.ndarray, "vertices 3"],
-    camera: Camera,
-    depth_seen: Float32[np.ndarray, "height width"],
+    points: Float[np.ndarray, "vertices 3"], camera: Camera, depth_seen: AlphaMask
 ) -> Float[np.ndarray, "vertices"]:
     """Return the light that reaches each point, in [0, 1], softened over 4 pixels."""
     forward, away = camera.camera_from_world[2, :3], camera.camera_from_world[2, 3]
@@ -251,7 +250,7 @@ def shade_pixels(
     light: Float32[np.ndarray, "vertices 3"],
     palette: Float32[np.ndarray, "colors 3"],
     checked: bool,
-) -> tuple[Float32[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]:
+) -> tuple[Float32[np.ndarray, "height width 3"], AlphaMask]:
     """Return the color of each pixel's covered part (sRGB in [0, 1]) and the covered fraction.
 
     `light` is a factor of color.
@@ -270,10 +269,8 @@ def shade_pixels(
 
 
 def composite_over(
-    rgb: Float32[np.ndarray, "height width 3"],
-    alpha: Float32[np.ndarray, "height width"],
-    background: UInt8[np.ndarray, "height width 3"] | None = None,
-) -> UInt8[np.ndarray, "height width 3"]:
+    rgb: Float32[np.ndarray, "height width 3"], alpha: AlphaMask, background: RgbImage | None = None
+) -> RgbImage:
     """The person in front of a background (white if None)."""
     behind = np.float32(1.0) if background is None else background.astype(np.float32) / 255.0
     mixed = alpha[..., None] * rgb + (1.0 - alpha[..., None]) * behind
@@ -293,7 +290,7 @@ def _shade(
     cut: Float32[np.ndarray, "cuts"],
     checked: bool,
     rgb: Float32[np.ndarray, "height width 3"],
-    alpha: Float32[np.ndarray, "height width"],
+    alpha: AlphaMask,
 ) -> None:
     for i in range(alpha.shape[0]):
         for j in range(alpha.shape[1]):

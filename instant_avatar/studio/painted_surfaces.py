@@ -4,18 +4,18 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32
 
 from capture.camera import Camera
+from capture.source import RgbImage
 
-Rgb = UInt8[np.ndarray, "height width 3"]
 Backdrop = Literal["plain", "clutter"]
 
 SUPERSAMPLING = 3
 """Factor by which the backdrop is painted larger before it is reduced."""
 
 
-def paint_backdrop(kind: Backdrop, camera: Camera, generator: np.random.Generator) -> Rgb:
+def paint_backdrop(kind: Backdrop, camera: Camera, generator: np.random.Generator) -> RgbImage:
     """The empty studio, as the camera sees it: wall and floor, cluttered or plain."""
     width, height = camera.size_px
     floor = _floor_row(camera)
@@ -33,8 +33,8 @@ def paint_backdrop(kind: Backdrop, camera: Camera, generator: np.random.Generato
 
 
 def add_foot_shadows(
-    background: Rgb, feet_world: Float[np.ndarray, "feet 3"], camera: Camera
-) -> Rgb:
+    background: RgbImage, feet_world: Float[np.ndarray, "feet 3"], camera: Camera
+) -> RgbImage:
     """The backdrop with soft shadows on the floor around points of the feet."""
     height, width = background.shape[:2]
     on_floor = feet_world * np.array([1.0, 0.0, 1.0])
@@ -54,7 +54,7 @@ def _floor_row(camera: Camera) -> float:
     return float(camera.project(np.array([0.0, 0.0, -1.5]))[1])
 
 
-def _furnish(large: Rgb, horizon: int, generator: np.random.Generator) -> None:
+def _furnish(large: RgbImage, horizon: int, generator: np.random.Generator) -> None:
     """Planks, a shelf of books, pictures, a window, a plant, a lamp."""
     width = large.shape[1]
     _planks(large, horizon, generator)
@@ -69,7 +69,7 @@ def _furnish(large: Rgb, horizon: int, generator: np.random.Generator) -> None:
     _plant(large, (int(86 * unit), horizon), unit, generator)
 
 
-def _planks(large: Rgb, horizon: int, generator: np.random.Generator) -> None:
+def _planks(large: RgbImage, horizon: int, generator: np.random.Generator) -> None:
     height, width = large.shape[:2]
     vanish = np.array([width * 0.5, horizon - height * 0.45])
     for k in range(-14, 14):
@@ -83,7 +83,7 @@ def _planks(large: Rgb, horizon: int, generator: np.random.Generator) -> None:
 
 
 def _shelf(
-    large: Rgb, corner: tuple[int, int], wide: int, floor: int, generator: np.random.Generator
+    large: RgbImage, corner: tuple[int, int], wide: int, floor: int, generator: np.random.Generator
 ) -> None:
     left, top = corner
     cv2.rectangle(large, (left, top), (left + wide, floor), (104, 74, 52), -1)
@@ -104,7 +104,7 @@ def _shelf(
         cv2.line(large, (left, y1), (left + wide, y1), (128, 94, 66), max(wide // 30, 1))
 
 
-def _window(large: Rgb, corner: tuple[int, int], size: tuple[int, int]) -> None:
+def _window(large: RgbImage, corner: tuple[int, int], size: tuple[int, int]) -> None:
     (x, y), (wide, tall) = corner, size
     cv2.rectangle(large, (x, y), (x + wide, y + tall), (240, 238, 230), -1)
     frame = max(wide // 14, 1)
@@ -122,7 +122,7 @@ def _window(large: Rgb, corner: tuple[int, int], size: tuple[int, int]) -> None:
 
 
 def _picture(
-    large: Rgb, corner: tuple[int, int], size: tuple[int, int], generator: np.random.Generator
+    large: RgbImage, corner: tuple[int, int], size: tuple[int, int], generator: np.random.Generator
 ) -> None:
     (x, y), (wide, tall) = corner, size
     cv2.rectangle(large, (x, y), (x + wide, y + tall), (52, 46, 44), -1)
@@ -139,7 +139,9 @@ def _picture(
         cv2.circle(large, middle, radius, tuple(int(c) for c in generator.integers(50, 235, 3)), -1)
 
 
-def _plant(large: Rgb, foot: tuple[int, int], unit: float, generator: np.random.Generator) -> None:
+def _plant(
+    large: RgbImage, foot: tuple[int, int], unit: float, generator: np.random.Generator
+) -> None:
     x, floor = foot
     for _ in range(46):
         angle = generator.uniform(-1.2, 1.2)

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import final
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, UInt8
 
 from capture.atomic_files import atomic_folder, check_replaceable_folder
 from capture.camera import Camera
 from capture.image_folder import write_png
 from capture.input_error import InputError
-from capture.source import FrameSelection
+from capture.source import AlphaMask, FrameSelection, RgbImage
 from capture.video import VideoFile
 from capture.video_writer import FFV1, H264, open_video_writer, write_video
 from instant_avatar.studio import painted_surfaces, staging
@@ -68,7 +68,7 @@ def draw_ahead(render: Callable[[int], RenderedFrame], count: int) -> Iterator[R
                 waiting.cancel()
 
 
-def _to_uint8(alpha: Float32[np.ndarray, "height width"]) -> UInt8[np.ndarray, "height width"]:
+def _to_uint8(alpha: AlphaMask) -> UInt8[np.ndarray, "height width"]:
     return (alpha * 255.0 + 0.5).astype(np.uint8)
 
 
@@ -238,7 +238,7 @@ class StudioScene:
 
     actor: Actor
     cameras: tuple[Camera, ...]
-    background: UInt8[np.ndarray, "height width 3"] | FurnishedRoom
+    background: RgbImage | FurnishedRoom
     first_frame_number: int = 0
 
     def render(self, pose: BodyPose, number: int) -> RenderedFrame:
@@ -254,7 +254,7 @@ class StudioScene:
 
     def _render_background(
         self, camera: Camera, feet: Float[np.ndarray, "feet 3"], number: int
-    ) -> UInt8[np.ndarray, "height width 3"]:
+    ) -> RgbImage:
         if isinstance(self.background, FurnishedRoom):
             return self.background.render(camera, feet, self.first_frame_number + number)
         return painted_surfaces.add_foot_shadows(self.background, feet, camera)

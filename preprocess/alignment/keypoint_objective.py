@@ -10,10 +10,10 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Bool, Float
 
 from capture.camera import Camera, same_aspect_ratio
-from capture.source import Frame, FrameSource
+from capture.source import AlphaMask, Frame, FrameSource, RgbImage
 from capture.source_opening import reopen
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.silhouette_objective import spaced_indices
@@ -49,8 +49,8 @@ class TrackedImage:
     """
 
     index: int
-    thumbnail: UInt8[np.ndarray, "height width 3"]
-    alpha: Float32[np.ndarray, "height width"] | None
+    thumbnail: RgbImage
+    alpha: AlphaMask | None
     size_px: tuple[int, int]
     image_px: Float[np.ndarray, "33 2"]
     confidence: Float[np.ndarray, "33"]

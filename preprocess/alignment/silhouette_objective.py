@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from capture.input_error import InputError
-from capture.source import Frame, FrameSource
+from capture.source import AlphaMask, Frame, FrameSource
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.body.body_pose import Motion
 from preprocess.body.body_surface import (
@@ -48,7 +48,7 @@ class MaskSample:
 
     index: int
     camera_row: int
-    alpha: Float32[np.ndarray, "height width"]
+    alpha: AlphaMask
     picture: Frame | None = None
 
 
@@ -99,9 +99,7 @@ class SilhouetteObjective:
             drawn, components_touching(alpha, drawn) if geometry.keeps_person_only else alpha
         )
 
-    def keep_person(
-        self, geometry: CaptureGeometry, frame: int, alpha: Float32[np.ndarray, "height width"]
-    ) -> Float32[np.ndarray, "height width"]:
+    def keep_person(self, geometry: CaptureGeometry, frame: int, alpha: AlphaMask) -> AlphaMask:
         """The components of a frame's mask, of any size, that the posed body touches.
 
         Unchanged where the geometry has no pose for the frame.
@@ -136,9 +134,7 @@ def mean_with_missing(scores: Float[np.ndarray, "samples"]) -> float:
     return float(np.nansum(scores)) / len(scores)
 
 
-def components_touching(
-    alpha: Float32[np.ndarray, "height width"], body: Bool[np.ndarray, "height width"]
-) -> Float32[np.ndarray, "height width"]:
+def components_touching(alpha: AlphaMask, body: Bool[np.ndarray, "height width"]) -> AlphaMask:
     """The connected components of a mask that a body covers in part; the others become 0.
 
     Unchanged where the body touches none.
@@ -233,14 +229,12 @@ def _scaled_size(size_px: tuple[int, int], longer: float) -> tuple[int, int]:
     return max(8, round(size_px[0] * scale)), max(8, round(size_px[1] * scale))
 
 
-def _mask_height(alpha: Float32[np.ndarray, "height width"]) -> int:
+def _mask_height(alpha: AlphaMask) -> int:
     rows = np.flatnonzero((alpha > 0.5).any(axis=1))
     return int(rows[-1] - rows[0] + 1)
 
 
-def _resize_alpha(
-    alpha: Float32[np.ndarray, "_ _"], size_px: tuple[int, int]
-) -> Float32[np.ndarray, "height width"]:
+def _resize_alpha(alpha: Float32[np.ndarray, "_ _"], size_px: tuple[int, int]) -> AlphaMask:
     shrinks = alpha.shape[1] >= size_px[0]
     return np.asarray(
         cv2.resize(alpha, size_px, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR),

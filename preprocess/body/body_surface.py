@@ -14,6 +14,7 @@ from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import splu
 
 from capture.camera import Camera
+from capture.source import AlphaMask
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.parametric_body import ShapedBody
 
@@ -227,9 +228,7 @@ def _project(
     return projected
 
 
-def soft_iou(
-    body: Bool[np.ndarray, "height width"], alpha: Float32[np.ndarray, "height width"]
-) -> float:
+def soft_iou(body: Bool[np.ndarray, "height width"], alpha: AlphaMask) -> float:
     """Soft intersection over union of a silhouette and a mask, in [0, 1].
 
     The sum over the pixels of the smaller value over the sum of the larger.
@@ -296,9 +295,7 @@ class MeshSilhouette:
         return np.asarray(closed, dtype=np.uint8)
 
 
-def signed_distance_px(
-    mask: Bool[np.ndarray, "height width"],
-) -> Float32[np.ndarray, "height width"]:
+def signed_distance_px(mask: Bool[np.ndarray, "height width"]) -> AlphaMask:
     """Distance of each pixel's center from a shape's border, px; negative inside."""
     hard = mask.astype(np.uint8)
     outside = cv2.distanceTransform(1 - hard, cv2.DIST_L2, 5)

@@ -9,9 +9,10 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 
 from capture.camera import Camera
+from capture.source import AlphaMask
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.silhouette_objective import MaskSample, SilhouetteObjective, mean_score
 from preprocess.body.body_surface import NEAR_PLANE_M, SkinPoints
@@ -196,9 +197,7 @@ def _compare_boxes(
     return max(1.0 + float(found[0]), 0.2), shift_m + found[1:]
 
 
-def _sides_of_mask(
-    alpha: Float32[np.ndarray, "height width"], camera: Camera
-) -> Float[np.ndarray, "4"]:
+def _sides_of_mask(alpha: AlphaMask, camera: Camera) -> Float[np.ndarray, "4"]:
     """Left, top, right and bottom of a mask, px; NaN at the image's border or in an empty mask."""
     size = np.array(camera.size_px, dtype=np.float64)
     columns, lines = (np.flatnonzero((alpha > 0.5).any(axis=axis)) for axis in (0, 1))

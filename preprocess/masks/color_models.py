@@ -10,7 +10,9 @@ from typing import NamedTuple, final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32
+
+from capture.source import RgbImage
 
 REFERENCE_SPREAD = 16.0
 """Standard deviation, in levels, at whose peak a density is 1."""
@@ -206,9 +208,7 @@ class DarkFilmBrightener:
         """Starts before the first frame."""
         self._brightest = 1.0
 
-    def __call__(
-        self, rgb: UInt8[np.ndarray, "height width 3"]
-    ) -> UInt8[np.ndarray, "height width 3"]:
+    def __call__(self, rgb: RgbImage) -> RgbImage:
         """Brighten the next frame, as much as the brightest one until now allows: some fade in."""
         if self._brightest < DARK_LEVEL:
             level = float(np.percentile(rgb[::LEVEL_STRIDE, ::LEVEL_STRIDE], 98))

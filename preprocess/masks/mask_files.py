@@ -15,7 +15,7 @@ from PIL import Image, ImageOps
 from capture.camera import same_aspect_ratio
 from capture.image_folder import IMAGE_SUFFIXES, has_cutout_alpha, natural_sort_key, refuse_pipe
 from capture.input_error import InputError
-from capture.source import FrameSelection
+from capture.source import AlphaMask, FrameSelection
 from capture.video import VIDEO_SUFFIXES, DecodedFrame, VideoFile
 from preprocess.file_content import read_npz
 
@@ -64,7 +64,7 @@ def are_object_ids(samples: list[Float32[np.ndarray, "_ _"]]) -> bool:
     return len(found) <= MAX_OBJECTS and area > MIN_OBJECT_AREA
 
 
-def _coverage(alpha: Float32[np.ndarray, "height width"]) -> Float[np.ndarray, "2"]:
+def _coverage(alpha: AlphaMask) -> Float[np.ndarray, "2"]:
     """Mean alpha of the image and of its rim."""
     rim = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])
     return np.array([alpha.mean(), rim.mean()], dtype=np.float64)
@@ -72,7 +72,7 @@ def _coverage(alpha: Float32[np.ndarray, "height width"]) -> Float[np.ndarray, "
 
 POLARITY_SAMPLES = 9
 """Number of masks from which polarity and kind are detected."""
-MaskReader = Callable[[int], Float32[np.ndarray, "height width"]]
+MaskReader = Callable[[int], AlphaMask]
 """From a row to the mask as stored."""
 
 
@@ -113,7 +113,7 @@ class Masks:
         """Alpha of a stored mask: any object, if the files hold object numbers."""
         return (stored > 0.0).astype(np.float32) if self._numbers else stored
 
-    def alpha(self, row: int, size_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
+    def alpha(self, row: int, size_px: tuple[int, int]) -> AlphaMask:
         """The mask of one row, scaled to an image's size.
 
         Raises:
@@ -195,9 +195,9 @@ class _MaskVideo:
         self._video = video
         self._frames: Iterator[tuple[int, DecodedFrame]] = iter(())
         self._at = -1
-        self._last: Float32[np.ndarray, "height width"] | None = None
+        self._last: AlphaMask | None = None
 
-    def read(self, row: int) -> Float32[np.ndarray, "height width"]:
+    def read(self, row: int) -> AlphaMask:
         """Read the mask of one frame."""
         if row == self._at and self._last is not None:
             return self._last
@@ -223,7 +223,7 @@ def _load_npy(path: Path) -> Shaped[np.ndarray, "..."] | None:
         return None
 
 
-def read_mask(path: Path) -> Float32[np.ndarray, "height width"]:
+def read_mask(path: Path) -> AlphaMask:
     """Read one mask as stored, in [0, 1]."""
     if path.suffix.lower() == ".npy":
         stored = _load_npy(path)
@@ -256,7 +256,7 @@ def _mask_channel(image: Image.Image) -> Shaped[np.ndarray, "height width"]:
     return np.asarray(image)
 
 
-def _to_alpha(stored: Shaped[np.ndarray, "..."], path: Path) -> Float32[np.ndarray, "height width"]:
+def _to_alpha(stored: Shaped[np.ndarray, "..."], path: Path) -> AlphaMask:
     """Stored numbers as alpha; a mask of only 0 and 1 needs no scaling."""
     stored = np.squeeze(np.asarray(stored))
     if stored.ndim != 2 or stored.dtype.kind not in "biuf":
@@ -275,7 +275,7 @@ def _full_scale(stored: Shaped[np.ndarray, "height width"]) -> np.float32:
     return np.float32(65535.0 if stored.dtype == np.uint16 else 255.0)
 
 
-def _readable(read: MaskReader, rows: list[int]) -> list[Float32[np.ndarray, "height width"]]:
+def _readable(read: MaskReader, rows: list[int]) -> list[AlphaMask]:
     """The readable masks; raises the first error if there are none."""
     masks, refused = [], []
     for row in rows:

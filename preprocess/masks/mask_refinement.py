@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int, UInt8
 
+from capture.source import RgbImage
 from preprocess.masks.color_models import (
     BackgroundPlate,
     DarkFilmBrightener,
@@ -311,9 +312,7 @@ class GivenMaskRefiner:
         return self._refiner(rgb, _crop(alpha))
 
 
-def edge_strength(
-    rgb: UInt8[np.ndarray, "height width 3"], alpha: Float32[np.ndarray, "height width"]
-) -> float:
+def edge_strength(rgb: RgbImage, alpha: Float32[np.ndarray, "height width"]) -> float:
     """Change of color across a mask's border, levels per pixel.
 
     It is the mean over the border, weighted by the gradient of alpha.

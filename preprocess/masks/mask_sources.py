@@ -7,20 +7,18 @@ from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Float32
 
 from capture.atomic_files import OutputFileList
 from capture.camera import Camera, same_aspect_ratio
 from capture.image_folder import has_cutout_alpha, list_images, read_image
 from capture.input_error import InputError
-from capture.source import Frame, FrameSource
+from capture.source import AlphaMask, Frame, FrameSource
 from preprocess.body.body_pose import BodyPose
 from preprocess.frame_association import associate_by_name, associate_by_order
 from preprocess.masks.mask_files import Masks
 from preprocess.masks.mask_refinement import GivenMaskRefiner
 from preprocess.plugins import Segmenter
 
-Alpha = Float32[np.ndarray, "height width"]
 UNREFINED = GivenMaskRefiner(enabled=False)
 """Masks stay as they are."""
 
@@ -55,11 +53,11 @@ class MaskSource:
     def check(self) -> None:
         """Raise an InputError if they do not belong to the frames."""
 
-    def read(self, index: int, size_px: tuple[int, int]) -> Alpha:
+    def read(self, index: int, size_px: tuple[int, int]) -> AlphaMask:
         """Read the given mask of a frame's number, scaled; an InputError if there is none."""
         raise InputError(f"the mask of frame {index} is not known before the frame")
 
-    def alpha(self, frame: Frame, scaled: Frame, pose: BodyPose, camera: Camera) -> Alpha:
+    def alpha(self, frame: Frame, scaled: Frame, pose: BodyPose, camera: Camera) -> AlphaMask:
         """The mask of a frame, in [0, 1]; an InputError if there is none.
 
         Args:
@@ -92,7 +90,7 @@ class GivenMasks(MaskSource):
         """Return whether they are refined, by the frames that were seen."""
         return self._refine.is_needed
 
-    def alpha(self, frame: Frame, scaled: Frame, pose: BodyPose, camera: Camera) -> Alpha:
+    def alpha(self, frame: Frame, scaled: Frame, pose: BodyPose, camera: Camera) -> AlphaMask:
         """Read the mask of a frame, and refine it if that is needed."""
         if self._refine.keeps_given_masks:
             return self._of_frame(frame, scaled.size_px)
@@ -103,7 +101,7 @@ class GivenMasks(MaskSource):
         if self._refine.note is not None:
             yield self._refine.note
 
-    def _of_frame(self, frame: Frame, size_px: tuple[int, int]) -> Alpha:
+    def _of_frame(self, frame: Frame, size_px: tuple[int, int]) -> AlphaMask:
         return self.read(frame.index, size_px)
 
 
@@ -131,7 +129,7 @@ class StoredMasks(GivenMasks):
         """Raise an InputError if files and frames do not belong together."""
         self.row_of  # noqa: B018 - it is found here
 
-    def read(self, index: int, size_px: tuple[int, int]) -> Alpha:
+    def read(self, index: int, size_px: tuple[int, int]) -> AlphaMask:
         """Read the mask of a frame's number, which may be beyond the video's."""
         row = self.row_of(index)
         if not 0 <= row < self.files.count:
@@ -163,7 +161,7 @@ class AlphaChannelMasks(GivenMasks):
     def _paths(self) -> list[Path]:
         return list_images(self._source.path)  # only images have alpha channels
 
-    def read(self, index: int, size_px: tuple[int, int]) -> Alpha:
+    def read(self, index: int, size_px: tuple[int, int]) -> AlphaMask:
         """Read the alpha channel of an image."""
         try:
             rgb, alpha = read_image(self._paths[index])
@@ -175,7 +173,7 @@ class AlphaChannelMasks(GivenMasks):
             raise InputError(f"image {index} is of another size than the others")
         return alpha_channel_mask(Frame(index=index, time_s=0.0, rgb=rgb, alpha=alpha), size_px)
 
-    def _of_frame(self, frame: Frame, size_px: tuple[int, int]) -> Alpha:
+    def _of_frame(self, frame: Frame, size_px: tuple[int, int]) -> AlphaMask:
         return alpha_channel_mask(frame, size_px)
 
 
@@ -193,7 +191,7 @@ class EstimatedMasks(MaskSource):
         """Agreement with the posed body, if the segmenter knows it."""
         return getattr(self._segment, "agreement", None)
 
-    def alpha(self, frame: Frame, scaled: Frame, pose: BodyPose, camera: Camera) -> Alpha:
+    def alpha(self, frame: Frame, scaled: Frame, pose: BodyPose, camera: Camera) -> AlphaMask:
         """Estimate the mask of a frame."""
         return self._segment(scaled, pose, camera)
 
@@ -234,9 +232,7 @@ def _row_by_name(named: dict[int, int], masks: Masks) -> Callable[[int], int]:
     return row
 
 
-def alpha_channel_mask(
-    frame: Frame, size_px: tuple[int, int]
-) -> Float32[np.ndarray, "height width"]:
+def alpha_channel_mask(frame: Frame, size_px: tuple[int, int]) -> AlphaMask:
     """The image's own alpha channel, scaled.
 
     Raises:

@@ -13,11 +13,11 @@ from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float
 
 from capture.camera import Camera
 from capture.input_error import InputError
-from capture.source import Frame
+from capture.source import AlphaMask, Frame, RgbImage
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.body_surface import NEAR_PLANE_M, SkinPoints
 from preprocess.body.parametric_body import ShapedBody
@@ -76,9 +76,7 @@ class PersonLooks:
         self._colors += max(LEARNING_RATE, 1 / self._pictures) * (colors - self._colors)
 
 
-def colors_of(
-    rgb: UInt8[np.ndarray, "height width 3"], found: PersonKeypoints
-) -> Float[np.ndarray, "numbers"]:
+def colors_of(rgb: RgbImage, found: PersonKeypoints) -> Float[np.ndarray, "numbers"]:
     """Quantiles of the colors of a person's chest and thighs in a frame, CIELAB."""
     points = found.image_px
     height, width = rgb.shape[:2]
@@ -163,7 +161,7 @@ class BlazePoseTracker:
         self._mask_px = 0.0
         self._is_replaced = False  # by another person at the same place
 
-    def __call__(self, rgb: UInt8[np.ndarray, "height width 3"]) -> PersonKeypoints | None:
+    def __call__(self, rgb: RgbImage) -> PersonKeypoints | None:
         """Find the person in the next frame; None where there is none."""
         rgb = self._brighten(rgb)
         found = self._follow(rgb) or self._find(rgb)
@@ -181,19 +179,19 @@ class BlazePoseTracker:
         is_near = self._crowded_frames > CROWD_MEMORY - SEEN_AGO
         return replace(found.keypoints, crowded=is_near)
 
-    def _follow(self, rgb: UInt8[np.ndarray, "height width 3"]) -> FoundLandmarks | None:
+    def _follow(self, rgb: RgbImage) -> FoundLandmarks | None:
         """The person, where the last frame's key points say; None if it is not there."""
         if self._last is None or self._last.frames_ago > 1:
             return None
         found = self._accept(rgb, self._find_landmarks(rgb, self._last.square))
         return None if found is None or self._is_a_thing(rgb, found) else found
 
-    def _is_strange(self, rgb: UInt8[np.ndarray, "height width 3"], found: FoundLandmarks) -> bool:
+    def _is_strange(self, rgb: RgbImage, found: FoundLandmarks) -> bool:
         """True if the colors are another one's."""
         distance = self._looks.distance(colors_of(rgb, found.keypoints))
         return self._looks.is_known and distance > MAX_UNSEEN_COLOR_DISTANCE
 
-    def _look_for_who_hides(self, rgb: UInt8[np.ndarray, "height width 3"]) -> None:
+    def _look_for_who_hides(self, rgb: RgbImage) -> None:
         """Look for another person where the person was, who is not there now."""
         last = self._last
         if last is None:
@@ -212,15 +210,13 @@ class BlazePoseTracker:
             self._crowded_frames, self._has_company, self._is_replaced = 0, False, False
         self._last = replace(last, frames_ago=last.frames_ago + 1)
 
-    def _is_a_thing(self, rgb: UInt8[np.ndarray, "height width 3"], found: FoundLandmarks) -> bool:
+    def _is_a_thing(self, rgb: RgbImage, found: FoundLandmarks) -> bool:
         """True if the colors are strange, and the detector finds no person there."""
         return self._is_strange(rgb, found) and not any(
             distance_in_sides(found.square, each.square) < NEAR for each in self._detect(rgb)
         )
 
-    def _accept(
-        self, rgb: UInt8[np.ndarray, "height width 3"], found: FoundLandmarks
-    ) -> FoundLandmarks | None:
+    def _accept(self, rgb: RgbImage, found: FoundLandmarks) -> FoundLandmarks | None:
         """The landmarks, if they are of a person, and of the same one as before."""
         if found.keypoints.presence < MIN_PRESENCE:
             return None
@@ -233,7 +229,7 @@ class BlazePoseTracker:
             return found if self._looks_right(colors_of(rgb, found.keypoints)) else None
         return found
 
-    def _find(self, rgb: UInt8[np.ndarray, "height width 3"]) -> FoundLandmarks | None:
+    def _find(self, rgb: RgbImage) -> FoundLandmarks | None:
         """The person, found by the detector; None if it is nowhere."""
         for detection in self._candidates(rgb):
             # The detector's square is rough; the key points found in it give a better one.
@@ -245,7 +241,7 @@ class BlazePoseTracker:
                 return found
         return None
 
-    def _candidates(self, rgb: UInt8[np.ndarray, "height width 3"]) -> list[PersonDetection]:
+    def _candidates(self, rgb: RgbImage) -> list[PersonDetection]:
         """Detections that may be the person, the most likely one first."""
         last = self._last
         if last is None:
@@ -259,7 +255,7 @@ class BlazePoseTracker:
                 return sorted(likely, key=lambda each: last.strangeness(each.square))
         return []
 
-    def _choose(self, rgb: UInt8[np.ndarray, "height width 3"]) -> list[PersonDetection]:
+    def _choose(self, rgb: RgbImage) -> list[PersonDetection]:
         """The person to follow, of those in the first frame; none if it is not there yet."""
         if self._person is None:
             return sorted(self._detect.find_all(rgb), key=lambda each: -each.square.side)
@@ -273,7 +269,7 @@ class BlazePoseTracker:
         from_left = sorted(persons, key=lambda each: each.square.x)
         return from_left[self._person - 1 : self._person]
 
-    def _watch(self, rgb: UInt8[np.ndarray, "height width 3"], found: FoundLandmarks) -> None:
+    def _watch(self, rgb: RgbImage, found: FoundLandmarks) -> None:
         """Look for other persons every few frames; while there are none, learn this one's looks."""
         self._crowded_frames = max(0, self._crowded_frames - 1)
         self._frames_to_watch -= 1
@@ -292,9 +288,7 @@ class BlazePoseTracker:
         if is_clear or not self._looks.is_known:
             self._looks.learn(colors_of(rgb, found.keypoints))
 
-    def _is_same(
-        self, rgb: UInt8[np.ndarray, "height width 3"], person: PersonSquare, other: PersonSquare
-    ) -> bool:
+    def _is_same(self, rgb: RgbImage, person: PersonSquare, other: PersonSquare) -> bool:
         """Check whether a detection near the person is the person; remember another one's looks.
 
         The detector's squares around small persons lie beside them; their key points do not.
@@ -332,7 +326,7 @@ class PosedPersonFinder:
         self._brighten, self._find_landmarks = DarkFilmBrightener(), BlazePoseLandmarks()
 
     def __call__(
-        self, rgb: UInt8[np.ndarray, "height width 3"], pose: BodyPose, camera: Camera
+        self, rgb: RgbImage, pose: BodyPose, camera: Camera
     ) -> tuple[PersonKeypoints, float]:
         """Look at the square around the posed body; the mask holds nothing far from it.
 
@@ -369,9 +363,7 @@ class BlazePoseSegmenter:
         self._refine: MaskRefiner | None = None
         self.mask_count, self.agreement = 0, 0.0
 
-    def __call__(
-        self, frame: Frame, pose: BodyPose, camera: Camera
-    ) -> Float32[np.ndarray, "height width"]:
+    def __call__(self, frame: Frame, pose: BodyPose, camera: Camera) -> AlphaMask:
         """Estimate the mask of a frame; see `Segmenter`.
 
         Raises:

@@ -15,6 +15,7 @@ import numpy as np
 import onnxruntime
 from jaxtyping import Float, Float32, UInt8
 
+from capture.source import RgbImage
 from preprocess.tracking.keypoints import KEYPOINT_COUNT, CroppedMask, PersonKeypoints
 
 WEIGHTS = Path(__file__).parent / "weights"
@@ -101,7 +102,7 @@ class PersonSquare:
         )
 
     @classmethod
-    def of_frame(cls, rgb: UInt8[np.ndarray, "height width 3"]) -> "PersonSquare":
+    def of_frame(cls, rgb: RgbImage) -> "PersonSquare":
         """The upright square around a whole frame."""
         height, width = rgb.shape[:2]
         return cls(x=width / 2, y=height / 2, side=float(max(width, height)))
@@ -117,9 +118,7 @@ class PersonSquare:
         cosine, sine = np.cos(self.angle), np.sin(self.angle)
         return np.array([[cosine, -sine], [sine, cosine]])
 
-    def crop(
-        self, rgb: UInt8[np.ndarray, "height width 3"], size: int
-    ) -> UInt8[np.ndarray, "size size 3"]:
+    def crop(self, rgb: RgbImage, size: int) -> UInt8[np.ndarray, "size size 3"]:
         """Cut the square out of a frame, `size` x `size` pixels; black outside the frame."""
         there = self.image_from_crop(size)
         corners = there @ np.array([[0, size, 0, size], [0, 0, size, size], [1, 1, 1, 1]])
@@ -162,9 +161,7 @@ class BlazePoseDetector:
         self._network = OnnxNetwork(WEIGHTS / "blazepose_detector.onnx")
         self._anchors = anchors(self._network.picture_size)
 
-    def __call__(
-        self, rgb: UInt8[np.ndarray, "height width 3"], area: PersonSquare | None = None
-    ) -> list[PersonDetection]:
+    def __call__(self, rgb: RgbImage, area: PersonSquare | None = None) -> list[PersonDetection]:
         """Find the persons in an upright area (None: the whole frame), the most certain first."""
         area = area or PersonSquare.of_frame(rgb)
         size = self._network.picture_size
@@ -191,9 +188,7 @@ class BlazePoseDetector:
                 found.append(detection)
         return found
 
-    def find_all(
-        self, rgb: UInt8[np.ndarray, "height width 3"], *, in_parts: bool = False
-    ) -> list[PersonDetection]:
+    def find_all(self, rgb: RgbImage, *, in_parts: bool = False) -> list[PersonDetection]:
         """Find the persons in a frame, small ones as well.
 
         With `in_parts`, each part of the frame is searched even if a person was found: of two the
@@ -212,9 +207,7 @@ class BlazePoseDetector:
             for each in found
         ]
 
-    def _look_closer(
-        self, rgb: UInt8[np.ndarray, "height width 3"], detection: PersonDetection
-    ) -> PersonDetection:
+    def _look_closer(self, rgb: RgbImage, detection: PersonDetection) -> PersonDetection:
         """The same person, found in a smaller area."""
         square = detection.square
         closer = self(rgb, replace(square, angle=0.0))
@@ -225,7 +218,7 @@ class BlazePoseDetector:
         )
 
 
-def parts_of_frame(rgb: UInt8[np.ndarray, "height width 3"]) -> list[PersonSquare]:
+def parts_of_frame(rgb: RgbImage) -> list[PersonSquare]:
     """Three squares that cover a frame, as high or as wide as it is."""
     height, width = rgb.shape[:2]
     side = float(min(width, height))
@@ -276,9 +269,7 @@ class BlazePoseLandmarks:
         """Loads the network."""
         self._network = OnnxNetwork(WEIGHTS / "blazepose_landmarks_full.onnx")
 
-    def __call__(
-        self, rgb: UInt8[np.ndarray, "height width 3"], square: PersonSquare
-    ) -> FoundLandmarks:
+    def __call__(self, rgb: RgbImage, square: PersonSquare) -> FoundLandmarks:
         """Find the person in a square of a frame."""
         size = self._network.picture_size
         output = self._network.run(square.crop(rgb, size), 0.0, 1.0)

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from capture.source import Frame, FrameSource
+from capture.source import Frame, FrameSource, RgbImage
 from capture.source_opening import glance
 from preprocess.masks.color_models import DARK_LEVEL, DarkFilmBrightener
 from preprocess.tracking.blazepose import OVERLAPPING, distance_in_sides
@@ -203,7 +203,7 @@ class PersonFinder:
         """Load the networks."""
         self._detect, self._landmarks = BlazePoseDetector(), BlazePoseLandmarks()
 
-    def find(self, rgb: UInt8[np.ndarray, "height width 3"]) -> _Glimpse:
+    def find(self, rgb: RgbImage) -> _Glimpse:
         """Find the persons; where none is upright, also in the frame turned by 90 degrees."""
         persons = self.persons(rgb)
         upright = [each for each in persons if _rotation(each) == 0]
@@ -217,9 +217,7 @@ class PersonFinder:
             rotation = 90 * best if surest > MIN_PRESENCE else 0
         return _Glimpse(size_px=(rgb.shape[1], rgb.shape[0]), persons=persons, rotation=rotation)
 
-    def follow(
-        self, rgb: UInt8[np.ndarray, "height width 3"], square: PersonSquare | None
-    ) -> FoundLandmarks | None:
+    def follow(self, rgb: RgbImage, square: PersonSquare | None) -> FoundLandmarks | None:
         """Find the person where it was in an earlier frame, else the largest one."""
         if square is not None:
             found = self._landmarks(rgb, square)
@@ -230,7 +228,7 @@ class PersonFinder:
                 return found
         return next(iter(self.persons(rgb)), None)
 
-    def persons(self, rgb: UInt8[np.ndarray, "height width 3"]) -> list[FoundLandmarks]:
+    def persons(self, rgb: RgbImage) -> list[FoundLandmarks]:
         """Find the largest person and others nearly as large, the largest first."""
         persons: list[FoundLandmarks] = []
         for detection in self._detect.find_all(rgb):
@@ -295,7 +293,7 @@ class _Shift:
     plane: float
 
 
-def _reduced_gray(rgb: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "rows columns"]:
+def _reduced_gray(rgb: RgbImage) -> UInt8[np.ndarray, "rows columns"]:
     scale = min(1.0, BACKGROUND_PX / max(rgb.shape[:2]))
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     return cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)

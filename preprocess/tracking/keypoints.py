@@ -9,7 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, Shaped, UInt8
+from jaxtyping import Float, Int, Shaped, UInt8
+
+from capture.source import AlphaMask
 
 KEYPOINT_COUNT = 33
 """Number of key points of a person."""
@@ -47,9 +49,7 @@ class CroppedMask:
         pixel = abs(float(np.linalg.det(self.image_from_crop[:, :2])))
         return pixel * float((self.values > 127).sum())
 
-    def resample(
-        self, frame_px: tuple[int, int], size_px: tuple[int, int]
-    ) -> Float32[np.ndarray, "height width"]:
+    def resample(self, frame_px: tuple[int, int], size_px: tuple[int, int]) -> AlphaMask:
         """The mask of a whole frame, in [0, 1], at `size_px` (width, height); 0 off the square."""
         import cv2  # heavy, and players, which read poses, do without
 

@@ -14,10 +14,10 @@ from typing import Protocol, final, runtime_checkable
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Int, UInt8
+from jaxtyping import Float32, Int
 
 from capture.input_error import InputError
-from capture.source import FrameSource
+from capture.source import FrameSource, RgbImage
 from preprocess.plugins import PersonTracker
 from preprocess.tracking.keypoints import CroppedMask, KeypointTrack, PersonKeypoints
 
@@ -134,7 +134,7 @@ class MaskRefinement(Protocol):
     """Makes the mask of a frame from a network's coarse one, frame by frame, in order."""
 
     def __call__(
-        self, rgb: UInt8[np.ndarray, "height width 3"], mask: CroppedMask, size_px: tuple[int, int]
+        self, rgb: RgbImage, mask: CroppedMask, size_px: tuple[int, int]
     ) -> Float32[np.ndarray, "rows columns"]:
         """Estimate how far each pixel is person, in [0, 1], at a size."""
         ...
@@ -235,10 +235,7 @@ def _mask_path(folder: Path, index: int) -> Path:
 
 
 def _write_mask(
-    path: Path,
-    rgb: UInt8[np.ndarray, "height width 3"],
-    person: PersonKeypoints | None,
-    refine: MaskRefinement,
+    path: Path, rgb: RgbImage, person: PersonKeypoints | None, refine: MaskRefinement
 ) -> None:
     height, width = rgb.shape[:2]
     mask = np.zeros((height, width), dtype=np.uint8)
