@@ -311,9 +311,9 @@ def skin_distance_volume(
     """Distance of each cell's center from the skin, metres, and whether it lies under it.
 
     The distance is to the nearest vertex, unsigned, and interpolated between every second cell
-    beyond `SEARCHED_WITHIN_M`; cells farther than `reach_m` count as 1 m away, and outside. Which
-    side of that vertex a center is on is right wherever it is farther off than vertices are from
-    each other.
+    beyond `SEARCHED_WITHIN_M`; cells farther than `reach_m` count as 1 m away. Which side of that
+    vertex a center is on is right wherever it is farther off than vertices are from each other;
+    holes that are left inside are filled.
     """
     shape = volume_shape(low, high, cell_m)
     size = (high - low) / shape

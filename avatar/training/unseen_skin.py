@@ -23,7 +23,7 @@ from scipy.sparse import coo_array
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from avatar.rig import CLOTHING_BAND_M, Rig
+from avatar.rig import CLOTHING_BAND_M, HEAD_PART, Rig
 from avatar.training.frame_stream import TrainingFrame
 from avatar.training.skin_evidence import SkinEvidence
 from preprocess.body.kinematics import body_from_rest
@@ -37,7 +37,7 @@ MIRRORED_PART = np.array([0, 2, 1, 4, 3, 6, 5, 7, 9, 8, 11, 10, 13, 12])
 """The part on the other side of the body."""
 SIDES_OF_BODY = ((1, 2), (4, 5), (16, 17), (18, 19))
 """Pairs of left and right joints, which lie symmetrically."""
-HEAD, FEET = 7, (5, 6)
+HEAD, FEET = HEAD_PART, (5, 6)
 """Parts whose front and back are not alike."""
 MIRROR_COST_M = 0.03
 """Cost of the mirrored side, as a distance around the limb, metres."""

@@ -165,6 +165,7 @@ def test_seeds_are_skin_and_leave_no_part_of_it_unseeded(rig, skin, shaped):
     seeds = KDTree(rig.seeds)
     on_skin, _ = KDTree(skin).query(rig.seeds)
     outer = skin[on_outside]
+    assert len(outer) > 0.85 * len(skin)
     reach, nearest = seeds.query(outer)
     assert on_skin.max() < 1e-6
     assert reach.max() < 0.02 * np.sqrt(3.0)  # a voxel's diagonal

@@ -72,6 +72,15 @@ def test_pictures_do_not_depend_on_what_onnxruntime_optimizes(exported, bent, ca
     np.testing.assert_array_equal(*pictures)
 
 
+def test_a_few_slightly_wrong_pixels_match_and_one_in_a_thousand_altogether_wrong_does_not():
+    black = np.zeros((64, 64, 4), np.float32)
+    slightly, altogether = black.copy(), black.copy()
+    slightly.reshape(-1, 4)[:40] = 8.0 / 255.0
+    altogether.reshape(-1, 4)[:4] = 1.0
+    assert PictureDifference.of(black, slightly).matches
+    assert not PictureDifference.of(black, altogether).matches
+
+
 @pytest.mark.parametrize("tier", ["hq", "lite"])
 def test_folded_skin_is_filtered_as_in_the_reference(exported, tables, camera, tier, monkeypatch):
     """A shoulder from near by, with the arm turned half round about its axis."""
