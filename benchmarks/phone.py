@@ -1,12 +1,14 @@
 """A video sent as a phone's page films it: what is lost, how late advice is, when it can be played.
 
-    python -m benchmarks.phone [--seconds 20] [--keep DIR]
+    python -m benchmarks.phone [--seconds 20] [--sample-seconds 20] [--capture-only] [--keep DIR]
 
 Films the sample, enlarges it to 720p, and sends it to ia-capture in pieces at its own speed; the
-connection breaks twice. Then ia-ingest --realtime learns from the same file. No browser is used.
+connection breaks twice. Then ia-ingest --realtime learns from the same file. No browser is used
+(`benchmarks.phone_page` uses one). Ten minutes: --seconds 600 --capture-only.
 """
 
 import asyncio
+import itertools
 import json
 import re
 import signal
@@ -38,20 +40,31 @@ BREAKS = (1 / 3, 2 / 3)
 """When the connection breaks, as shares of the video."""
 
 
-def main(seconds: float = 20.0, keep: Path | None = None) -> None:
-    """Measure ia-capture on a video of some seconds; a sample in `keep` is used again."""
+def main(
+    seconds: float = 20.0,
+    sample_seconds: float = 20.0,
+    capture_only: bool = False,
+    keep: Path | None = None,
+) -> None:
+    """Measure ia-capture on a video of some seconds; a sample in `keep` is used again.
+
+    A longer video plays the sample forwards and backwards.
+    """
     hardware, count = Hardware.here(), round(seconds * FPS / FRAMES_PER_PIECE) * FRAMES_PER_PIECE
+    sampled = min(count, round(sample_seconds * FPS))
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         sample, video = (keep or folder) / f"sample{FILMED_PX}", folder / "film.mp4"
         if not sample.exists():
-            size = ["--size", str(FILMED_PX), "--frames", str(count)]
+            size = ["--size", str(FILMED_PX), "--frames", str(sampled)]
             subprocess.run([*command("sample"), str(sample), "--like-a-phone", *size], check=True)
         phone = PhoneClient(encode_pieces(sample / "video.mp4", video, count))
         capture = phone.run_capture(folder / "avatars")
-        out = ["--realtime", "--size", "400", "--out", str(folder / "run")]
-        subprocess.run([*command("ingest"), str(video), *out], check=True, stdout=sys.stderr)
-        played = json.loads((folder / "run" / "report.json").read_text())
+        played = None
+        if not capture_only:
+            out = ["--realtime", "--size", "400", "--out", str(folder / "run")]
+            subprocess.run([*command("ingest"), str(video), *out], check=True, stdout=sys.stderr)
+            played = json.loads((folder / "run" / "report.json").read_text())
         marks = measurements(phone, capture, played)
     print("\n".join([*hardware.lines(), "", *markdown_rows(marks)]))
 
@@ -68,7 +81,9 @@ def encode_pieces(source: Path, out: Path, count: int) -> list[bytes]:
         fast = {"preset": "veryfast", "tune": "zerolatency"}
         stream = video.add_stream("libx264", rate=FPS, options=fast)
         (stream.width, stream.height), stream.pix_fmt = SIZE_PX, "yuv420p"
-        for index, frame in zip(range(count), film.decode(video=0), strict=False):
+        frames = list(itertools.islice(film.decode(video=0), count))
+        to_and_fro = itertools.cycle([*frames, *frames[-2:0:-1]])
+        for index, frame in zip(range(count), to_and_fro, strict=False):
             image = frame.reformat(*SIZE_PX, format="yuv420p")
             image.pts, image.time_base = index, Fraction(1, FPS)
             video.mux(stream.encode(image))
@@ -169,12 +184,19 @@ async def break_halfway(content: bytes) -> AsyncIterator[bytes]:
 
 
 def measurements(
-    phone: PhoneClient, capture: dict[str, Any], played: dict[str, Any]
+    phone: PhoneClient, capture: dict[str, Any], played: dict[str, Any] | None
 ) -> list[Measurement]:
     """The rows of issue 36 that need no browser."""
     sent, tracked = len(phone.arrived_at), phone.delays_s["seconds"]
     advice = ", ".join(f"{delay:.2f}" for delay in phone.delays_s["advice"])
-    psnr, file_psnr = (report["held_out"]["psnr"] for report in (capture, played))
+    psnr, steps = capture["held_out"]["psnr"], capture["training"]["steps"]
+    scored, least, more = "held-out PSNR, dB", "", ""
+    quality = f"{psnr:.2f} of {capture['frames']['read']} frames, {steps} steps"
+    if played is not None:
+        file = played["held_out"]["psnr"], played["frames"]["read"], played["training"]["steps"]
+        quality += "; file: {:.2f}, {}, {}".format(*file)
+        scored, least, more = "held-out PSNR, above that of the file, dB", "≥ -0.5", "≥ 0"
+        psnr -= file[0]
     memory = capture["training"]["peak_memory_mb"] / 1024.0
     rows = [
         ("from the last frame to a package, s", phone.played_after_s, "≤ 6", "≤ 3",
@@ -185,10 +207,8 @@ def measurements(
          f"of {sent}; {phone.tracked} before the last one came"),
         ("feedback after the frame came, median, s", np.median(tracked), "≤ 1", "≤ 0.3",
          f"of {len(tracked)} tracked; p95 {np.percentile(tracked, 95):.2f}; advice: {advice}"),
-        ("held-out PSNR, above that of the file, dB", psnr - file_psnr, "≥ -0.5", "≥ 0",
-         f"{psnr:.2f} of {capture['frames']['read']} frames, {capture['training']['steps']} steps; "
-         f"file: {file_psnr:.2f}, {played['frames']['read']}, {played['training']['steps']}"),
-        ("peak memory, GiB", memory, "≤ 2", "≤ 1.5", f"a video of {sent / FPS:g} s, not 10 min"),
+        (scored, psnr, least, more, quality),
+        ("peak memory, GiB", memory, "≤ 2", "≤ 1.5", f"a video of {sent / FPS:g} s"),
     ]  # fmt: skip
     return [
         Measurement(

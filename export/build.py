@@ -21,7 +21,7 @@ from PIL import Image
 from avatar.avatar_model import Avatar
 from avatar.evaluation.image_metrics import psnr
 from avatar.render import render
-from avatar.rig import Rig, canonical_rotations
+from avatar.rig import Rig
 from capture.input_error import InputError
 from export.bake.bake_tables import BakeConfig, ExportRefused, bake_tables, sample_field
 from export.bake.fine_tuning import (
@@ -42,18 +42,12 @@ from export.package.package_file import (
     COARSE_GRAPH,
     AvatarPackage,
     PackageWriter,
-    write_package,
 )
 from export.package.player_tables import (
-    BRICK_NODES,
     QUALITY_TIERS,
     THICK_FIELD_TIERS,
-    WEIGHT_SCALE,
-    BrickTable,
     PlayerTables,
     RenderSettings,
-    SkinningGrid,
-    SurfelTable,
 )
 from export.package.table_codec import TableLayout, estimate_brick_bytes
 from export.player import (
@@ -65,7 +59,6 @@ from export.player import (
     straighten,
 )
 from export.player_inputs import fit_camera
-from preprocess.body.kinematics import PARENTS
 
 GRAPH_CHECK_PICTURES = {"hq": 2, "lite": 1}
 """Golden frames on which each tier's graph is compared with its reference, 0.2 s each. They test
@@ -164,47 +157,10 @@ def write_draft(avatar: Avatar, path: Path, view: PosedView) -> None:
         pose, camera = view
         drawn = render(avatar, pose, replace(camera, distortion=()))
         package = _unchecked_package(baking.result(), QUALITY_TIERS, avatar.rig, (), {})
-        serialized = executor.map(lambda tier: _serialized_graph(package, tier), QUALITY_TIERS)
+        serialized = executor.map(lambda tier: serialize_graph(package, tier), QUALITY_TIERS)
         writer.add_tables(baking.result())
-        graphs = dict(zip(QUALITY_TIERS, serialized, strict=True)) | _coarse_graph(package)
-        writer.finish(replace(package, graphs=graphs, preview=_encode_png(straighten(drawn))))
-
-
-def write_practice_package(path: Path) -> None:
-    """Write a package of two surfels, as high as a person, and an empty brick.
-
-    A browser that has drawn it has compiled what draws an avatar.
-    """
-    origin = np.zeros(3, np.float32)
-    tables = PlayerTables(
-        surfels=SurfelTable(
-            low=origin - 1.0, extent_m=2.0, spacing_m=0.01,
-            position_codes=np.array([[1 << 15, 0, 1 << 15], [1 << 15, 65535, 1 << 15]], np.uint16),
-            normal_codes=np.array([[0, 0, 127]] * 2, np.int8),
-            thickness_codes=np.full(2, 40, np.uint8),
-        ),
-        bricks=BrickTable(
-            low=origin, voxel_m=0.01, index=np.ones((1, 1, 1), np.int32),
-            voxels=np.zeros((2, *[BRICK_NODES] * 3, 4), np.uint8),
-        ),
-        skinning=SkinningGrid(
-            low=origin - 2.0, step_m=origin + 4.0,
-            index=np.arange(1, 9, dtype=np.int32).reshape(2, 2, 2),
-            weight_codes=np.eye(24, 1, dtype=np.uint16).repeat(9, axis=1) * WEIGHT_SCALE,
-        ),
-        pelvis=origin, reach_m=2.0,
-    )  # fmt: skip
-    manifest = Manifest(
-        rest_joints=np.zeros((24, 3)), parents=np.array(PARENTS),
-        canonical_rotations=canonical_rotations(), tiers=_tier_notes(tables, QUALITY_TIERS),
-        golden=(), metrics={}, sha256={},
-    )  # fmt: skip
-    package = AvatarPackage(
-        manifest=manifest, graphs={}, tables=dict.fromkeys(QUALITY_TIERS, tables), golden=(),
-        preview=_encode_png(np.zeros((1, 1, 4), np.uint8)),
-    )  # fmt: skip
-    graphs = {tier: _serialized_graph(package, tier) for tier in QUALITY_TIERS}
-    write_package(replace(package, graphs=graphs | _coarse_graph(package)), path)
+        graphs = dict(zip(QUALITY_TIERS, serialized, strict=True)) | build_coarse_graph(package)
+        writer.finish(replace(package, graphs=graphs, preview=encode_png(straighten(drawn))))
 
 
 def export_field(
@@ -338,12 +294,13 @@ def _fine_tune(
     return FineTuningResult(tables=inputs.tables, settings=inputs.settings, psnr=None)
 
 
-def _serialized_graph(package: AvatarPackage, tier: str) -> bytes:
+def serialize_graph(package: AvatarPackage, tier: str) -> bytes:
+    """Build the graph that draws a tier."""
     settings = package.manifest.tiers[tier].settings
     return build_graph(package.tables[tier], settings).SerializeToString()
 
 
-def _coarse_graph(package: AvatarPackage) -> dict[str, bytes]:
+def build_coarse_graph(package: AvatarPackage) -> dict[str, bytes]:
     """Build the graph by which a page draws its first picture, of the tables of "lite"."""
     settings = replace(package.manifest.tiers["lite"].settings, layers=1, max_blocks=1)
     return {COARSE_GRAPH: build_graph(package.tables["lite"], settings).SerializeToString()}
@@ -351,7 +308,7 @@ def _coarse_graph(package: AvatarPackage) -> dict[str, bytes]:
 
 def _prepare_player(package: AvatarPackage, tier: str) -> tuple[bytes, Player]:
     """Build the graph of a tier, and its player."""
-    graph = _serialized_graph(package, tier)
+    graph = serialize_graph(package, tier)
     return graph, Player(replace(package, graphs={tier: graph}), tier=tier, optimize=False)
 
 
@@ -391,9 +348,9 @@ def _checked_package(
     return replace(
         package,
         manifest=replace(manifest, tiers=tiers, metrics={**manifest.metrics, "warnings": warnings}),
-        graphs={tier: graph for tier, (graph, _) in players.items()} | _coarse_graph(package),
+        graphs={tier: graph for tier, (graph, _) in players.items()} | build_coarse_graph(package),
         golden=tuple(golden),
-        preview=_encode_png(preview),
+        preview=encode_png(preview),
     )
 
 
@@ -414,7 +371,7 @@ def _unchecked_package(
             rest_joints=rig.rest_joints,
             parents=rig.parents,
             canonical_rotations=rig.canonical_rotations,
-            tiers=_tier_notes(tables, settings),
+            tiers=describe_tiers(tables, settings),
             golden=tuple(golden),
             metrics=dict(metrics),
             licence=" ".join(
@@ -429,7 +386,7 @@ def _unchecked_package(
     )
 
 
-def _tier_notes(
+def describe_tiers(
     tables: PlayerTables, settings: Mapping[str, RenderSettings]
 ) -> dict[str, TierInfo]:
     """Describe tiers that were not checked."""
@@ -440,7 +397,8 @@ def _tier_notes(
     }
 
 
-def _encode_png(rgba: UInt8[np.ndarray, "height width 4"]) -> bytes:
+def encode_png(rgba: UInt8[np.ndarray, "height width 4"]) -> bytes:
+    """Encode a picture of straight alpha."""
     buffer = io.BytesIO()
     Image.fromarray(rgba).save(buffer, format="PNG")
     return buffer.getvalue()

@@ -14,7 +14,6 @@ from urllib.parse import quote
 from aiohttp import web
 
 from capture.input_error import InputError
-from export.build import write_practice_package
 from export.package.package_file import read_package
 from export.player_page import (
     ORT_WEB_VERSION,
@@ -23,6 +22,7 @@ from export.player_page import (
     player_files,
     titled,
 )
+from export.warm_up_package import write_warm_up_package
 from instant_avatar.animation.driving_motion import demo_motion, pose_rate
 from instant_avatar.animation.web_server import MIME_TYPES
 from instant_avatar.cli.console import Console
@@ -43,7 +43,7 @@ PIECE_TIMEOUT_S = 60.0
 """Longest time that one piece may take, seconds."""
 HEARTBEAT_S = 5.0
 """Longest time without a message to a page, seconds: proxies cut silent connections."""
-PRACTICE = "-"
+WARM_UP = "-"
 """Name of an avatar of two points, which the page's hidden player draws before a film: the browser
 has then compiled what draws the film's avatar. Names of films do not end in a dash."""
 MESHES = ("avatar.glb", "avatar.vrm", "avatar.ply", "avatar.obj")
@@ -82,7 +82,7 @@ class PhoneServer:
         self.on_entered: Callable[[], object] = lambda: None
         self._loop = asyncio.new_event_loop()
         self._player: dict[str, bytes] = {}
-        self._practice = b""
+        self._warm_up = b""
         self._requests: dict[str, deque[float]] = {}
         self._exporting = asyncio.Lock()  # meshes are costly: one at a time
         self._listeners: dict[str, set[asyncio.Event]] = {}
@@ -184,8 +184,8 @@ class PhoneServer:
         policy = "default-src 'self'; img-src 'self' data: blob:; media-src 'self' blob:"
         headers = {"Content-Security-Policy": f"{policy}; base-uri 'none'; form-action 'none'"}
         live = "here" if request.secure else "elsewhere" if self._live_port else "no"
-        practice = f"avatars/{PRACTICE}/?start=lite&practice" if self._player else ""
-        text = text.replace("{{live}}", live).replace("{{practice}}", practice)
+        warm_up = f"avatars/{WARM_UP}/?start=lite&warm-up" if self._player else ""
+        text = text.replace("{{live}}", live).replace("{{warm_up}}", warm_up)
         return web.Response(text=text, content_type="text/html", headers=headers)
 
     async def _go_live(self, request: web.Request) -> web.Response:
@@ -241,7 +241,7 @@ class PhoneServer:
         if offset < 0 or not length or length > MAX_PIECE_BYTES:
             raise FilmRefused(413 if length else 400, "A piece has 1 byte to 8 MiB.")
         if film.file.ended:
-            raise FilmRefused(409, film.file.reason or "The film is whole.")
+            return self._progress(film)
         async with asyncio.timeout(PIECE_TIMEOUT_S):
             async for content, _ in request.content.iter_chunks():
                 await asyncio.to_thread(film.write, offset, content)
@@ -311,9 +311,9 @@ class PhoneServer:
             kind = MIME_TYPES.get(Path(file).suffix, "application/octet-stream")
             body = titled(body, name) if file == "index.html" else body
             return web.Response(body=body, headers={"Content-Type": kind})
-        if name == PRACTICE:
-            self._practice = self._practice or await asyncio.to_thread(_practice_package)
-            return web.Response(body=self._practice)
+        if name == WARM_UP:
+            self._warm_up = self._warm_up or await asyncio.to_thread(_warm_up_package)
+            return web.Response(body=self._warm_up)
         film = next((film for film in self._queue if film.place.name == name), None)
         if film is not None:
             with self._listening(film) as woken:
@@ -344,10 +344,10 @@ def _player_files() -> dict[str, bytes]:
     return player_files(motion, pose_rate(motion), compression_level=1)
 
 
-def _practice_package() -> bytes:
+def _warm_up_package() -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / PACKAGE_FILE
-        write_practice_package(path)
+        write_warm_up_package(path)
         return path.read_bytes()
 
 

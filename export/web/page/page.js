@@ -31,7 +31,7 @@ export function start() {
     loading.done();
     if (state.tier !== "hq") tryFull(player, state, avatar.playback);
   });
-  if (options.has("practice")) { // out of sight: draws one coarse picture and one sharp one
+  if (options.has("warm-up")) { // out of sight: draws one coarse picture and one sharp one
     avatar.toggleAttribute("paused", true);
     state.chosen = true;
     avatar.seen(true);

@@ -191,9 +191,9 @@ function open(name, note, final = false) {
 
 addEventListener("message", ({ source, origin, data }) => {
   if (origin !== location.origin || data !== "drawn") return;
-  if (source === $("practice")?.contentWindow) return;
+  if (source === $("warm-up")?.contentWindow) return;
   $("poster").hidden = true;
-  $("practice")?.remove(); // the others share what it has compiled
+  $("warm-up")?.remove(); // the others share what it has compiled
   const finer = document.querySelector(".coming");
   if (finer?.contentWindow !== source) return;
   $("player").remove();

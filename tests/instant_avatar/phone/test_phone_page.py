@@ -11,6 +11,7 @@ import pytest
 from capture.input_error import InputError
 from capture.source_opening import open_source
 from export import player_page
+from instant_avatar.phone import film_queue
 from instant_avatar.phone.access_control import AccessControl, made_certificate
 from instant_avatar.phone.film_queue import FilmQueue
 from instant_avatar.phone.phone_server import PhoneServer
@@ -19,6 +20,10 @@ from tests.instant_avatar.browser import Browser, chromium, until
 
 pytest.importorskip("aiohttp")
 pytest.importorskip("segno")
+
+
+PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACwAAAAAAQABAAAC"
+"""A picture of one pixel."""
 
 
 def has_runtime():
@@ -73,7 +78,9 @@ def test_the_plain_page_leads_to_that_with_tls_and_opens_again_after_it(tmp_path
                 server.close()
 
 
-def test_the_page_stays_with_what_a_person_looks_at(run, tmp_path):
+@pytest.fixture
+def page(run, tmp_path):
+    """A page of 360 px with an earlier avatar, Anna, and the queue of its films."""
     queue, access = FilmQueue(tmp_path / "out", 30.0), AccessControl()
     (queue.folder / "Anna" / "run").mkdir(parents=True)
     shutil.copy(run / "avatar.iavatar", queue.folder / "Anna" / "run")
@@ -83,39 +90,92 @@ def test_the_page_stays_with_what_a_person_looks_at(run, tmp_path):
         browser.emulate(scheme="light", size=(360, 740))
         browser.go(f"http://127.0.0.1:8745/?token={access.token}")
         until(lambda: "Anna" in browser.text(), 60.0)
-        browser.run(
-            """(() => {
-              const held = new DataTransfer();
-              held.items.add(new File(["film"], "film.mp4", { type: "video/mp4" }));
-              const input = document.getElementById("stored");
-              input.files = held.files;
-              input.dispatchEvent(new Event("change"));
-            })()"""
-        )
-        film = queue.take_next(60.0)
-        until(lambda: "Making the avatar" in browser.text(), 60.0)
-        assert browser.run("document.getElementById('poster').hidden")  # there is no picture yet
-        film.run.path.mkdir()
-        shutil.copy(run / "avatar.iavatar", film.run.path)
-        film.tell("warning", text="The phone fell silent.")
-        film.tell("avatar", name=film.place.name, final=False)
-        until(lambda: "It can be played" in browser.text(), 60.0)
-        until(lambda: not browser.run("!!document.getElementById('practice')"), 120.0)  # drawn
-        assert "The phone fell silent." in browser.text()
-        bottom = "document.getElementById('warning').getBoundingClientRect().bottom"
-        assert browser.run(f"{bottom} <= innerHeight")
-        browser.click("Another person")
-        until(lambda: browser.run("document.querySelectorAll('#avatars button').length") == 1, 60.0)
-        browser.click("Anna")
-        until(lambda: browser.run("document.getElementById('title').textContent") == "Anna", 60.0)
-        film.tell("progress", text="scoring", share=0.5)
-        film.tell("avatar", name=film.place.name, final=True)
-        film.tell("advice", text="last", time=0.0)
-        until(lambda: browser.run("document.getElementById('advice').textContent") == "last", 60.0)
-        assert browser.run("document.getElementById('title').textContent") == "Anna"
-        assert "scoring" not in browser.text()
-        assert "fell silent" not in browser.text()
+        yield browser, queue
     server.close()
+
+
+def choose_video(browser, size=4):
+    """A person chooses a file of `size` bytes."""
+    browser.run(
+        f"""(() => {{
+          const held = new DataTransfer();
+          held.items.add(new File([new Uint8Array({size})], "film.mp4", {{ type: "video/mp4" }}));
+          const input = document.getElementById("stored");
+          input.files = held.files;
+          input.dispatchEvent(new Event("change"));
+        }})()"""
+    )
+
+
+def text_of(browser, name):
+    return browser.run(f"document.getElementById('{name}').textContent")
+
+
+def test_the_page_stays_with_what_a_person_looks_at(page, run):
+    browser, queue = page
+    choose_video(browser)
+    film = queue.take_next(60.0)
+    until(lambda: "Making the avatar" in browser.text(), 60.0)
+    assert browser.run("document.getElementById('poster').hidden")  # there is no picture yet
+    film.tell("preview", image=PIXEL)
+    until(lambda: not browser.run("document.getElementById('poster').hidden"), 60.0)
+    film.run.path.mkdir()
+    shutil.copy(run / "avatar.iavatar", film.run.path)
+    film.tell("warning", text="The phone fell silent.")
+    film.tell("avatar", name=film.place.name, final=False)
+    until(lambda: "It can be played" in browser.text(), 60.0)
+    until(lambda: not browser.run("!!document.getElementById('warm-up')"), 120.0)  # drawn
+    assert "The phone fell silent." in browser.text()
+    bottom = "document.getElementById('warning').getBoundingClientRect().bottom"
+    assert browser.run(f"{bottom} <= innerHeight")
+    browser.click("Another person")
+    until(lambda: browser.run("document.querySelectorAll('#avatars button').length") == 1, 60.0)
+    browser.click("Anna")
+    until(lambda: text_of(browser, "title") == "Anna", 60.0)
+    film.tell("progress", text="scoring", share=0.5)
+    film.tell("avatar", name=film.place.name, final=True)
+    film.tell("state", state="done")
+    film.tell("advice", text="last", time=0.0)
+    until(lambda: text_of(browser, "advice") == "last", 60.0)
+    assert text_of(browser, "title") == "Anna"
+    assert text_of(browser, "note") == ""  # all of these were of the other avatar
+    assert "fell silent" not in browser.text()
+
+
+def test_a_full_disk_ends_the_film_by_name_and_its_avatar_is_made(page, monkeypatch):
+    browser, queue = page
+    free = shutil.disk_usage(queue.folder)
+
+    def usage(place):
+        return free._replace(free=0 if any(film.file.received for film in queue) else 1 << 40)
+
+    monkeypatch.setattr(film_queue.shutil, "disk_usage", usage)
+    choose_video(browser, size=5_000_000)
+    film = queue.take_next(60.0)
+    until(lambda: "The disk of the computer is full: the film ends here." in browser.text(), 60.0)
+    assert "Making the avatar" in browser.text()
+    assert 0 < film.file.path.stat().st_size < 5_000_000
+
+
+def test_a_film_that_the_computer_has_ended_says_why_and_its_avatar_is_made(page):
+    browser, queue = page
+    choose_video(browser)
+    until(lambda: list(queue), 60.0)
+    next(iter(queue)).file.end("The phone fell silent for 30 s: the film ends here.")
+    queue.take_next(60.0)
+    until(lambda: "The phone fell silent for 30 s" in browser.text(), 60.0)
+    assert "Making the avatar" in browser.text()
+
+
+def test_a_film_begins_without_the_figures_of_the_one_before(page):
+    browser, queue = page
+    choose_video(browser)
+    queue.take_next(60.0)
+    until(lambda: "0.0 MB sent" in text_of(browser, "sent"), 60.0)
+    until(lambda: "Making the avatar" in browser.text(), 60.0)
+    choose_video(browser)
+    until(lambda: "Waiting for avatar" in browser.text(), 60.0)
+    assert text_of(browser, "sent") == ""
 
 
 def test_a_film_of_the_pages_camera_becomes_an_avatar_in_its_player(camera_film, tmp_path):

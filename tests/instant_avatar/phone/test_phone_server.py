@@ -7,6 +7,7 @@ import shutil
 import time
 import zlib
 from concurrent.futures import ThreadPoolExecutor
+from urllib.parse import quote
 
 import pytest
 
@@ -23,6 +24,7 @@ from instant_avatar.phone.access_control import (
     made_certificate,
 )
 from instant_avatar.phone.film_queue import FilmQueue
+from instant_avatar.phone.phone_command import CaptureOptions
 from instant_avatar.phone.phone_server import PhoneServer
 
 CONTENT = bytes(range(256)) * 40
@@ -136,6 +138,7 @@ def test_malformed_and_oversized_pieces_are_refused(phone, query, size, status):
     [
         ({"type": "text/html"}, 415),
         ({"size": 1 << 40}, 413),
+        ({"size": 0}, 413),
         ({"size": -1}, 413),
         ({"size": "many"}, 400),
         ({"avatar": "../../etc"}, 404),
@@ -208,6 +211,9 @@ def test_a_silent_phone_ends_its_film_by_name(phone, queue):
     queue.end_silent()
     assert film.file.ended
     assert "fell silent" in film.file.reason
+    late = phone.ask("PUT", f"/films/{film.number}?offset=0", b"late")
+    assert json.loads(late.content)["reason"] == film.file.reason
+    assert film.file.received == 0
 
 
 def test_films_wait_for_those_before_them_by_name(phone, queue):
@@ -240,6 +246,13 @@ def test_a_certificate_is_made_for_an_address_or_a_name(address, monkeypatch):
     assert usage == ExtendedKeyUsageOID.SERVER_AUTH  # Apple's systems ask for it
 
 
+@pytest.mark.parametrize("seconds", [9.9, float("nan"), float("inf")])
+def test_a_phone_may_be_silent_for_as_long_as_the_page_counts_down(tmp_path, seconds):
+    CaptureOptions(out=tmp_path, silent_seconds=10.0).validate()
+    with pytest.raises(InputError, match="at least 10"):
+        CaptureOptions(out=tmp_path, silent_seconds=seconds).validate()
+
+
 def test_what_is_no_certificate_is_bad_input(tmp_path):
     path = tmp_path / "notes.pem"
     path.write_text("notes")
@@ -253,6 +266,17 @@ def anna(queue, run):
     place = queue.folder / "Anna" / "run"
     place.mkdir(parents=True)
     shutil.copy(run / "avatar.iavatar", place)
+
+
+@pytest.mark.slow
+def test_an_avatar_is_saved_under_a_name_in_any_script(phone, queue, run):
+    place = queue.folder / "Zoë-さくら" / "run"
+    place.mkdir(parents=True)
+    shutil.copy(run / "avatar.iavatar", place)
+    name = quote("Zoë-さくら")
+    answer = phone.ask("GET", f"/avatars/{name}/avatar.iavatar")
+    saved = f"attachment; filename*=UTF-8''{name}.iavatar"
+    assert answer.headers["Content-Disposition"] == saved
 
 
 @pytest.mark.slow
@@ -285,10 +309,10 @@ def test_the_player_waits_for_the_package_that_a_film_makes(phone, queue, run):
 
 @pytest.mark.slow
 def test_the_players_module_is_served_once_for_all_avatars(phone, anna):
-    practice = re.search(r'src="(avatars/-/[^"]+)"', phone.ask("GET", "/").content.decode())
-    if practice is None:
+    warm_up = re.search(r'src="(avatars/-/[^"]+)"', phone.ask("GET", "/").content.decode())
+    if warm_up is None:
         pytest.skip("onnxruntime-web is not here (make web)")
-    assert phone.ask("GET", f"/{practice[1]}").status == 200
+    assert phone.ask("GET", f"/{warm_up[1]}").status == 200
     answer = phone.ask("GET", "/avatars/Anna/runtime/ort.wasm.zlib")
     assert answer.status == 302
     path = answer.headers["Location"].removeprefix("../../../")
