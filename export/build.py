@@ -71,6 +71,10 @@ BAKING_PROGRESS = 0.25
 """Fraction of an export's time after which baking is done."""
 FINE_TUNING_PROGRESS = 0.55
 """Fraction of an export's time that fine-tuning takes; the rest are the checks."""
+DRAFT_COARSENESS = 1.5
+"""Voxels and surfels of a draft, in those of a checked package: 0.7 core-s instead of 2.1 and half
+the bytes for 0.6 dB to the renderer (37.6 instead of 38.2, where the avatar is 25 dB from the
+film)."""
 INTERRUPTED_WARNING = (
     "Fine-tuning was interrupted: the package holds the bricks as they were baked, and looks about "
     "half a decibel less like the avatar. ia-export does it all again."
@@ -144,12 +148,17 @@ def export_avatar(
 def write_draft(avatar: Avatar, path: Path, view: PosedView) -> None:
     """Write an avatar's package as baked, unchecked, without scores and golden frames.
 
-    It can be played half as long after training as a checked one. `view` is the preview.
+    It is baked coarser, so that it can be played soonest. `view` is the preview.
 
     Raises:
         ExportRefused: If there is nothing to draw.
     """
     config = BakeConfig.for_sample_step(avatar.sample_step_m)
+    config = replace(
+        config,
+        voxel_m=DRAFT_COARSENESS * config.voxel_m,
+        surfel_spacing_m=DRAFT_COARSENESS * config.surfel_spacing_m,
+    )
     occupied = avatar.rendering_grid().occupied.numpy()
     grid = sample_field(avatar.color_and_density_at, avatar.rig, occupied=occupied, config=config)
     with ThreadPoolExecutor(2) as executor, PackageWriter(path, level=1) as writer:

@@ -46,10 +46,10 @@ HEARTBEAT_S = 5.0
 WARM_UP = "-"
 """Name of an avatar of two points, which the page's hidden player draws before a film: the browser
 has then compiled what draws the film's avatar. Names of films do not end in a dash."""
-MESHES = ("avatar.glb", "avatar.vrm", "avatar.ply", "avatar.obj")
-"""Meshes that the page offers."""
+EXPORTS = ("avatar.glb", "avatar.vrm", "avatar.spz", "avatar.ply", "avatar.obj")
+"""Files for other programs that the page offers: meshes, and splats (.spz)."""
 MESH_TRIANGLES = 20_000
-"""Triangles of each."""
+"""Triangles of a mesh."""
 MAX_AUTHOR_LENGTH = 80
 """Longest author that a VRM names, characters."""
 HEADERS = {
@@ -84,7 +84,7 @@ class PhoneServer:
         self._player: dict[str, bytes] = {}
         self._warm_up = b""
         self._requests: dict[str, deque[float]] = {}
-        self._exporting = asyncio.Lock()  # meshes are costly: one at a time
+        self._exporting = asyncio.Lock()  # exports are costly: one at a time
         self._listeners: dict[str, set[asyncio.Event]] = {}
         self._app = web.Application(client_max_size=MAX_PIECE_BYTES, middlewares=[self._guard])
         self._app.add_routes(
@@ -296,14 +296,14 @@ class PhoneServer:
         return web.json_response(self._queue.avatars())
 
     async def _avatar(self, request: web.Request) -> web.StreamResponse:
-        """A file of an avatar's player page, its poster, its package, or a mesh of it.
+        """A file of an avatar's player page, its poster, its package, or a file for other programs.
 
         The package that a film in progress makes is waited for: its player starts meanwhile.
         """
         name, file = request.match_info["name"], request.match_info["file"] or "index.html"
         if file == WEB_MODULE:  # one module for all avatars
             return web.Response(status=302, headers={"Location": f"../../../runtime/{MODULE_FILE}"})
-        if file not in (PACKAGE_FILE, "poster.png", *MESHES):
+        if file not in (PACKAGE_FILE, "poster.png", *EXPORTS):
             self._player = self._player or _player_files()
             if file not in self._player:
                 raise InputError("There is no such file.")
@@ -330,7 +330,7 @@ class PhoneServer:
             return web.Response(body=content, content_type="image/png")
         author = request.query.get("author", "").strip()[:MAX_AUTHOR_LENGTH]
         async with self._exporting:
-            content = await asyncio.to_thread(_mesh, package, file, author)
+            content = await asyncio.to_thread(_exported, package, file, author)
         return web.Response(body=content, headers=saved)
 
 
@@ -351,14 +351,13 @@ def _warm_up_package() -> bytes:
         return path.read_bytes()
 
 
-def _mesh(package: Path, file: str, author: str) -> bytes:
-    """A mesh of an avatar, as ia-export writes it; a VRM names its author."""
+def _exported(package: Path, file: str, author: str) -> bytes:
+    """A file of an avatar for other programs, as ia-export writes it; a VRM names its author."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / file
-        to: Any = out.suffix[1:]
+        to: Any = "splats" if out.suffix == ".spz" else out.suffix[1:]
         named = author if author and to == "vrm" else None
-        chosen = ExportArguments(
-            run=package, to=to, out=out, triangles=MESH_TRIANGLES, author=named
-        )
+        triangles = None if to == "splats" else MESH_TRIANGLES
+        chosen = ExportArguments(run=package, to=to, out=out, triangles=triangles, author=named)
         export(chosen, Console())
         return out.read_bytes()

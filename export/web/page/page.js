@@ -29,7 +29,7 @@ export function start() {
     window.player = player; // for scripts: verify(), measure()
     markPlaying(state);
     loading.done();
-    if (state.tier !== "hq") tryFull(player, state, avatar.playback);
+    if (state.tier !== "hq") tryFull(player, state, avatar.playback, loading);
   });
   if (options.has("warm-up")) { // out of sight: draws one coarse picture and one sharp one
     avatar.toggleAttribute("paused", true);
@@ -43,10 +43,12 @@ export function start() {
 }
 
 /** Change from Lite to Full once the device has shown that it draws fast enough, unless a tier was chosen. */
-function tryFull(player, state, playback) {
+function tryFull(player, state, playback, loading) {
   setTimeout(async () => {
     if (state.chosen || playback.typicalMs() * FULL_COSTS > QUICK_MS) return;
-    await player.open({ tier: "hq" });
+    const opened = player.open({ tier: "hq" });
+    loading.done(); // there is a picture meanwhile
+    await opened;
     if (state.chosen) return;
     state.tier = "hq";
     playback.changed();

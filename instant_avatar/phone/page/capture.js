@@ -14,6 +14,16 @@ function view(name) {
   scrollTo(0, 0);
 }
 
+/** Offer to film a new person, or more of one whose avatar exists. */
+function home(name = "") {
+  adding = name;
+  $("adding").textContent = `The next film is added to ${name}.`;
+  $("back").textContent = `Back to ${name}`;
+  $("adding").hidden = $("back").hidden = !name;
+  $("naming").hidden = Boolean(name);
+  view("home");
+}
+
 function warn(text) {
   $("warning").textContent = text;
   $("warning").hidden = false;
@@ -31,7 +41,7 @@ function say(text) {
 /** Begin a film and listen to what the server tells of it; resolves when it is this film's turn. */
 async function begin(type, size) {
   view("filming");
-  $("map").replaceChildren(); $("preview").hidden = true; $("preview").removeAttribute("src"); $("seen").textContent = $("sent").textContent = ""; $("progress").value = 0;
+  $("map").replaceChildren(); $("preview").hidden = true; $("preview").removeAttribute("src"); $("seconds").textContent = $("seen").textContent = $("sent").textContent = ""; $("progress").value = 0;
   const body = JSON.stringify({ name: $("name").value, type, size, avatar: adding });
   const { film, avatar } = await ask("films", { method: "POST", body });
   making = avatar;
@@ -42,7 +52,7 @@ async function begin(type, size) {
     $("seconds").textContent = `${seconds.toFixed(0)} s looked at`;
     if (making && making === shown) $("note").textContent = `Making the avatar: ${$("seconds").textContent} …`; // a stored film
   });
-  on("map", ({ svg, seen }) => { $("map").innerHTML = svg; $("seen").textContent = ` · ${Math.round(100 * seen)} % of you seen`; });
+  on("map", ({ svg, seen }) => { $("map").innerHTML = svg; $("seen").textContent = `${Math.round(100 * seen)} % of you seen`; });
   on("preview", ({ image }) => {
     $("preview").src = image; $("preview").hidden = false;
     if (making && making === shown) Object.assign($("poster"), { src: image, hidden: false });
@@ -56,7 +66,7 @@ async function begin(type, size) {
     making = "";
     open(name, final ? "It is ready." : "It can be played; finer detail follows.", final);
   });
-  on("failed", ({ text }) => { making = shown = ""; finish(); view("home"); warn(text); });
+  on("failed", ({ text }) => { making = shown = ""; finish(); home(); warn(text); });
   on("over", () => { events.close(); listEarlier(); });
   await new Promise((resolve) => on("state", ({ state, behind }) => {
     if (state === "waiting") say(`Waiting for ${behind.join(", ")} …`);
@@ -96,14 +106,14 @@ async function upload(file) {
     say("Learning while the film arrives …");
     await transfer(film, new Stored(file));
   } catch (error) {
-    view("home");
+    home(adding);
     warn(error.message);
   }
 }
 
 async function openCamera() {
   finish();
-  const video = { facingMode: facing, width: { ideal: 1280 }, height: { ideal: 720 }, frameRate: { ideal: 30 } };
+  const video = { facingMode: facing, width: { ideal: 1280 }, height: { ideal: 720 }, frameRate: { ideal: 30 }, resizeMode: "none" }; // not cropped
   stream = await navigator.mediaDevices.getUserMedia({ video, audio: false });
   $("camera").srcObject = stream;
   $("camera").classList.toggle("front", facing === "user");
@@ -136,7 +146,7 @@ async function live() {
     await record(film, type);
   } catch (error) {
     finish();
-    view("home");
+    home(adding);
     warn(error.name === "NotAllowedError" ? "The camera may not be used: allow it in the browser's settings for this page." : error.message);
   }
 }
@@ -160,6 +170,7 @@ function open(name, note, final = false) {
   adding = "";
   const address = `avatars/${encodeURIComponent(name)}/`, isFirst = $("done").hidden || shown !== name;
   $("offers").inert = Boolean(making);
+  $("player").classList.toggle("early", Boolean(making)); // it waits for the package
   if (isFirst) {
     view("done");
     $("poster").hidden = Boolean(making) && !$("preview").src;
@@ -175,18 +186,14 @@ function open(name, note, final = false) {
   shown = name;
   $("title").textContent = name;
   $("note").textContent = note;
-  for (const [id, file] of [["package", "avatar.iavatar"], ["glb", "avatar.glb"], ["ply", "avatar.ply"], ["obj", "avatar.obj"]]) {
+  for (const [id, file] of [["package", "avatar.iavatar"], ["glb", "avatar.glb"], ["spz", "avatar.spz"], ["ply", "avatar.ply"], ["obj", "avatar.obj"]]) {
     $(id).href = address + file;
   }
   $("author").oninput = () => { $("vrm").href = `${address}avatar.vrm?author=${encodeURIComponent($("author").value)}`; };
   $("author").oninput();
   $("share").onclick = () => share(name);
-  $("more").onclick = () => {
-    adding = name;
-    $("adding").textContent = `The next film is added to ${name}.`;
-    $("adding").hidden = false;
-    view("home");
-  };
+  $("more").onclick = () => home(name);
+  $("back").onclick = () => open(name, "");
 }
 
 addEventListener("message", ({ source, origin, data }) => {
@@ -225,7 +232,7 @@ $("file").onchange = () => upload($("file").files[0]);
 $("stored").onchange = () => upload($("stored").files[0]);
 $("live").onclick = live;
 $("turn").onclick = () => { facing = facing === "user" ? "environment" : "user"; openCamera().catch((error) => warn(error.message)); };
-$("again").onclick = () => { adding = ""; $("adding").hidden = true; $("name").value = ""; view("home"); };
+$("again").onclick = () => { $("name").value = ""; home(); };
 $("live").hidden = document.documentElement.dataset.live === "no" && !window.isSecureContext;
 $("why").hidden = document.documentElement.dataset.live !== "elsewhere" || window.isSecureContext;
 for (const kind of ["dragover", "dragleave", "drop"]) {

@@ -19,7 +19,7 @@ from export import player_page
 from export.package.package_file import read_package
 from export.player import PictureDifference, Player, premultiply
 from export.player_inputs import graph_initializers
-from instant_avatar.animation.driving_motion import FollowingCamera
+from instant_avatar.animation.driving_motion import FollowingCamera, demo_motion
 from instant_avatar.animation.web_server import make_server
 from preprocess.poses.pose_format_registry import read_poses
 from tests.instant_avatar.browser import Browser, chromium, until
@@ -304,6 +304,28 @@ def test_what_is_too_near_for_surfels_is_drawn_with_fewer_pixels(page):
     )
     assert far == beside == 2000
     assert 500 < near < 1800
+
+
+@with_runtime
+@with_chromium
+@pytest.mark.slow
+def test_full_replaces_lite_without_a_word_where_the_device_is_fast(package, tmp_path):
+    page = player_page.build_page(package, demo_motion(), 30.0, name="x", compression_level=1)
+    playback = page["playback.js"]
+    page["playback.js"] = playback.replace(b"QUICK_MS = 45", b"QUICK_MS = 1e9")
+    assert page["playback.js"] != playback
+    server = make_server(page, 8095)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    with Browser(tmp_path, size=(360, 400)) as browser:
+        browser.emulate(scheme="light", size=(360, 400))
+        browser.go(f"http://127.0.0.1:{server.server_port}/?start=lite")
+        chosen = "document.querySelector('#tiers input:checked')?.value"
+        until(lambda: browser.run(chosen) == "lite", 60.0)
+        assert browser.run("document.getElementById('status').hidden")
+        until(lambda: browser.run(chosen) == "hq", 120.0)
+        assert browser.run("document.getElementById('status').hidden")
+    server.shutdown()
+    server.server_close()
 
 
 @with_runtime

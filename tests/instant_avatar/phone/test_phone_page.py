@@ -117,6 +117,7 @@ def test_the_page_stays_with_what_a_person_looks_at(page, run):
     film = queue.take_next(60.0)
     until(lambda: "Making the avatar" in browser.text(), 60.0)
     assert browser.run("document.getElementById('poster').hidden")  # there is no picture yet
+    assert browser.run("getComputedStyle(document.getElementById('player')).opacity") == "0"
     film.tell("preview", image=PIXEL)
     until(lambda: not browser.run("document.getElementById('poster').hidden"), 60.0)
     film.run.path.mkdir()
@@ -128,7 +129,13 @@ def test_the_page_stays_with_what_a_person_looks_at(page, run):
     assert "The phone fell silent." in browser.text()
     bottom = "document.getElementById('warning').getBoundingClientRect().bottom"
     assert browser.run(f"{bottom} <= innerHeight")
+    browser.click("Film more")
+    assert "The next film is added to avatar." in browser.text()
+    assert browser.run("document.getElementById('name').offsetParent === null")  # it has its name
+    browser.click("Back to avatar")
+    assert text_of(browser, "title") == "avatar"
     browser.click("Another person")
+    assert "The next film is added" not in browser.text()
     until(lambda: browser.run("document.querySelectorAll('#avatars button').length") == 1, 60.0)
     browser.click("Anna")
     until(lambda: text_of(browser, "title") == "Anna", 60.0)
@@ -198,6 +205,9 @@ def test_a_film_of_the_pages_camera_becomes_an_avatar_in_its_player(camera_film,
             assert browser.run("crossOriginIsolated")
             browser.run("document.getElementById('name').value = 'Anna'")
             browser.run("document.getElementById('live').click()")
+            size = "[document.getElementById('camera').videoWidth,"
+            size += " document.getElementById('camera').videoHeight]"
+            until(lambda: browser.run(size) == [240, 426], 60.0)  # nothing is cut off
             until(lambda: "seen" in browser.text(), 600.0)
             assert browser.run("document.documentElement.scrollWidth") <= 360
             until(lambda: browser.run("!document.getElementById('preview').hidden"), 600.0)

@@ -1,5 +1,6 @@
 """The phone page's server, with clients that are slow, broken or hostile; nothing is trained."""
 
+import gzip
 import http.client
 import json
 import re
@@ -288,6 +289,13 @@ def test_an_avatar_is_saved_as_vrm_with_the_author_who_was_named(phone, anna):
         length = int.from_bytes(answer.content[12:16], "little")
         scene = json.loads(answer.content[20 : 20 + length])
         assert scene["extensions"]["VRMC_vrm"]["meta"]["authors"] == [author]
+
+
+@pytest.mark.slow
+def test_an_avatar_is_saved_as_splats(phone, anna):
+    answer = phone.ask("GET", "/avatars/Anna/avatar.spz")
+    assert answer.status == 200
+    assert gzip.decompress(answer.content).startswith(b"NGSP")
 
 
 @pytest.mark.slow
