@@ -7,6 +7,7 @@ and another thread or program reads the frames as far as they have come.
 import json
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, final
 
@@ -75,7 +76,8 @@ class ReceivedFile:
     def end(self, reason: str = "") -> None:
         """Expect no more; what has come is read."""
         self._ended, self.reason = True, self.reason or reason
-        self._write_note()
+        with suppress(OSError):  # of a full disk; readers then wait for their time without a byte
+            self._write_note()
 
     def next_offset(self) -> int:
         """Where the piece that is of most use begins: the index of a video, else its first gap."""

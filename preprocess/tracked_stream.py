@@ -56,7 +56,7 @@ LOOK_INTERVAL_S = 0.3
 POLL_S = 0.01
 """Interval at which it looks for room, seconds."""
 KEPT_BYTES = 160 << 20
-"""Memory for skipped frames."""
+"""Memory for skipped frames, until enough others are tracked."""
 LEAST_FRAMES = 40
 """Frames that are tracked; where fewer were in time, skipped ones follow, while a user waits."""
 FoundPerson = tuple[Frame, PersonKeypoints | None]
@@ -177,7 +177,14 @@ class TrackedStream(WrappedSource):
     def _look(self, found: FoundPerson) -> None:
         self._last_s, self._taken = max(self._last_s, found[0].time_s), self._taken + 1
         self._waiting.append(found[0])
+        if self._taken >= LEAST_FRAMES:
+            self._skipped.take(0)
         self.on_frame(*found)
+
+    def _skip(self, frame: Frame) -> None:
+        """Keep a frame that was not tracked in time, unless enough others were."""
+        if self._taken < LEAST_FRAMES:
+            self._skipped.add(frame)
 
     def close(self) -> None:
         """End the source and the threads that read it."""
@@ -188,16 +195,14 @@ class TrackedStream(WrappedSource):
 
     def _found(self) -> Iterator[FoundPerson]:
         """Track the newest frame again and again, then skipped ones; on the tracker's thread."""
-        self._decoded = Inbox(
-            self._counted(), capacity=1, live=self.skippable, on_drop=self._skipped.add
-        )
+        self._decoded = Inbox(self._counted(), capacity=1, live=self.skippable, on_drop=self._skip)
         last_s = -np.inf
         for frame in self._decoded.items(max_items=1):
             if frame.due_s is not None and frame.time_s - last_s < MIN_INTERVAL_S:
                 continue
             last_s, found = frame.time_s, self.search(frame, True)
             if self.skippable and not self._has_room():
-                self._skipped.add(frame)
+                self._skip(frame)
             else:
                 self._skipped.mark(frame.time_s)
                 yield frame, found

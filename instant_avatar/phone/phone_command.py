@@ -203,8 +203,11 @@ def _learn(options: CaptureOptions, film: "Film", console: Console) -> int:
         if not is_disk_full(error):
             raise
         code = DONE
-        console.warning(f"{film.place.name}: the disk is full. What was learnt is kept.")
-        film.tell("failed", text="The disk of the computer is full. What was learnt is kept.")
+        console.warning(f"{film.place.name}: the disk is full. Film and run are kept.")
+        film.tell(
+            "failed",
+            text="The disk of the computer is full: free some space. Film and run are kept.",
+        )
     return code
 
 

@@ -41,6 +41,11 @@ export class Stored {
 
 export class Refused extends Error {}
 
+async function refusal(answer) {
+  const { message } = await answer.json().catch(() => ({}));
+  return new Refused(message ?? `The computer answered with error ${answer.status}: its terminal says more.`);
+}
+
 const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
 
 /** Ask the server until it answers; a refusal is an error, a broken connection is not. */
@@ -51,9 +56,9 @@ export async function ask(path, options = {}) {
       answer = await fetch(path, options);
     } catch { /* the connection is broken */ }
     if (answer && answer.ok) return answer.json();
-    if (answer && answer.status !== 429 && answer.status < 502) throw new Refused((await answer.json()).message);
+    if (answer && answer.status !== 429 && answer.status < 502) throw await refusal(answer);
     if (options.once) return null;
-    if (answer && answer.status === 507) throw new Refused((await answer.json()).message);
+    if (answer && answer.status === 507) throw await refusal(answer);
     await pause(wait);
   }
 }

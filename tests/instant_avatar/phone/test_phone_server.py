@@ -1,5 +1,6 @@
 """The phone page's server, with clients that are slow, broken or hostile; nothing is trained."""
 
+import errno
 import gzip
 import http.client
 import json
@@ -17,6 +18,7 @@ pytest.importorskip("aiohttp")
 from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
+from capture import received_video
 from capture.input_error import InputError
 from instant_avatar.phone import access_control, film_queue, phone_server
 from instant_avatar.phone.access_control import (
@@ -203,6 +205,20 @@ def test_a_full_disk_ends_the_film_and_keeps_what_came(phone, queue, monkeypatch
     assert state["ended"]
     assert "disk" in state["reason"]
     assert state["received"] == 1000
+
+
+def test_a_disk_without_room_for_a_note_ends_the_film_by_name(phone, queue, monkeypatch, caplog):
+    film = phone.begin()
+
+    def fail(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(received_video, "write_text_atomically", fail)
+    answer = phone.ask("PUT", f"/films/{film}?offset=0", CONTENT[:1000])
+    assert answer.status == 507
+    assert "disk" in json.loads(answer.content)["message"]
+    assert json.loads(phone.ask("GET", f"/films/{film}").content)["ended"]
+    assert caplog.records == []  # no traceback
 
 
 def test_a_silent_phone_ends_its_film_by_name(phone, queue):
