@@ -78,12 +78,12 @@ def encode_camera(source: Path, out: Path, count: int) -> None:
         camera.mux(stream.encode())
 
 
-def film(place: Path, camera: Path, seconds: float) -> tuple[float, float, float, float, float]:
+def film(place: Path, camera: Path, seconds: float) -> tuple[float, float, float, float]:
     """Film once.
 
     Returns:
         Wall seconds from Stop to the package's first byte and to a picture of it; CPU seconds of
-        ia-capture and of the browser meanwhile; dB held out.
+        ia-capture meanwhile; dB held out.
     """
     options = ["--no-tls", "--host", "127.0.0.1", "--port", "8420", "--out", str(place / "avatars")]
     program = [*command("phone.phone_command"), *options]
@@ -100,26 +100,25 @@ def film(place: Path, camera: Path, seconds: float) -> tuple[float, float, float
                 browser.run("document.getElementById('live').click()")
                 until(lambda: browser.run("!document.getElementById('stop').hidden"), 60.0)
                 time.sleep(seconds)
-                before = sum(process.cpu_times()[:2]), browser.cpu_seconds()
+                before = sum(process.cpu_times()[:2])
                 browser.run(LISTEN)
                 until(lambda: browser.run("!!window.drawnAt"), 300.0)
-                after = sum(process.cpu_times()[:2]), browser.cpu_seconds()
+                spent = sum(process.cpu_times()[:2]) - before
                 stopped, drawn = browser.run("[window.stoppedAt, window.drawnAt]")
                 package = browser.run(PACKAGE_AT)
         finally:
             server.send_signal(signal.SIGINT)
     report = json.loads((place / "avatars" / "film" / "run" / "report.json").read_text())
     waits = (package - stopped) / 1000.0, (drawn - stopped) / 1000.0
-    return *waits, after[0] - before[0], after[1] - before[1], report["held_out"]["psnr"]
+    return *waits, spent, report["held_out"]["psnr"]
 
 
-def marks(found: Float[np.ndarray, "films 5"], seconds: float) -> list[Measurement]:
+def marks(found: Float[np.ndarray, "films 4"], seconds: float) -> list[Measurement]:
     """The rows: medians, and all films beside them."""
     rows = [
         ("Stop to the first byte of the package, s", "", ""),
         ("Stop to a picture in the page, s", "≤ 6", "≤ 3"),
         ("CPU time of ia-capture meanwhile, s", "", ""),
-        ("CPU time of Chromium meanwhile, s", "", ""),
         ("held-out PSNR, dB", "", ""),
     ]
     return [

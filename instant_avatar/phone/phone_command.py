@@ -59,7 +59,7 @@ class CaptureOptions:
 
     out: Annotated[Path, arg(metavar="DIR")] = Path("avatars")
     """Folder for films and avatars."""
-    host: str = ""
+    host: Annotated[str, arg(metavar="ADDRESS", help_behavior_hint="")] = ""
     """Address to serve at (default: all of this machine; 127.0.0.1 for this machine only)."""
     port: int = 8010
     """Port of the page; the one after it has the page with TLS."""
@@ -140,6 +140,8 @@ def capture(options: CaptureOptions, console: Console) -> int:
                 f"The page cannot be served at {address}: {error.strerror}. Check --host, --port."
             )
         raise InputError(cause) from None
+    if server.missing_player:
+        console.warning(f"The page will film, but not play. {server.missing_player}")
     print_address()
     try:
         return _serve(options, queue, console)

@@ -74,12 +74,18 @@ REFUSED = (
 
 @final
 class PhoneServer:
-    """Serves the page on a thread of its own; `queue` is filled, others take from it."""
+    """Serves the page on a thread of its own; `queue` is filled, others take from it.
+
+    Attributes:
+        on_entered: Called when a browser has entered with a token.
+        missing_player: Why the page cannot play avatars, once it is served; empty if it can.
+    """
 
     def __init__(self, queue: FilmQueue, access: AccessControl, live_port: int | None) -> None:
         """Serve nothing yet; `live_port` is that of the page with TLS, if there is one."""
         self._queue, self._access, self._live_port = queue, access, live_port
         self.on_entered: Callable[[], object] = lambda: None
+        self.missing_player = ""
         self._loop = asyncio.new_event_loop()
         self._player: dict[str, bytes] = {}
         self._warm_up = b""
@@ -105,8 +111,10 @@ class PhoneServer:
 
     def start(self, host: str, sites: list[tuple[int, Any]]) -> None:
         """Serve at ports, each with a TLS context or None; raise an OSError if one is in use."""
-        with suppress(InputError):  # the player's page names what is missing
+        try:
             self._player = _player_files()
+        except InputError as error:
+            self.missing_player = str(error)
         runner = web.AppRunner(self._app, access_log=None, shutdown_timeout=1.0)
 
         async def listen() -> None:
@@ -183,9 +191,13 @@ class PhoneServer:
         text = (PAGE / "index.html").read_text(encoding="utf-8")
         policy = "default-src 'self'; img-src 'self' data: blob:; media-src 'self' blob:"
         headers = {"Content-Security-Policy": f"{policy}; base-uri 'none'; form-action 'none'"}
+        with suppress(InputError):  # it may have been fetched meanwhile
+            self._player = self._player or _player_files()
         live = "here" if request.secure else "elsewhere" if self._live_port else "no"
         warm_up = f"avatars/{WARM_UP}/?start=lite&warm-up" if self._player else ""
-        text = text.replace("{{live}}", live).replace("{{warm_up}}", warm_up)
+        player = "here" if self._player else "missing"
+        for name, value in (("live", live), ("warm_up", warm_up), ("player", player)):
+            text = text.replace(f"{{{{{name}}}}}", value)
         return web.Response(text=text, content_type="text/html", headers=headers)
 
     async def _go_live(self, request: web.Request) -> web.Response:

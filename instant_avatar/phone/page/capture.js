@@ -184,6 +184,9 @@ function open(name, note, final = false) {
     $("player").after(finer);
   }
   shown = name;
+  if (!making && document.documentElement.dataset.player === "missing") {
+    warn("This page cannot draw avatars yet: the terminal of the computer says what it needs. Reload the page then.");
+  }
   $("title").textContent = name;
   $("note").textContent = note;
   for (const [id, file] of [["package", "avatar.iavatar"], ["glb", "avatar.glb"], ["spz", "avatar.spz"], ["ply", "avatar.ply"], ["obj", "avatar.obj"]]) {

@@ -244,6 +244,21 @@ def test_films_wait_for_those_before_them_by_name(phone, queue):
     assert queue.take_next(1.0) is second
 
 
+def test_without_the_browsers_runtime_page_and_terminal_say_so(tmp_path, monkeypatch):
+    def fail():
+        raise InputError("The browser page needs onnxruntime-web.")
+
+    monkeypatch.setattr(phone_server, "_player_files", fail)
+    access = AccessControl()
+    server = PhoneServer(FilmQueue(tmp_path, 0.2), access, None)
+    server.start("127.0.0.1", [(0, None)])
+    page = Phone(server._runner.addresses[0][1], access).ask("GET", "/").content.decode()
+    server.close()
+    assert server.missing_player == "The browser page needs onnxruntime-web."
+    assert 'data-player="missing"' in page
+    assert "{{" not in page
+
+
 def test_too_many_requests_must_wait(phone, monkeypatch):
     monkeypatch.setattr(phone_server, "MAX_REQUESTS_PER_S", 1)
     assert 429 in [phone.ask("GET", "/avatars").status for _ in range(8)]
