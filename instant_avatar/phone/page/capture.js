@@ -11,6 +11,7 @@ let adding = "", making = "", facing = "environment", stream = null, shown = "",
 
 function view(name) {
   for (const id of ["home", "filming", "done"]) $(id).hidden = id !== name;
+  $(name).focus({ preventScroll: true }); // what was pressed is hidden
   scrollTo(0, 0);
 }
 
