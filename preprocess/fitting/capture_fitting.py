@@ -41,8 +41,6 @@ MAX_ITERATIONS = 12
 """Most Gauss-Newton iterations."""
 TRACKED_KEY_FRAMES = 300
 """Frames, evenly spread, whose masks are fitted together with key points."""
-TRACKED_FRAMES_PER_PRIOR = 30.0
-"""Frames that count as one for the proportions where key points see the joints, too."""
 KEYPOINT_ITERATIONS = 5
 """Iterations with key points alone, after which the body is near its outline."""
 TRACKED_ITERATIONS = 3
@@ -213,7 +211,6 @@ def make_fitter(capture: Capture) -> ClipFitter | None:
         space,
         frames,
         track=track,
-        frames_per_prior=TRACKED_FRAMES_PER_PRIOR,
         weights=TRACKED_WEIGHTS if samples else USUAL_WEIGHTS,
     )
 

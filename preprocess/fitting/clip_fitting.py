@@ -26,8 +26,6 @@ from preprocess.tracking.keypoints import KeypointTrack
 
 SIGMA_OUTLINE_PX = 1.0
 """Standard deviation of an outline's distance, px of the reduced masks."""
-FRAMES_PER_PRIOR = 10.0
-"""Frames of one person that count as one for the proportions: their clothes err alike."""
 SIGMA_LOG_FOCAL = 0.3
 """Prior standard deviation of the logarithm of the focal length: what files state is often the
 tracker's own guess (with 0.08 a stated one stays 1.25 times too short that is 1.38 times so)."""
@@ -110,7 +108,6 @@ class ClipFitter:
         track: KeypointTrack | None = None,
         settled: bool = False,
         sigma_log_focal: float = SIGMA_LOG_FOCAL,
-        frames_per_prior: float = FRAMES_PER_PRIOR,
         weights: EvidenceWeights = USUAL_WEIGHTS,
         model: OutlineModel | None = None,
     ) -> None:
@@ -122,14 +119,12 @@ class ClipFitter:
                 they are near the motion's.
             settled: Whether these poses were fitted to key points before.
             sigma_log_focal: Prior standard deviation of the focal length's logarithm.
-            frames_per_prior: Frames that count as one for the proportions.
             model: The person at the space's origin, where several clips share it.
         """
         self.frames = tuple(frames)
         self.model = model or OutlineModel(space)
         self._keypoint_model = KeypointModel(space)
-        seen = sum(frame.mask is not None for frame in frames) if track is None else len(frames)
-        self._priors, self.weights = max(1.0, seen / frames_per_prior), weights
+        self.weights = weights
         self.coefficients = np.zeros(space.count)
         self.log_focal, self._sigma_log_focal = 0.0, sigma_log_focal
         self.given = ClipPoses.of(motion, [frame.row for frame in self.frames])
@@ -138,6 +133,11 @@ class ClipFitter:
             [each.camera.camera_from_world[:3, :3] for each in self.frames]
         )
         numbers = np.array([frame.number for frame in self.frames])
+        masked = np.flatnonzero([frame.mask is not None for frame in self.frames])
+        telling = masked if track is None and len(masked) else np.arange(len(self.frames))
+        self._priors = len(telling) / self.given.rows(telling).independent_count(
+            space.shaped.joints, self.camera_rotations[telling]
+        )
         self._keypoints: ClipKeypoints | None = None
         if track is None:
             self._prior = GivenPosePrior(self.given, self.camera_rotations, numbers)

@@ -10,6 +10,7 @@ from typing import NamedTuple, final
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.distance import pdist
 from scipy.spatial.transform import Rotation
 
 from preprocess.body.body_pose import BodyPose, Motion
@@ -46,6 +47,12 @@ GUESSED_JOINTS = (10, 11, 22, 23)
 """Toes and hands."""
 TURN_FACTOR = 1.5
 """Standard deviation of a given rotation relative to the root, in `JOINT_SIGMAS_RAD`."""
+SHARED_ERROR = 0.5
+"""Share of the variance of a frame's errors that another frame of the same pose has, too: clothes
+and key points err alike in frames that are alike."""
+ALIKE_M = 0.1
+"""Distance of poses at which `SHARED_ERROR` has fallen by exp(-1/2): root mean square over the
+joints, in camera axes and from the root, metres."""
 UNUSUAL_TURN_RAD = 0.08
 """Root mean square of given axis-angles about their mean in `LEFT_PRIORS` and `MIDDLE_PRIORS` at
 which the prior counts a quarter, radians: what trackers err by, or else how this person moves."""
@@ -96,6 +103,11 @@ class ClipPoses:
             joint_rotations=turned[1:],
         )
 
+    def rows(self, rows: Sequence[int] | Int[np.ndarray, "rows"]) -> "ClipPoses":
+        """The poses of some frames."""
+        some = list(rows)
+        return ClipPoses(rotations=self.rotations[some], translations=self.translations[some])
+
     def moved(
         self,
         steps: Float[np.ndarray, "frames 75"],
@@ -119,6 +131,23 @@ class ClipPoses:
         turned = rotation_vectors(other.rotations.swapaxes(-1, -2) @ self.rotations)
         shifted = (camera_rotations @ (self.translations - other.translations)[..., None])[..., 0]
         return np.concatenate([turned.reshape(-1, 72), shifted], axis=1)
+
+    def independent_count(
+        self,
+        rest_joints: Float[np.ndarray, "24 3"],
+        camera_rotations: Float[np.ndarray, "frames 3 3"],
+    ) -> float:
+        """Number of frames that would tell as much of the person if their errors were independent.
+
+        It is the frames' number over the mean sum of the errors' correlations with a frame's. These
+        fall with the distance of the poses as the camera sees them: about 12 for a turn, 5 for
+        squats filmed from one side, however many frames there are.
+        """
+        places = self.joints(rest_joints, np.array(PARENTS)).places
+        seen = ((places - places[:, :1]) @ camera_rotations.swapaxes(-1, -2)).reshape(-1, 72)
+        squares = pdist(seen, "sqeuclidean") / 24.0
+        shared = 2.0 * SHARED_ERROR * float(np.exp(-0.5 * squares / ALIKE_M**2).sum())
+        return len(seen) ** 2 / (len(seen) + shared)
 
     def joints(
         self, rest_joints: Float[np.ndarray, "24 3"], parents: Int[np.ndarray, "24"]

@@ -71,7 +71,7 @@ def weigh_keypoint_poses(
         return None
     beside = _fit_keypoints(capture, fitter, track)
     rows = np.searchsorted(_numbers(fitter.frames), _numbers(beside.frames)).tolist()
-    steps = beside.poses.steps_from(_select(fitter.poses, rows), beside.camera_rotations)
+    steps = beside.poses.steps_from(fitter.poses.rows(rows), beside.camera_rotations)
     weight = error2 / max(_mean_turn(steps) ** 2, error2 + LEAST_ERROR_RAD**2)
     everywhere = [
         np.interp(_numbers(fitter.frames), _numbers(beside.frames), each) for each in steps.T
@@ -144,7 +144,7 @@ def _fit_keypoints(capture: Capture, fitter: ClipFitter, track: KeypointTrack) -
         weights=TRACKED_WEIGHTS,
     )
     beside.take_person(fitter)
-    beside.poses = _select(fitter.poses, rows)
+    beside.poses = fitter.poses.rows(rows)
     poses_only = FitParameters(proportions=False, focal=False)
     for _ in range(ITERATIONS[0]):
         beside.iterate(poses_only._replace(outlines=False))
@@ -160,7 +160,3 @@ def _mean_turn(steps: Float[np.ndarray, "frames 75"]) -> float:
 
 def _numbers(frames: Sequence[ClipFrame]) -> Float[np.ndarray, "frames"]:
     return np.array([frame.number for frame in frames])
-
-
-def _select(poses: ClipPoses, rows: Sequence[int]) -> ClipPoses:
-    return ClipPoses(rotations=poses.rotations[rows], translations=poses.translations[rows])

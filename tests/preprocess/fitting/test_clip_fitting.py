@@ -12,6 +12,7 @@ from preprocess.body.body_surface import SkinPoints, splat_silhouette
 from preprocess.body.parametric_body import load_body_model
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.fitting.clip_fitting import ClipFitter, ClipFrame, FitParameters
+from preprocess.fitting.clip_poses import ClipPoses
 from preprocess.fitting.outlines import OUTLINE_SKIN_POINTS, OutlineDistances
 
 VIEW = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -123,3 +124,29 @@ def test_exact_poses_hardly_move(space):
         fitter.iterate()
     assert np.degrees(np.abs(fitter.corrections[:, :72]).max()) < 2.0
     assert np.degrees(np.linalg.norm(fitter.corrections[:, :3], axis=1).mean()) < 0.5
+
+
+def test_frames_that_are_alike_count_as_two_at_most():
+    truth, rest = turning_motion(), load_body_model().with_shape().joints
+
+    def count(rows: list[int]) -> float:
+        views = np.broadcast_to(VIEW[:3, :3], (len(rows), 3, 3))
+        return ClipPoses.of(truth, rows).independent_count(rest, views)
+
+    assert count([0]) == pytest.approx(1.0)
+    assert 1.9 < count([0] * 100) < 2.0
+    turn = list(range(FRAMES))
+    assert 0.6 * FRAMES < count(turn) < FRAMES
+    assert count(10 * turn) < 2.0 * FRAMES
+
+
+def test_a_still_person_is_believed_no_more_the_longer_the_film(space):
+    coefficients, found = np.zeros(space.count), []
+    coefficients[17] = 3.0  # outlines of forearms 15 % too long
+    for count in (4, 12):
+        still = replace(turning_motion(), root_rotations=np.zeros((FRAMES, 3)))
+        fitter = ClipFitter(still, space, outlines(space, coefficients, still)[:count])
+        for _ in range(6):
+            fitter.iterate()
+        found.append(fitter.coefficients[17])
+    assert found[1] == pytest.approx(found[0], abs=0.15)
