@@ -112,8 +112,10 @@ class FilmFeedback:
         self._film.tell("seconds", seconds=time_s)
         if self._repeats >= (CROWDED_LOOKS if text == CROWDED else LOOKS_TO_SPEAK):
             coverage = self._started.coverage if self._started is not None else None
-            advice = "" if coverage is None else coverage_advice(coverage)
-            text = text or advice or "Good. Now turn round slowly."
+            advice = "Good. Now turn round slowly."
+            if coverage is not None and coverage.stages.any():  # a frame was learnt from
+                advice = coverage_advice(coverage)
+            text = text or advice
             if text != self._advice:
                 self._advice = text
                 self._film.tell("advice", text=text, time=time_s)

@@ -1,12 +1,16 @@
 """What the page says of frames that are tracked."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from avatar.evaluation.coverage import Coverage
 from capture.source import Frame
 from instant_avatar.phone.film_feedback import CROWDED, CROWDED_LOOKS, FilmFeedback
 from instant_avatar.phone.film_queue import Film
 from instant_avatar.run.session_events import Tracked
+from preprocess.body.parametric_body import load_body_model
 from preprocess.tracking.keypoints import CroppedMask, PersonKeypoints
 
 
@@ -29,9 +33,14 @@ def advice(film, monkeypatch):
 
 
 @pytest.fixture
-def look(film):
+def reader(film):
+    return FilmFeedback(film)
+
+
+@pytest.fixture
+def look(reader):
     """Shows the reader a frame of a person who stands whole in the middle."""
-    reader, count = FilmFeedback(film), iter(range(1000))
+    count = iter(range(1000))
 
     def look(*, level=200, found=True, crowded=False, shift=0.0):
         points = np.column_stack([np.linspace(50, 70, 33), np.linspace(20, 140, 33) + shift])
@@ -66,6 +75,14 @@ def test_two_frames_alike_are_spoken_of_once(look, advice, seen, said):
     look(**seen)
     (sentence,) = advice
     assert said in sentence
+
+
+def test_nothing_is_said_of_skin_before_a_frame_is_learnt(look, advice, reader):
+    coverage = Coverage(load_body_model(None).with_shape())
+    reader._started = SimpleNamespace(coverage=coverage)
+    look()
+    look()
+    assert advice == ["Good. Now turn round slowly."]
 
 
 def test_another_person_is_named_once_the_tracker_has_seen_it_twice(look, advice):
