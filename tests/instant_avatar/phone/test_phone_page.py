@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import av
+import numpy as np
 import pytest
 
 from capture.input_error import InputError
@@ -46,18 +47,42 @@ def camera_film(tmp_path_factory):
     """A film of the actor for Chromium's fake camera."""
     folder = tmp_path_factory.mktemp("camera")
     film_capture(folder / "film", ShootConfig(frames=60, size=240, turns=1.0, like_a_phone=True))
-    path = folder / "camera.mjpeg"
+    frames = [frame.rgb for frame in open_source(folder / "film").frames()]
+    write_camera_film(folder / "camera.mjpeg", [*frames, *frames[::-1]])
+    return folder / "camera.mjpeg"
+
+
+def write_camera_film(path, frames):
     with av.open(str(path), "w", format="mjpeg") as container:
-        stream = None
-        frames = [frame.rgb for frame in open_source(folder / "film").frames()]
-        for rgb in [*frames, *frames[::-1]]:
-            if stream is None:
-                stream = container.add_stream("mjpeg", rate=15, options={"qmin": "2", "qmax": "4"})
-                stream.height, stream.width = rgb.shape[:2]
-                stream.pix_fmt = "yuvj420p"
+        stream = container.add_stream("mjpeg", rate=15, options={"qmin": "2", "qmax": "4"})
+        stream.height, stream.width = frames[0].shape[:2]
+        stream.pix_fmt = "yuvj420p"
+        for rgb in frames:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(rgb, format="rgb24")))
         container.mux(stream.encode())
-    return path
+
+
+def camera_flags(path):
+    return [
+        "--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream",
+        f"--use-file-for-fake-video-capture={path}",
+    ]  # fmt: skip
+
+
+def test_an_upright_camera_is_not_cropped(tmp_path):
+    write_camera_film(tmp_path / "camera.mjpeg", [np.full((1280, 720, 3), 90, np.uint8)] * 8)
+    queue, access = FilmQueue(tmp_path / "out", 30.0), AccessControl()
+    queue.folder.mkdir()
+    server = PhoneServer(queue, access, None)
+    server.start("127.0.0.1", [(8747, None)])
+    with Browser(tmp_path / "browser", flags=camera_flags(tmp_path / "camera.mjpeg")) as browser:
+        browser.go(f"http://127.0.0.1:8747/?token={access.token}")
+        until(lambda: browser.run("!!document.getElementById('live')?.onclick"), 60.0)
+        browser.click("Film here, with advice")
+        width, height = (f"document.getElementById('camera').video{s}" for s in ("Width", "Height"))
+        until(lambda: browser.run(width), 60.0)
+        assert (browser.run(width), browser.run(height)) == (720, 1280)
+    server.close()
 
 
 def test_the_plain_page_leads_to_that_with_tls_and_opens_again_after_it(tmp_path):
@@ -191,10 +216,7 @@ def test_a_film_of_the_pages_camera_becomes_an_avatar_in_its_player(camera_film,
         "--host", "127.0.0.1", "--port", "8731", "--size", "160", "--no-tls",
     ]  # fmt: skip
     server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    flags = [
-        "--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream",
-        f"--use-file-for-fake-video-capture={camera_film}",
-    ]  # fmt: skip
+    flags = camera_flags(camera_film)
     try:
         address = server.stdout.readline().strip()
         with Browser(tmp_path / "browser", size=(360, 740), flags=flags) as browser:
@@ -205,9 +227,6 @@ def test_a_film_of_the_pages_camera_becomes_an_avatar_in_its_player(camera_film,
             assert browser.run("crossOriginIsolated")
             browser.run("document.getElementById('name').value = 'Anna'")
             browser.run("document.getElementById('live').click()")
-            size = "[document.getElementById('camera').videoWidth,"
-            size += " document.getElementById('camera').videoHeight]"
-            until(lambda: browser.run(size) == [240, 426], 60.0)  # nothing is cut off
             until(lambda: "seen" in browser.text(), 600.0)
             assert browser.run("document.documentElement.scrollWidth") <= 360
             until(lambda: browser.run("!document.getElementById('preview').hidden"), 600.0)
