@@ -77,7 +77,7 @@ def test_two_frames_alike_are_spoken_of_once(look, advice, seen, said):
     assert said in sentence
 
 
-def test_nothing_is_said_of_skin_before_a_frame_is_learnt(look, advice, reader):
+def test_no_advice_about_skin_before_a_frame_is_learnt(look, advice, reader):
     coverage = Coverage(load_body_model(None).with_shape())
     reader._started = SimpleNamespace(coverage=coverage)
     look()
