@@ -28,15 +28,16 @@ POINT_NAMES = (*JOINT_NAMES, *LANDMARKS)
 """Points of a `JointTrack`, in their order."""
 JOINT_SIGMAS_M = (
     (0.004, (1, 2, 4, 5, 7, 8, 16, 17, 18, 19, 20, 21)), (0.006, (10, 11)),
-    (0.02, (3, 6, 9, 13, 14, 15, 22, 23)), (0.03, (0, 12)),
+    (0.008, (0, 3, 6, 9, 12, 13, 14, 15)), (0.02, (22, 23)),
 )  # fmt: skip
-"""Standard deviation between joints of the same name of two bodies, metres: limbs, toes, then
-those of which bodies differ in meaning."""
+"""Standard deviation between joints of the same name of two bodies, metres: limbs, toes, the
+trunk's, which depend most on the person, and hands."""
 SIGMA_LANDMARK_M = 0.012
 """The same of landmarks, metres."""
-COMPARED_JOINTS = (1, 2, 4, 5, 7, 8, 10, 11, 12, 15, 16, 17, 18, 19, 20, 21)
-"""Joints whose distance is stated: all but pelvis, spine, collars and hands, which bodies have in
-different places."""
+SAME_JOINTS = np.zeros((24, 3))
+"""Offsets of a body that has its joints where ours has them."""
+COMPARED_JOINTS = tuple(range(22))
+"""Joints whose distance is stated: all but the hands, which bodies have in different places."""
 KEY_FRAMES = 60
 """Frames, evenly spread, to which proportions are fitted."""
 CHUNK_FRAMES = 300
@@ -82,14 +83,16 @@ def fit_joints(
     places: Float[np.ndarray, "rows points 3"],
     times_s: Float[np.ndarray, "rows"],
     turns: Float[np.ndarray, "rows 24 3 3"] | None = None,
+    offsets_m: Float[np.ndarray, "24 3"] = SAME_JOINTS,
 ) -> FittedJoints:
     """Fit the embedded body to the joints of another one over time.
 
     Args:
         places: Of `POINT_NAMES`, metres; NaN where unknown, but not of limbs.
         turns: World rotations since SMPL's T-pose, if known: the fit stays near them.
+        offsets_m: Where the other body has its joints, from ours in our rest pose.
     """
-    fitter = _JointFitter(places, times_s, turns)
+    fitter = _JointFitter(places, times_s, turns, offsets_m)
     count = len(places)
     keys = np.unique(np.linspace(0, count - 1, KEY_FRAMES).round().astype(int))
     fitter.fit(keys, proportions=True)
@@ -101,9 +104,10 @@ def fit_joints(
         rotations=np.concatenate([part.rotations for part in parts]),
         translations=np.concatenate([part.translations for part in parts]),
     )
-    joints = poses.joints(fitter.rest_joints, fitter.space.shaped.body.parents).places
+    joints = poses.joints(fitter.rest_joints, fitter.space.shaped.body.parents)
+    found = joints.places + (joints.turns @ offsets_m[:, :, None])[..., 0]
     compared = list(COMPARED_JOINTS)
-    apart = np.linalg.norm(joints[:, compared] - places[:, compared], axis=-1)
+    apart = np.linalg.norm(found[:, compared] - places[:, compared], axis=-1)
     return FittedJoints(poses, fitter.coefficients, apart)
 
 
@@ -115,13 +119,14 @@ class _JointFitter:
         places: Float[np.ndarray, "rows points 3"],
         times_s: Float[np.ndarray, "rows"],
         turns: Float[np.ndarray, "rows 24 3 3"] | None,
+        offsets_m: Float[np.ndarray, "24 3"],
     ) -> None:
         self._places, self._times, self._turns = places, times_s, turns
         self.space = ProportionSpace.around(load_body_model().with_shape())
         self.coefficients = np.zeros(self.space.count)
         numbers = list(LANDMARKS.values())
         joints = np.concatenate([np.arange(24), KEYPOINT_JOINTS[numbers]])
-        offsets = np.concatenate([np.zeros((24, 3)), KEYPOINT_OFFSETS_M[numbers]])
+        offsets = np.concatenate([offsets_m, KEYPOINT_OFFSETS_M[numbers]])
         self._attached = AttachedPoints(self.space, joints, offsets)
         sigma = np.full(len(POINT_NAMES), SIGMA_LANDMARK_M)
         for value, some in JOINT_SIGMAS_M:

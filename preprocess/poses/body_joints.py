@@ -52,6 +52,32 @@ SIDE_JOINTS = {
     "heel": (None, (17, 20), None, None, None, None),
 }  # fmt: skip
 """Joints of the left and the right; names are the left's without the side."""
+NAMED = "a skeleton"
+"""The body of joints that are known by our own names, which are SMPL's."""
+SMPL_OFFSETS_CM = {
+    "pelvis": (0.0, 4.9, 0.1), "spine1": (0.0, 7.6, 2.1), "spine2": (0.0, 13.4, 1.6),
+    "spine3": (0.0, 8.8, 2.2), "neck": (0.0, 0.7, 1.5), "head": (0.0, -1.1, 0.7),
+    "hip": (-3.1, -2.3, -1.1), "collar": (5.3, -3.7, -0.2), "shoulder": (0.7, 0.9, -0.2),
+}  # fmt: skip
+"""Where SMPL has joints of the trunk, from ours in our rest pose, centimetres: of the left side."""
+OFFSETS_CM = {
+    "MHR": {
+        "pelvis": (0.0, -1.0, -1.2), "spine1": (0.0, 2.9, 2.0), "spine2": (0.0, 5.7, -1.8),
+        "spine3": (0.0, 13.1, -2.5), "neck": (0.0, 0.9, 3.0), "head": (0.0, -3.3, 1.2),
+        "hip": (-2.8, -1.6, 0.0), "collar": (-1.1, -2.3, 4.6), "shoulder": (-0.8, 1.4, 0.3),
+    },
+    "MHR's key points": {
+        "neck": (0.0, -0.9, 3.9), "hip": (-2.4, -0.4, 0.1), "shoulder": (-0.9, 0.8, 1.3),
+    },
+    "SOMA": {
+        "pelvis": (0.0, 5.8, -2.9), "spine1": (0.0, 2.5, 1.3), "spine2": (0.0, 2.2, -0.4),
+        "spine3": (0.0, 0.4, -0.9), "neck": (0.0, 2.6, 0.6), "head": (0.0, -1.5, 0.7),
+        "hip": (-1.1, -1.0, 0.0), "collar": (-1.0, -0.7, 0.7), "shoulder": (-0.5, -0.2, -0.2),
+    },
+    "SMPL-H": SMPL_OFFSETS_CM, "SMPL-X": SMPL_OFFSETS_CM, NAMED: SMPL_OFFSETS_CM,
+}  # fmt: skip
+"""The same for other bodies (Anny's joints are ours; joints of SMPL's names are SMPL's). Means of
+fits to published persons and to mean skeletons that dance (dev/log/captures.md)."""
 COUNTS = {
     22: "SMPL-H", 24: "SMPL-H", 52: "SMPL-H", 55: "SMPL-X", 70: "MHR's key points", 73: "SMPL-H",
     77: "SOMA", 127: "SMPL-X", 144: "SMPL-X",
@@ -154,7 +180,8 @@ class JointTrack:
             upright = find_upright(places[:, :24])
             places, turns = places @ upright.T, None if turns is None else upright @ turns
         numbers = np.array(self.frames or range(len(self.places)))[rows]
-        found = fit_joints(places, numbers / (self.fps or 30.0), turns)
+        offsets_m = _offsets_m(self.body)
+        found = fit_joints(places, numbers / (self.fps or 30.0), turns, offsets_m)
         known = np.isfinite(found.distances_m).all(axis=0)
         apart = found.distances_m[:, known].mean(axis=0)
         compared = np.array(COMPARED_JOINTS)[known]
@@ -306,7 +333,7 @@ def _read_item(node: dict[str, Any], frame: int, person: str | None) -> _Item | 
 def _known_body(key: str, count: int, names: Any) -> str:
     """The body by the names of its joints, else by their number."""
     if names is not None:
-        counted = {body: len(_columns(body, list(names))) for body in (*BODIES[2:4], "")}
+        counted = {body: len(_columns(body, list(names))) for body in (*BODIES[2:4], NAMED)}
         best = max(counted, key=lambda body: counted[body])
         if counted[best] >= MIN_NAMED:
             return best
@@ -322,8 +349,8 @@ def _known_body(key: str, count: int, names: Any) -> str:
 
 
 def _columns(body: str, names: list[str] | None) -> dict[str, int]:
-    """Where each of our points is among the joints of a body; "" for joints of our own names."""
-    if not body:
+    """Where each of our points is among the joints of a body."""
+    if body == NAMED:
         plain = [str(name).replace("-", "_").lower() for name in names or ()]
         return {point: plain.index(point) for point in POINT_NAMES if point in plain}
     column, found = BODIES.index(body), {}
@@ -341,6 +368,16 @@ def _columns(body: str, names: list[str] | None) -> dict[str, int]:
         for point, one in found.items()
     }
     return {point: one for point, one in placed.items() if isinstance(one, int)}
+
+
+def _offsets_m(body: str) -> Float[np.ndarray, "24 3"]:
+    """Where a body has its joints, from ours in our rest pose, metres."""
+    offsets = np.zeros((24, 3))
+    for point, place in OFFSETS_CM.get(body, {}).items():
+        for side, mirror in (("", 1.0), ("left_", 1.0), ("right_", -1.0)):
+            if side + point in JOINT_NAMES:
+                offsets[JOINT_NAMES.index(side + point)] = np.array(place) * (mirror, 1.0, 1.0)
+    return offsets / 100.0
 
 
 def _intrinsic(
@@ -366,7 +403,7 @@ def _join(rows: list[_Item], fps: Any) -> JointTrack:
     known = [row.intrinsic for row in rows if row.intrinsic is not None]
     in_camera = rows[0].in_camera
     return JointTrack(
-        body=rows[0].body or "a skeleton",
+        body=rows[0].body,
         places=np.concatenate([row.places for row in rows]),
         frames=[row.frame for row in rows] if len(rows) > 1 else None,
         fps=None if fps is None else float(fps),
