@@ -80,7 +80,7 @@ def open_observations(
                 with suppress(InputError, OSError, ValueError):  # damaged: reading names it
                     print_first_look(look.result(), inputs, console, tracks=False)
     _describe(capture, console)
-    if not resumes:
+    if not resumes and inputs.kind is InputKind.POSED:  # what was tracked here has its grade
         preflight_check(capture, imported.inputs, console, force=arguments.force)
     if inputs.cameras == "solve":
         capture = _solve_cameras(arguments, capture, console)
