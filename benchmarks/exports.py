@@ -152,13 +152,11 @@ def measure(job: ExportJob) -> int:
         ]
     }
     mesh = mesh_file(package, views, job.triangles)
-    splats = [
-        build_splats(package.tables["hq"], player.world_from_canonical(view.pose)) for view in views
-    ]
+    splats = [build_splats(package, view.pose) for view in views]
     files = {f"{number}.ply": encode_ply(each) for number, each in enumerate(splats)}
     files |= {f"{number}.spz": encode_spz(each) for number, each in enumerate(splats)}
     files |= {"index.html": PAGE.encode(), "mesh.glb": mesh, **packages(job.node)}
-    files["rest.spz"] = encode_spz(build_splats(package.tables["hq"]))
+    files["rest.spz"] = encode_spz(build_splats(package))
     files[SKINNING.name] = SKINNING.read_bytes()
     with serve(files) as browser:
         drawn[f"mesh of {job.triangles:,} triangles"] = draw_meshes(browser, package, views)

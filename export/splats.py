@@ -12,13 +12,15 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
-from scipy.sparse import csr_array
+from jaxtyping import Float, Float32
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from export.package.player_tables import PlayerTables
+from export.package.package_file import AvatarPackage
+from export.player import Player, picture_on_white, premultiply
 from export.skinned_mesh import LevelSet, SkinnedMesh, extract_mesh
+from export.splat_colors import cameras_around, fit_colors
+from preprocess.body.body_pose import BodyPose
 
 
 class Shell(NamedTuple):
@@ -26,23 +28,24 @@ class Shell(NamedTuple):
 
     Attributes:
         spacing_m: Distance between them, about.
-        depth_m: Under the surface.
-        clear_m: Least distance from the surface, also from that of another side or fold.
+        depth_m: Under the surface, for a film of coarse pixels.
+        clear_share: Least distance from the surface, also from that of another side or fold, in
+            depths.
         thickness_m: Standard deviation along the normal.
         opacity: At their centers.
     """
 
     spacing_m: float
     depth_m: float
-    clear_m: float
+    clear_share: float
     thickness_m: float
     opacity: float
 
 
 SHELLS = (
     Shell(0.0055, 0.005, 0.0, 0.003, 0.15),
-    Shell(0.008, 0.008, 0.0064, 0.0005, 0.5),
-    Shell(0.012, 0.02, 0.016, 0.0005, 0.95),
+    Shell(0.008, 0.008, 0.8, 0.0005, 0.5),
+    Shell(0.012, 0.02, 0.8, 0.0005, 0.95),
 )
 """From the outermost, chosen by pictures from 1.4 to 7 mm a pixel (dev/log/player.md)."""
 MAX_CROSSED_M2 = 3.85
@@ -52,14 +55,13 @@ MIN_SCALE_M = 1e-6
 """Least standard deviation, where a pose flattens one."""
 SPREAD = 0.6
 """Standard deviation along the surface, in distances of neighbors: less shows gaps."""
-VIEWER_BLUR_M = 0.003
-"""Standard deviation of viewers' blur on a figure of some 400 px, metres."""
-NEAREST, NEIGHBORS = 6, 24
-"""Neighbors whose mean distance sets a Gaussian's size; neighbors that blend with it."""
-MIN_FACING = 0.3
-"""Least cosine between the normals of Gaussians that blend."""
-SHARPENINGS = 5
-"""Iterations by which colors are sharpened."""
+NEAREST = 6
+"""Neighbors whose mean distance sets a Gaussian's size."""
+COARSE_PIXEL_M = 0.0092
+"""Size of a film's pixels on the person for which the shells' depths are chosen, metres."""
+RISE = 0.37
+"""How much nearer to the surface shells lie, in what a film's pixels are smaller: an avatar is
+looked at from nearer then, and a viewer's half pixel is less."""
 SH_BASE = 0.28209479177387814
 """Spherical harmonics' constant function, by which 3DGS divides colors."""
 SPZ_MAGIC, SPZ_VERSION = 0x5053474E, 2
@@ -86,19 +88,35 @@ class GaussianSplats:
     rotations: Float32[np.ndarray, "splats 4"]
 
 
-def build_splats(
-    tables: PlayerTables, bones: Float[np.ndarray, "24 4 4"] | None = None
-) -> GaussianSplats:
-    """Lay Gaussians under the surface of baked bricks, moved by world-from-canonical matrices."""
+def build_splats(package: AvatarPackage, pose: BodyPose | None = None) -> GaussianSplats:
+    """Lay Gaussians under an avatar's surface, and move them to a pose (default: canonical)."""
+    tables, player = package.tables["hq"], Player(package)
     level = LevelSet.of(tables.bricks)
     crossings = sum(np.count_nonzero(np.diff(level.heights > 0.0, axis=axis)) for axis in range(3))
     wider = max(1.0, np.sqrt(crossings * tables.bricks.voxel_m**2 / MAX_CROSSED_M2))
     meshes = [extract_mesh(tables, level, spacing_m=wider * shell.spacing_m) for shell in SHELLS]
     surface = KDTree(meshes[0].positions)
+    pixel_m = (package.manifest.metrics.get("recipe") or {}).get("finest_m", COARSE_PIXEL_M)
+    rise_m = RISE * max(0.0, COARSE_PIXEL_M - pixel_m)
     parts = [
-        _lay_shell(mesh, shell, surface, bones) for mesh, shell in zip(meshes, SHELLS, strict=True)
+        _lay_shell(mesh, shell, surface, rise_m) for mesh, shell in zip(meshes, SHELLS, strict=True)
     ]
-    positions, axes, colors, opacities = (np.concatenate(each) for each in zip(*parts, strict=True))
+    positions, axes, colors, opacities, joints, weights = (
+        np.concatenate(each) for each in zip(*parts, strict=True)
+    )
+    rest = BodyPose(
+        root_rotation=np.zeros(3),
+        root_translation=np.zeros(3),
+        joint_rotations=package.manifest.canonical_rotations,
+    )
+    cameras = cameras_around(positions)
+    pictures = [picture_on_white(premultiply(player.render(rest, each))) for each in cameras]
+    colors = fit_colors(positions, axes, opacities, colors, cameras, pictures)
+    if pose is not None:
+        bones = player.world_from_canonical(pose)
+        moved = np.einsum("vi,viab->vab", weights / 255.0, bones[joints])
+        positions = np.einsum("vab,vb->va", moved[:, :3, :3], positions) + moved[:, :3, 3]
+        axes = moved[:, :3, :3] @ axes
     squares, turned = np.linalg.eigh(axes @ axes.swapaxes(1, 2))
     scales = np.sqrt(np.maximum(squares, MIN_SCALE_M**2))
     turned[np.linalg.det(turned) < 0.0, :, 2] *= -1.0
@@ -113,43 +131,19 @@ def build_splats(
 
 
 def _lay_shell(
-    mesh: SkinnedMesh, shell: Shell, surface: KDTree, bones: Float[np.ndarray, "24 4 4"] | None
+    mesh: SkinnedMesh, shell: Shell, surface: KDTree, rise_m: float
 ) -> tuple[np.ndarray, ...]:
-    """Positions, axes times standard deviations, colors and opacities of a shell's Gaussians."""
-    found = KDTree(mesh.positions).query(mesh.positions, 1 + NEIGHBORS)
-    distances, neighbors = np.asarray(found[0]), np.asarray(found[1])
-    sizes = SPREAD * distances[:, 1 : 1 + NEAREST].mean(axis=1)
-    shares = np.exp(-0.5 * (distances / np.hypot(sizes, VIEWER_BLUR_M)[neighbors]) ** 2)
-    facing = np.einsum("vnx,vx->vn", mesh.normals[neighbors], mesh.normals)
-    shares *= facing > MIN_FACING
+    """Positions, axes times standard deviations, colors, opacities and skin of its Gaussians."""
+    depth_m = shell.depth_m - rise_m
+    distances = np.asarray(KDTree(mesh.positions).query(mesh.positions, 1 + NEAREST)[0])
     axes = _tangents(mesh.normals)
-    axes[..., :2] *= sizes[:, None, None]
+    axes[..., :2] *= SPREAD * distances[:, 1:].mean(axis=1)[:, None, None]
     axes[..., 2] *= shell.thickness_m
-    positions = mesh.positions - shell.depth_m * mesh.normals.astype(np.float64)
-    clear = np.asarray(surface.query(positions)[0]) >= shell.clear_m
-    if bones is not None:
-        moved = np.einsum("vi,viab->vab", mesh.weights / 255.0, bones[mesh.joints])
-        positions = np.einsum("vab,vb->va", moved[:, :3, :3], positions) + moved[:, :3, 3]
-        axes = moved[:, :3, :3] @ axes
-    colors = _sharpen(mesh.colors / 255.0, neighbors, shares)
+    positions = mesh.positions - depth_m * mesh.normals.astype(np.float64)
+    clear = np.asarray(surface.query(positions)[0]) >= shell.clear_share * depth_m
     opacities = np.full(len(positions), shell.opacity)
-    return tuple(each[clear] for each in (positions, axes, colors, opacities))
-
-
-def _sharpen(
-    colors: Float[np.ndarray, "splats 3"],
-    neighbors: Int[np.ndarray, "splats neighbors"],
-    shares: Float[np.ndarray, "splats neighbors"],
-) -> Float[np.ndarray, "splats 3"]:
-    """Find colors that become the given ones where Gaussians overlap (Van Cittert's iteration)."""
-    starts = np.arange(0, neighbors.size + 1, neighbors.shape[1])
-    blur = csr_array(
-        ((shares / shares.sum(axis=1, keepdims=True)).ravel(), neighbors.ravel(), starts)
-    )
-    found = colors
-    for _ in range(SHARPENINGS):
-        found = np.clip(found + colors - blur @ found, 0.0, 1.0)
-    return found
+    columns = positions, axes, mesh.colors / 255.0, opacities, mesh.joints, mesh.weights
+    return tuple(each[clear] for each in columns)
 
 
 def _tangents(normals: Float32[np.ndarray, "splats 3"]) -> Float[np.ndarray, "splats 3 3"]:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from jaxtyping import Float
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from capture.atomic_files import atomic_file
@@ -19,7 +18,6 @@ from capture.input_error import InputError
 from export.gltf import SkeletonAnimation, encode_glb, encode_vrm, text_of_glb
 from export.package.manifest import Manifest
 from export.package.package_file import AvatarPackage, read_package
-from export.player import Player
 from export.skinned_mesh import SkinnedMesh, extract_mesh
 from export.splats import build_splats, encode_ply, encode_spz
 from instant_avatar.animation.driving_motion import (
@@ -162,8 +160,7 @@ def _export_converted(arguments: ExportArguments, package: Path, console: Consol
     out = arguments.out
     if arguments.to == "splats":
         with console.status("laying Gaussians on the surface"):
-            bones = None if motion is None else _bones_of_first_pose(held, motion)
-            splats = build_splats(held.tables["hq"], bones)
+            splats = build_splats(held, None if motion is None else _first_pose(motion))
             content = SPLAT_ENCODERS[out.suffix.lower()](splats)
         said = f"{len(splats.positions):,} Gaussians."
     else:
@@ -196,11 +193,10 @@ def _build_mesh(
     return content, f"{len(mesh.positions):,} vertices, {len(mesh.faces):,} triangles."
 
 
-def _bones_of_first_pose(package: AvatarPackage, motion: Motion) -> Float[np.ndarray, "24 4 4"]:
-    """Return world-from-canonical matrices of a motion's first pose, upright at the origin."""
+def _first_pose(motion: Motion) -> BodyPose:
+    """Return a motion's first pose, upright at the origin."""
     pose = motion[int(np.flatnonzero(motion.valid)[0])]
-    upright = replace(pose, root_rotation=np.zeros(3), root_translation=np.zeros(3))
-    return Player(package).world_from_canonical(upright)
+    return replace(pose, root_rotation=np.zeros(3), root_translation=np.zeros(3))
 
 
 def _encode_animated(mesh: SkinnedMesh, manifest: Manifest, motion: Motion, name: str) -> bytes:

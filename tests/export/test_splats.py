@@ -2,6 +2,7 @@
 
 import gzip
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,16 @@ from scipy.spatial.transform import Rotation
 from export.package.package_file import read_package
 from export.player import Player, picture_on_white, premultiply
 from export.skinned_mesh import extract_mesh
-from export.splats import SHELLS, build_splats, encode_ply, encode_spz
+from export.splat_colors import cameras_around, fit_colors
+from export.splats import (
+    COARSE_PIXEL_M,
+    RISE,
+    SHELLS,
+    GaussianSplats,
+    build_splats,
+    encode_ply,
+    encode_spz,
+)
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +31,7 @@ def package(exported):
 
 @pytest.fixture(scope="module")
 def splats(package):
-    return build_splats(package.tables["hq"])
+    return build_splats(package)
 
 
 def covariances(scales, rotations):
@@ -123,7 +133,7 @@ def test_they_lie_in_shells_under_the_surface_and_clear_of_it(package, splats):
         chosen = splats.opacities == np.float32(shell.opacity)
         assert chosen.sum() > 0.1 * (splats.opacities == np.float32(SHELLS[0].opacity)).sum()
         assert np.median(inward[chosen]) == pytest.approx(shell.depth_m, rel=0.1)
-        assert far[chosen].min() >= 0.999 * shell.clear_m
+        assert far[chosen].min() >= 0.999 * shell.clear_share * shell.depth_m
         thinnest = splats.scales[chosen].min(axis=1)
         assert np.median(thinnest) == pytest.approx(shell.thickness_m, rel=0.15)
     assert len(mesh.positions) == (splats.opacities == np.float32(SHELLS[0].opacity)).sum()
@@ -131,10 +141,52 @@ def test_they_lie_in_shells_under_the_surface_and_clear_of_it(package, splats):
 
 def test_wide_clothes_have_gaussians_farther_apart(package, splats, monkeypatch):
     monkeypatch.setattr("export.splats.MAX_CROSSED_M2", 0.2)
-    fewer = build_splats(package.tables["hq"])
+    fewer = build_splats(package)
     assert len(fewer.positions) < 0.6 * len(splats.positions)
     area = [np.sort(each.scales, axis=1)[:, 1:].prod(axis=1).sum() for each in (fewer, splats)]
     assert area[0] == pytest.approx(area[1], rel=0.1)  # each is wider
+
+
+@pytest.mark.slow
+def test_shells_of_a_finer_film_lie_nearer_to_the_surface(package, splats):
+    metrics = {**package.manifest.metrics, "recipe": {"finest_m": COARSE_PIXEL_M - 0.005}}
+    fine = build_splats(replace(package, manifest=replace(package.manifest, metrics=metrics)))
+    surface = KDTree(extract_mesh(package.tables["hq"]).positions)
+    for shell in SHELLS[:2]:
+        depths = [
+            np.median(surface.query(each.positions[each.opacities == np.float32(shell.opacity)])[0])
+            for each in (splats, fine)
+        ]
+        assert depths[0] - depths[1] == pytest.approx(0.005 * RISE, rel=0.3)
+
+
+def test_colors_are_fitted_so_that_blurred_and_overlapping_gaussians_show_the_pictures():
+    rng = np.random.default_rng(3)
+    normals = rng.normal(size=(2000, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    turned = Rotation.concatenate(
+        [Rotation.align_vectors([normal], [[0.0, 0.0, 1.0]])[0] for normal in normals]
+    )
+    scales = np.tile([0.015, 0.015, 0.001], (len(normals), 1))
+    stripes = np.where(np.sin(20.0 * normals[:, 1:2]) > 0.0, [0.9, 0.2, 0.1], [0.1, 0.3, 0.8])
+    true = GaussianSplats(
+        positions=np.float32(0.25 * normals),
+        colors=np.float32(stripes),
+        opacities=np.full(len(normals), 0.7, np.float32),
+        scales=np.float32(scales),
+        rotations=np.float32(turned.as_quat(scalar_first=True)),
+    )
+    cameras = cameras_around(true.positions)
+    pictures = [np.float32(rasterize(true, each)) for each in cameras]
+    assert all((picture[0] == 1.0).all() for picture in pictures)  # the whole ball is seen
+    gray = np.full((len(normals), 3), 0.5)
+    error = {}
+    axes = turned.as_matrix() * scales[:, None]
+    found = fit_colors(true.positions, axes, true.opacities, gray, cameras, pictures)
+    for name, colors in (("gray", gray), ("found", found)):
+        drawn = [rasterize(replace(true, colors=np.float32(colors)), each) for each in cameras]
+        error[name] = np.mean([((a - b) ** 2).mean() for a, b in zip(drawn, pictures, strict=True)])
+    assert error["found"] < 0.05 * error["gray"]
 
 
 @pytest.mark.slow
@@ -142,7 +194,7 @@ def test_wide_clothes_have_gaussians_farther_apart(package, splats, monkeypatch)
 def test_they_look_like_the_avatar(package, stand_in, camera, bent, pose):
     player, view = Player(package), camera(320, 400)
     pose = stand_in.canonical if pose == "canonical" else bent
-    drawn = rasterize(build_splats(package.tables["hq"], player.world_from_canonical(pose)), view)
+    drawn = rasterize(build_splats(package, pose), view)
     expected = picture_on_white(premultiply(player.render(pose, view)))
     error = ((drawn - expected) ** 2).mean()
     assert -10.0 * np.log10(error) > 33.5  # 34.7 and 35.7 were measured
