@@ -71,7 +71,7 @@ def fit_colors(
     cameras: Sequence[Camera],
     pictures: Sequence[Float32[np.ndarray, "height width 3"]],
 ) -> Float[np.ndarray, "splats 3"]:
-    """Find colors near the given ones with which Gaussians look like pictures on white.
+    """Find colors near the given ones, so that Gaussians look like pictures on white.
 
     Args:
         axes: Columns are the Gaussians' axes times their standard deviations, metres; the last one
