@@ -159,6 +159,8 @@ MIN_TOP_NORMAL_Y = 0.6
 NEARLY_COMPLETE = 0.95
 """Share of seen skin from which the capture counts as complete."""
 SEEN_COMPLETELY = "It was seen from all sides."
+SEEN_NEARLY = "Nearly everything was seen; only small pieces are missing."
+"""Without their share: a page speaks it, and would begin again with each frame."""
 PARTS_OF_LIMB = {
     "hand": ("hand",),
     "foot": ("foot",),
@@ -213,10 +215,7 @@ def coverage_advice(coverage: Coverage) -> str:
     region = largest_unseen_region(coverage)
     if region is not None:
         return _advice_sentence(region)
-    if coverage.seen_share >= NEARLY_COMPLETE:
-        return SEEN_COMPLETELY
-    rest = 1.0 - coverage.seen_share
-    return f"Nearly everything was seen; the {rest:.0%} that are missing are small pieces."
+    return SEEN_COMPLETELY if coverage.seen_share >= NEARLY_COMPLETE else SEEN_NEARLY
 
 
 def largest_unseen_region(coverage: Coverage) -> UnseenRegion | None:

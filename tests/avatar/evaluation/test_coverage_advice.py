@@ -87,6 +87,16 @@ def test_a_piece_on_one_limb_is_named_by_limb_and_side(coverage, parts, side, se
     assert coverage_advice(without(coverage, here(coverage, *parts, side=side))) == sentence
 
 
+def test_small_pieces_are_one_sentence_however_many_are_left(coverage, rng):
+    order = rng.permutation(len(coverage.patches.points))
+    said = {
+        coverage_advice(without(coverage, order < share * len(order)))
+        for share in (0.08, 0.12, 0.17)
+    }
+    assert len(said) == 1
+    assert SEEN_COMPLETELY not in said
+
+
 def test_every_sentence_is_one(coverage, rng):
     """Any ball of unseen skin, for any reason, makes a sentence without a hole in it."""
     points = coverage.patches.points
