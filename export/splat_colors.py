@@ -31,8 +31,8 @@ VIEWER_BLUR_PX2 = 0.3
 """Variance by which viewers widen Gaussians, px² (Mip-Splatting, Yu et al. 2024)."""
 MAX_COSINE = 0.4
 """Cosine between view and normal from which on a Gaussian lies on the side that is not seen."""
-REACH = 8.0
-"""Squared distance, in standard deviations, at which a Gaussian ends."""
+MAX_SQUARED_DISTANCE = 8.0
+"""Squared distance from its center, in variances, at which a Gaussian is cut off."""
 MIN_ALPHA = 1.0 / 512.0
 """Least alpha, and least light that is left before a Gaussian, that count."""
 
@@ -113,7 +113,7 @@ def _shares_of_pixels(
     thinner = np.sqrt(np.maximum(np.linalg.det(shape), 0.0) / np.linalg.det(wide))
     peaks = (opacities[order] * thinner).astype(np.float32)
     narrow = np.linalg.inv(wide).astype(np.float32)
-    reach = np.ceil(np.sqrt(REACH * wide[:, [0, 1], [0, 1]].max(axis=1))).astype(int)
+    reach = np.ceil(np.sqrt(MAX_SQUARED_DISTANCE * wide[:, [0, 1], [0, 1]].max(axis=1))).astype(int)
     normals = axes[order, :, 2] @ turn.T
     lengths = np.linalg.norm(points, axis=1) * np.linalg.norm(normals, axis=1)
     seen = np.einsum("va,va->v", points, normals) <= MAX_COSINE * lengths
@@ -129,7 +129,7 @@ def _shares_of_pixels(
             form = narrow[some, :, :, None]
             power = form[:, 0, 0] * x * x + 2.0 * form[:, 0, 1] * x * y + form[:, 1, 1] * y * y
             alpha = peaks[some, None] * np.exp(-0.5 * power)
-            inside = (power < REACH) & (alpha > MIN_ALPHA)
+            inside = (power < MAX_SQUARED_DISTANCE) & (alpha > MIN_ALPHA)
             place = pixels[..., 1] * width + pixels[..., 0]
             parts.append((place[inside], some[np.nonzero(inside)[0]], alpha[inside]))
     place, splat, alpha = (np.concatenate(each) for each in zip(*parts, strict=True))

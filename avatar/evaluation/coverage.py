@@ -160,7 +160,7 @@ NEARLY_COMPLETE = 0.95
 """Share of seen skin from which the capture counts as complete."""
 SEEN_COMPLETELY = "It was seen from all sides."
 SEEN_NEARLY = "Nearly everything was seen; only small pieces are missing."
-"""Without their share: a page speaks it, and would begin again with each frame."""
+"""It names no share, which changes with each frame: a page that speaks would begin again."""
 PARTS_OF_LIMB = {
     "hand": ("hand",),
     "foot": ("foot",),

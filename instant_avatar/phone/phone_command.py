@@ -102,20 +102,21 @@ def capture(options: CaptureOptions, console: Console) -> int:
     """Serve the page, and learn from one film after the other until Ctrl-C."""
     require_packages("aiohttp", "cryptography", "segno", "torch", "numba", "onnx")
     options.validate()
-    with exit_on_interrupt(console, PROGRAM), console.status("loading torch"):
-        import instant_avatar.report.report_writer
-        import instant_avatar.run.session_start  # noqa: F401 - no film waits for these
-        from instant_avatar.phone.access_control import (
-            AccessControl,
-            load_certificate,
-            local_address,
-            made_certificate,
-        )
-        from instant_avatar.phone.film_queue import FilmQueue
-        from instant_avatar.phone.phone_server import PhoneServer
-        from instant_avatar.run.start_up import warm_up
-
-        warm_up()
+    with exit_on_interrupt(console, PROGRAM):
+        with console.status("loading torch"):
+            import instant_avatar.report.report_writer
+            import instant_avatar.run.session_start  # noqa: F401 - no film waits for these
+            from instant_avatar.phone.access_control import (
+                AccessControl,
+                load_certificate,
+                local_address,
+                made_certificate,
+            )
+            from instant_avatar.phone.film_queue import FilmQueue
+            from instant_avatar.phone.phone_server import PhoneServer
+            from instant_avatar.run.start_up import warm_up
+        with console.status("compiling kernels (slow on the first run only)"):
+            warm_up()
     options.out.mkdir(parents=True, exist_ok=True)
     queue, access = FilmQueue(options.out, options.silent_seconds), AccessControl()
     address = options.host or local_address()

@@ -134,9 +134,9 @@ class ClipFitter:
         )
         numbers = np.array([frame.number for frame in self.frames])
         masked = np.flatnonzero([frame.mask is not None for frame in self.frames])
-        telling = masked if track is None and len(masked) else np.arange(len(self.frames))
-        self._priors = len(telling) / self.given.rows(telling).independent_count(
-            space.shaped.joints, self.camera_rotations[telling]
+        used = masked if track is None and len(masked) else np.arange(len(self.frames))
+        self._priors = len(used) / self.given.rows(used).independent_count(
+            space.shaped.joints, self.camera_rotations[used]
         )
         self._keypoints: ClipKeypoints | None = None
         if track is None:

@@ -15,7 +15,7 @@ from export.skinned_mesh import extract_mesh
 from export.splat_colors import cameras_around, fit_colors
 from export.splats import (
     COARSE_PIXEL_M,
-    RISE,
+    DEPTH_PER_PIXEL,
     SHELLS,
     GaussianSplats,
     build_splats,
@@ -157,7 +157,7 @@ def test_shells_of_a_finer_film_lie_nearer_to_the_surface(package, splats):
             np.median(surface.query(each.positions[each.opacities == np.float32(shell.opacity)])[0])
             for each in (splats, fine)
         ]
-        assert depths[0] - depths[1] == pytest.approx(0.005 * RISE, rel=0.3)
+        assert depths[0] - depths[1] == pytest.approx(0.005 * DEPTH_PER_PIXEL, rel=0.3)
 
 
 def test_colors_are_fitted_so_that_blurred_and_overlapping_gaussians_show_the_pictures():
