@@ -26,7 +26,7 @@ from benchmarks.measurements import Measurement, markdown_rows
 from benchmarks.stopwatch import limit_threads
 from export.package.player_tables import QUALITY_TIERS
 from export.player import Player
-from export.player_page import build_page
+from export.player_page import build_page, encode_motion
 from instant_avatar.animation.driving_motion import FollowingCamera, demo_motion
 from instant_avatar.animation.web_server import make_server
 from instant_avatar.cli.command_line import run_command
@@ -51,7 +51,8 @@ def compare(package: Path, rounds: int) -> int:
     limit_threads(1)
     players = {tier: Player.load(package, tier=tier) for tier in QUALITY_TIERS}
     motion = demo_motion(FRAMES)
-    page = build_page(package, motion, 16.0, name="benchmark", compression_level=1)
+    motions = {"Turn": encode_motion(motion, 16.0)}
+    page = build_page(package, motions, name="benchmark", compression_level=1)
     server = make_server(page, 8090)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     found: dict[str, list[tuple[float, float, float]]] = {tier: [] for tier in QUALITY_TIERS}

@@ -11,6 +11,7 @@ import os
 import sys
 import tarfile
 import zlib
+from collections.abc import Mapping
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
@@ -114,27 +115,35 @@ _compress = lru_cache(maxsize=1)(zlib.compress)
 
 
 def build_page(
-    path: Path, motion: Motion, fps: float, *, name: str, compression_level: int = 6
+    path: Path, motions: Mapping[str, bytes], *, name: str, compression_level: int = 6
 ) -> dict[str, bytes]:
     """Build all files of the page by relative path; index.html is the one to open.
 
-    The page has all tiers of the package. zlib's level: 1 for a local browser, 6 for a host.
+    The page has all tiers of the package, and motions (`encode_motion`) by the names that it shows,
+    of which the first plays at once. zlib's level: 1 for a local browser, 6 for a host.
     """
-    pages = player_files(motion, fps, compression_level=compression_level)
+    pages = player_files(motions, compression_level=compression_level)
     read_package(path)  # every checksum
     pages["index.html"] = titled(pages["index.html"], name)
     return pages | {PACKAGE_FILE: path.read_bytes()}
 
 
-def player_files(motion: Motion, fps: float, *, compression_level: int) -> dict[str, bytes]:
+def player_files(motions: Mapping[str, bytes], *, compression_level: int) -> dict[str, bytes]:
     """Build the page's files but its package, the same for every avatar; arguments as above."""
-    runtime = runtime_files()
+    files = [MOTION_FILE, *(f"{motion.lower()}.npz" for motion in list(motions)[1:])]
+    options = [
+        f'<option value="{file}">{motion}</option>'
+        for file, motion in zip(files, motions, strict=True)
+    ]
+    pages, runtime = static_page_files(), runtime_files()
+    index = pages["index.html"].replace(b"<!-- motions -->", "".join(options).encode())
     runtime[PACKED_WASM_FILE] = pack_runtime(compression_level)
     del runtime[WASM_FILE]
     runtime[PAGE_SCRIPT] = runtime.pop(SCRIPT_FILE)
     return {
-        **static_page_files(),
-        MOTION_FILE: encode_motion(motion, fps),
+        **pages,
+        "index.html": index,
+        **dict(zip(files, motions.values(), strict=True)),
         **{f"runtime/{file}": held for file, held in runtime.items()},
     }
 

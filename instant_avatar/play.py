@@ -138,8 +138,9 @@ def _run_benchmark(arguments: PlayArguments, console: Console) -> int:
 
 def _run_web(arguments: PlayArguments, port: int, console: Console) -> int:
     from export.player import Player
-    from export.player_page import build_page, runtime_files
-    from instant_avatar.animation.driving_motion import demo_motion, load_driving_motion, pose_rate
+    from export.player_page import build_page, encode_motion, runtime_files
+    from instant_avatar.animation.driving_motion import load_driving_motion, pose_rate
+    from instant_avatar.animation.sample_motions import sample_motions
     from instant_avatar.animation.web_server import serve_site, write_site
     from instant_avatar.cli.shared_options import check_output_folder
 
@@ -150,10 +151,14 @@ def _run_web(arguments: PlayArguments, port: int, console: Console) -> int:
         check_output_folder(arguments.out, "--out", arguments.inputs)
     player = Player.load(arguments.avatar)
     _print_package_warnings(player, console)
-    joints, motion = player.manifest.rest_joints, demo_motion()
+    joints, motions = player.manifest.rest_joints, sample_motions()
     if arguments.poses is not None:
-        motion = load_driving_motion(arguments.poses, joints, console, person=arguments.person)
-    fps = arguments.fps or arguments.speed * pose_rate(motion)
+        given = load_driving_motion(arguments.poses, joints, console, person=arguments.person)
+        motions = {"Given": given, **motions}
+    encoded = {
+        motion_name: encode_motion(motion, arguments.fps or arguments.speed * pose_rate(motion))
+        for motion_name, motion in motions.items()
+    }
     name = (
         arguments.avatar.resolve().parent.name
         if arguments.avatar.stem == "avatar"
@@ -161,7 +166,7 @@ def _run_web(arguments: PlayArguments, port: int, console: Console) -> int:
     )
     with console.status("packing the page"):
         level = 1 if arguments.out is None else 6
-        files = build_page(arguments.avatar, motion, fps, name=name, compression_level=level)
+        files = build_page(arguments.avatar, encoded, name=name, compression_level=level)
     if arguments.out is None:
         serve_site(files, port, console)
         return DONE

@@ -34,6 +34,11 @@ MIME_TYPES = {
     ".txt": "text/plain; charset=utf-8",
 }
 """MIME type by suffix."""
+HEADERS = {
+    "Cross-Origin-Opener-Policy": "same-origin", "Cross-Origin-Embedder-Policy": "require-corp",
+    "Cache-Control": "no-cache", "X-Content-Type-Options": "nosniff",
+}  # fmt: skip
+"""Headers of all answers; the first two isolate the page, so that its player may use threads."""
 
 
 def write_site(files: Mapping[str, bytes], path: Path) -> None:
@@ -98,8 +103,8 @@ def _handler(files: Mapping[str, bytes]) -> type[BaseHTTPRequestHandler]:
             self.send_response(status)
             self.send_header("Content-Type", MIME_TYPES.get(suffix, "application/octet-stream"))
             self.send_header("Content-Length", str(len(content)))
-            self.send_header("Cache-Control", "no-cache")
-            self.send_header("X-Content-Type-Options", "nosniff")
+            for header, value in HEADERS.items():
+                self.send_header(header, value)
             self.end_headers()
             self.wfile.write(content)
 

@@ -19,12 +19,14 @@ from export.player_page import (
     ORT_WEB_VERSION,
     PACKAGE_FILE,
     PACKED_WASM_FILE,
+    encode_motion,
     player_files,
     titled,
 )
 from export.warm_up_package import write_warm_up_package
-from instant_avatar.animation.driving_motion import demo_motion, pose_rate
-from instant_avatar.animation.web_server import MIME_TYPES
+from instant_avatar.animation import web_server
+from instant_avatar.animation.driving_motion import pose_rate
+from instant_avatar.animation.sample_motions import sample_motions
 from instant_avatar.cli.console import Console
 from instant_avatar.export import ExportArguments, export
 from instant_avatar.phone.access_control import AccessControl
@@ -52,13 +54,11 @@ MESH_TRIANGLES = 20_000
 """Triangles of a mesh."""
 MAX_AUTHOR_LENGTH = 80
 """Longest author that a VRM names, characters."""
-HEADERS = {
-    "Cross-Origin-Opener-Policy": "same-origin", "Cross-Origin-Embedder-Policy": "require-corp",
-    "Cross-Origin-Resource-Policy": "same-origin", "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer", "Cache-Control": "no-cache",
+HEADERS = web_server.HEADERS | {
+    "Cross-Origin-Resource-Policy": "same-origin", "Referrer-Policy": "no-referrer",
     "X-Frame-Options": "SAMEORIGIN",
 }  # fmt: skip
-"""Headers of all answers; the first two isolate the page, so that its player may use threads."""
+"""Headers of all answers."""
 MODULE_FILE = f"ort-{ORT_WEB_VERSION}.wasm.zlib"
 """The player's WebAssembly module, named by its release."""
 WEB_MODULE = f"runtime/{PACKED_WASM_FILE}"
@@ -210,7 +210,7 @@ class PhoneServer:
         path = PAGE / request.match_info["file"]
         if path.parent != PAGE or path.suffix not in (".js", ".css") or not path.is_file():
             raise InputError("There is no such file.")
-        kind = MIME_TYPES[path.suffix]
+        kind = web_server.MIME_TYPES[path.suffix]
         return web.Response(body=path.read_bytes(), headers={"Content-Type": kind})
 
     async def _runtime(self, request: web.Request) -> web.Response:
@@ -320,7 +320,7 @@ class PhoneServer:
             if file not in self._player:
                 raise InputError("There is no such file.")
             body = self._player[file]
-            kind = MIME_TYPES.get(Path(file).suffix, "application/octet-stream")
+            kind = web_server.MIME_TYPES.get(Path(file).suffix, "application/octet-stream")
             body = titled(body, name) if file == "index.html" else body
             return web.Response(body=body, headers={"Content-Type": kind})
         if name == WARM_UP:
@@ -351,9 +351,10 @@ def _session(request: web.Request) -> str:
 
 
 def _player_files() -> dict[str, bytes]:
-    """The files of a player's page with the built-in motion."""
-    motion = demo_motion()
-    return player_files(motion, pose_rate(motion), compression_level=1)
+    """The files of a player's page with the sample motions."""
+    samples = sample_motions()
+    motions = {name: encode_motion(motion, pose_rate(motion)) for name, motion in samples.items()}
+    return player_files(motions, compression_level=1)
 
 
 def _warm_up_package() -> bytes:

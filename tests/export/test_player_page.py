@@ -38,13 +38,20 @@ def motion(bent):
 @pytest.fixture
 def files(exported, motion, kept, monkeypatch):
     monkeypatch.setattr(player_page, "RUNTIME_FOLDER", kept)
-    return player_page.build_page(exported.path, motion, 25.0, name="<an avatar>")
+    return player_page.build_page(
+        exported.path,
+        {"Given": player_page.encode_motion(motion, 25.0), "Turn": b"turn"},
+        name="<an avatar>",
+    )
 
 
 def test_the_page_holds_the_package_and_the_valid_poses(files, exported, motion, tmp_path):
     assert files["avatar.iavatar"] == exported.path.read_bytes()
     assert b"<title>&lt;an avatar&gt;</title>" in files["index.html"]
     assert zlib.decompress(files["runtime/ort.wasm.zlib"]) == b"ort.wasm"
+    options = '<option value="motion.npz">Given</option><option value="turn.npz">Turn</option>'
+    assert options in files["index.html"].decode()
+    assert files["turn.npz"] == b"turn"
     path = tmp_path / "motion.npz"
     path.write_bytes(files["motion.npz"])
     with np.load(path) as held:

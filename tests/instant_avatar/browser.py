@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 from PIL import Image
 
 FLAGS = [
@@ -138,6 +139,20 @@ class Browser:
             deviceScaleFactor=1,
             mobile=width < 600,
         )
+
+    def claim_cores(self, count: int) -> None:
+        """What the machine says of its cores."""
+        self._ask("Emulation.setHardwareConcurrencyOverride", hardwareConcurrency=count)
+
+    def worker_threads(self) -> int:
+        """Threads that run workers, in all of its processes; Linux names them."""
+        family = psutil.Process(self._process.pid).children(recursive=True)
+        names = [
+            (Path("/proc") / str(process.pid) / "task" / str(thread.id) / "comm").read_text()
+            for process in family
+            for thread in process.threads()
+        ]
+        return sum(name.startswith("DedicatedWorker") for name in names)
 
     def press(self, key: str) -> None:
         """A key goes down and up; characters are typed."""

@@ -1,4 +1,4 @@
-// Runs the package's own ONNX graph in WebAssembly, one thread, away from the page.
+// Runs the package's own ONNX graph in WebAssembly, away from the page.
 
 import { InferenceSession, Tensor, env } from "./runtime/ort.js";
 import { answer } from "./worker_calls.js";
@@ -6,8 +6,8 @@ import { answer } from "./worker_calls.js";
 const sessions = {}, finer = {}; // by tier; what to make before each of the next pictures
 
 /** Start the runtime, a WebAssembly module. */
-async function load({ wasm }) {
-  env.wasm.numThreads = 1;
+async function load({ wasm, threads }) {
+  env.wasm.numThreads = threads;
   env.wasm.wasmBinary = wasm;
   env.logLevel = "fatal";
   await InferenceSession.create(new Uint8Array()).catch(() => {}); // no graph, but the runtime has started
@@ -45,4 +45,4 @@ async function draw({ tier, bones, camera, width, height, samples }) {
   return [{ rgba: buffer, ms: performance.now() - began }, [buffer]];
 }
 
-answer({ load, open, draw });
+answer({ load, open, draw, end: () => close() });

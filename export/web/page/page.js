@@ -1,13 +1,14 @@
 // The page: buttons, settings and words around the playback.
 
 import "./ia-avatar.js";
+import { fetched, readMotion } from "./package.js";
 import { QUICK_MS } from "./playback.js";
 
 const TIERS = { hq: "Full", lite: "Lite" };
 const BACKGROUNDS = { "As the page": "", White: "#ffffff", Grey: "#8c8c8c", Black: "#000000", Green: "#00b140" };
 const THEMES = { system: "System", light: "Light", dark: "Dark" };
 const SAID_MS = 6000;
-const TRIED_MS = 1000; // time in which a page that starts with Lite finds out what the device manages
+const TRIED_MS = 1000; // time in which a page finds out what the device manages
 const FULL_COSTS = 1.7; // time of a picture in Full, in pictures in Lite
 const BAR_PX = 76; // the bar's height and the gap below it
 const $ = (id) => document.getElementById(id);
@@ -29,7 +30,7 @@ export function start() {
     window.player = player; // for scripts: verify(), measure()
     markPlaying(state);
     loading.done();
-    if (state.tier !== "hq") tryFull(player, state, avatar.playback, loading);
+    setTimeout(() => adapt(player, state, avatar.playback, loading), TRIED_MS);
   });
   if (options.has("warm-up")) { // out of sight: draws one coarse picture and one sharp one
     avatar.toggleAttribute("paused", true);
@@ -42,18 +43,22 @@ export function start() {
   });
 }
 
-/** Change from Lite to Full once the device has shown that it draws fast enough, unless a tier was chosen. */
-function tryFull(player, state, playback, loading) {
-  setTimeout(async () => {
-    if (state.chosen || playback.typicalMs() * FULL_COSTS > QUICK_MS) return;
-    const opened = player.open({ tier: "hq" });
-    loading.done(); // there is a picture meanwhile
-    await opened;
-    if (state.chosen) return;
-    state.tier = "hq";
-    playback.changed();
-    markTier(state);
-  }, TRIED_MS);
+/** Draw with more threads where the device is slow and they pay, and in Full where it is fast, unless a tier was chosen. */
+async function adapt(player, state, playback, loading) {
+  const isQuick = () => playback.typicalMs() * (state.tier === "hq" ? 1 : FULL_COSTS) <= QUICK_MS;
+  if (state.chosen) return;
+  if (!isQuick() && await player.engine.spread().catch(() => false)) { // or there is no room for another worker
+    playback.took = [];
+    await new Promise((resolve) => setTimeout(resolve, TRIED_MS));
+  }
+  if (state.chosen || state.tier === "hq" || !isQuick()) return;
+  const opened = player.open({ tier: "hq" });
+  loading.done(); // there is a picture meanwhile
+  await opened;
+  if (state.chosen) return;
+  state.tier = "hq";
+  playback.changed();
+  markTier(state);
 }
 
 function markTier(state) {
@@ -136,6 +141,18 @@ function settings(player, state, playback, loading) {
   choices($("tiers"), known(TIERS, Object.keys(player.avatar.tiers)), state.tier, changeTier);
   choices($("themes"), THEMES, "system", (theme) => { document.documentElement.dataset.theme = theme; });
   backgrounds();
+  $("motions").hidden = $("motions").length < 2;
+  $("motions").onchange = async () => {
+    try {
+      player.drive(await readMotion(await fetched($("motions").value)));
+      $("timeline").max = player.count - 1;
+      playback.seek(0);
+      playback.play(true);
+      markPlaying(state);
+    } catch (error) {
+      loading.showError(error.message);
+    }
+  };
   $("sharpness").onchange = () => { state.sharpness = $("sharpness").value; playback.changed(); };
   $("speed").onchange = () => { state.speed = Number($("speed").value); };
   $("check").onclick = () => check(player);

@@ -43,18 +43,23 @@ export class Player {
     }));
     const standing = new Float32Array(POSE);
     standing.set(avatar.canonical_rotations.flat(), 6);
-    const { poses, fps } = (await reading) || { poses: standing, fps: 30 };
+    const moves = (await reading) || { poses: standing, fps: 30 };
     const { low, high } = await taken;
-    const front = rigid(poses.slice(0, 3)); // the first pose is upright
-    const axes = [1, -1, -1].map((sign, axis) => [0, 4, 8].map((row) => sign * front[row + axis]));
-    avatar.look = { axes, pelvis: avatar.rest_joints[0], height_m: high - low, middle_m: (high + low) / 2 };
-    return new Player(avatar, entries, engine, poses, fps);
+    avatar.look = { pelvis: avatar.rest_joints[0], height_m: high - low, middle_m: (high + low) / 2 };
+    return new Player(avatar, entries, engine, moves);
   }
 
-  constructor(avatar, entries, engine, poses, fps) {
-    Object.assign(this, { avatar, entries, engine, poses, fps });
-    this.count = poses.length / POSE;
+  constructor(avatar, entries, engine, moves) {
+    Object.assign(this, { avatar, entries, engine });
+    this.drive(moves);
     this.skeleton = new Skeleton(avatar);
+  }
+
+  /** Take a motion (`readMotion`), of which the first pose is upright and seen from the front. */
+  drive({ poses, fps }) {
+    Object.assign(this, { poses, fps, count: poses.length / POSE });
+    const front = rigid(poses.slice(0, 3));
+    this.avatar.look.axes = [1, -1, -1].map((sign, axis) => [0, 4, 8].map((row) => sign * front[row + axis]));
   }
 
   pose(row) {

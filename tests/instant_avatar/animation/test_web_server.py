@@ -19,7 +19,9 @@ from export import player_page
 from export.package.package_file import read_package
 from export.player import PictureDifference, Player, premultiply
 from export.player_inputs import graph_initializers
+from instant_avatar.animation import web_server
 from instant_avatar.animation.driving_motion import FollowingCamera, demo_motion
+from instant_avatar.animation.sample_motions import sample_motions
 from instant_avatar.animation.web_server import make_server
 from preprocess.poses.pose_format_registry import read_poses
 from tests.instant_avatar.browser import Browser, chromium, until
@@ -232,6 +234,29 @@ def test_the_page_plays_pauses_turns_and_zooms(page):
 @with_runtime
 @with_chromium
 @pytest.mark.slow
+def test_a_motion_plays_once_it_is_chosen_beside_the_given_one(page):
+    def choose(file, count):
+        page.run(
+            f"""(() => {{
+              const motions = document.getElementById("motions");
+              motions.value = "{file}";
+              motions.dispatchEvent(new Event("change"));
+            }})()"""
+        )
+        until(lambda: page.run("player.count") == count, 30.0)
+
+    given = page.run("player.count")
+    paused(page)
+    for file, motion in list(sample_motions().items())[1:]:
+        choose(f"{file.lower()}.npz", len(motion))
+        until(lambda: moves(page), 30.0)
+        assert page.run("Number(document.getElementById('timeline').max)") == len(motion) - 1
+    choose("motion.npz", given)
+
+
+@with_runtime
+@with_chromium
+@pytest.mark.slow
 def test_the_page_is_dark_for_those_who_like_it_and_fits_a_phone(page):
     paused(page)
     page.emulate(scheme="dark", size=(390, 700))
@@ -306,14 +331,54 @@ def test_what_is_too_near_for_surfels_is_drawn_with_fewer_pixels(page):
     assert 500 < near < 1800
 
 
+def edited_page(package, file, before, after):
+    """A page of its own with another number in a script."""
+    motions = {"Turn": player_page.encode_motion(demo_motion(), 30.0)}
+    page = player_page.build_page(package, motions, name="x", compression_level=1)
+    assert page[file].count(before) == 1
+    return page | {file: page[file].replace(before, after)}
+
+
+@with_runtime
+@with_chromium
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("isolated", "cores", "pays", "threads"),
+    [(True, 6, 1e9, 3), (True, 6, 0, 1), (True, 2, 1e9, 1), (False, 6, 1e9, 1)],
+)
+def test_an_isolated_page_draws_with_more_threads_where_they_pay(
+    package, tmp_path, monkeypatch, isolated, cores, pays, threads
+):
+    page = edited_page(package, "engine.js", b"PAYS = 0.8", f"PAYS = {pays}".encode())
+    quick = 0 if threads > 1 else 1e9  # the page tries by itself, or the test makes it
+    edited = page["playback.js"].replace(b"QUICK_MS = 45", f"QUICK_MS = {quick}".encode())
+    assert edited != page["playback.js"]
+    page["playback.js"] = edited
+    if not isolated:
+        monkeypatch.delitem(web_server.HEADERS, "Cross-Origin-Embedder-Policy")
+    server = make_server(page, 8098)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    with Browser(tmp_path, size=(360, 400)) as browser:
+        browser.emulate(scheme="light", size=(360, 400))
+        browser.claim_cores(cores)
+        browser.go(f"http://127.0.0.1:{server.server_port}/?start=hq")
+        until(lambda: browser.run("!!window.player"), 120.0)
+        assert browser.run("crossOriginIsolated") is isolated
+        if threads == 1:
+            assert browser.run("player.engine.spread()", seconds=120.0) is False
+        until(lambda: browser.run("player.engine.graphs.threads") == threads, 120.0)
+        until(lambda: browser.worker_threads() == 1 + threads, 60.0)
+        found = browser.run("player.verify()", seconds=240.0)
+        assert all(frame["alike"] for frame in found), found
+    server.shutdown()
+    server.server_close()
+
+
 @with_runtime
 @with_chromium
 @pytest.mark.slow
 def test_full_replaces_lite_without_a_word_where_the_device_is_fast(package, tmp_path):
-    page = player_page.build_page(package, demo_motion(), 30.0, name="x", compression_level=1)
-    playback = page["playback.js"]
-    page["playback.js"] = playback.replace(b"QUICK_MS = 45", b"QUICK_MS = 1e9")
-    assert page["playback.js"] != playback
+    page = edited_page(package, "playback.js", b"QUICK_MS = 45", b"QUICK_MS = 1e9")
     server = make_server(page, 8095)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     with Browser(tmp_path, size=(360, 400)) as browser:
