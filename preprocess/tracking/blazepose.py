@@ -30,8 +30,10 @@ from preprocess.tracking.blazepose_networks import (
     FoundLandmarks,
     PersonDetection,
     PersonSquare,
+    parts_of_frame,
 )
 from preprocess.tracking.keypoints import HIPS, MIN_PRESENCE, CroppedMask, PersonKeypoints
+from preprocess.tracking.person_separation import separate_mask
 
 SHOULDERS, KNEES = (11, 12), (25, 26)
 """Numbers of key points, left and right."""
@@ -107,6 +109,10 @@ NEAR = 0.6
 """Distance of another person, in sides of the square, within which the two may be mixed up."""
 OVERLAPPING = 0.3
 """Distance within which two persons hide each other."""
+REACHING = 1.0
+"""Distance of another person within which its limbs may reach into the person's square."""
+MAX_MIXED = 0.1
+"""Share of a person's mask that may be nearer to another one's limbs: an arm is 0.06."""
 MAX_COLOR_DISTANCE = 8.0
 """Largest difference of a person's colors, in units of CIELAB, if the others' are not known."""
 MAX_UNSEEN_COLOR_DISTANCE = 12.0
@@ -155,9 +161,10 @@ class BlazePoseTracker:
         self._person = person
         self._last: LastPlace | None = None
         self._looks, self._company = PersonLooks(), PersonLooks()
-        self._frames_to_watch = 0
+        self._frames_to_watch, self._watched = 0, 0
         self._crowded_frames = 0
         self._has_company = False
+        self._beside: FoundLandmarks | None = None
         self._mask_px = 0.0
         self._is_replaced = False  # by another person at the same place
 
@@ -176,8 +183,14 @@ class BlazePoseTracker:
             self._frames_to_watch = 0
         self._last = LastPlace(square=found.square)
         self._watch(rgb, found)
-        is_near = self._crowded_frames > CROWD_MEMORY - SEEN_AGO
-        return replace(found.keypoints, crowded=is_near)
+        return self._separated(found.keypoints)
+
+    def _separated(self, person: PersonKeypoints) -> PersonKeypoints:
+        """The person without the limbs of another one, and whether the two may be mixed up."""
+        if self._beside is None:
+            return replace(person, crowded=self._crowded_frames > CROWD_MEMORY - SEEN_AGO)
+        mask, removed = separate_mask(person, self._beside.keypoints)
+        return replace(person, mask=mask, crowded=removed > MAX_MIXED)
 
     def _follow(self, rgb: RgbImage) -> FoundLandmarks | None:
         """The person, where the last frame's key points say; None if it is not there."""
@@ -272,12 +285,13 @@ class BlazePoseTracker:
     def _watch(self, rgb: RgbImage, found: FoundLandmarks) -> None:
         """Look for other persons every few frames; while there are none, learn this one's looks."""
         self._crowded_frames = max(0, self._crowded_frames - 1)
+        self._follow_beside(rgb, found)
         self._frames_to_watch -= 1
         if self._frames_to_watch > 0:
             return
         self._frames_to_watch = WATCH_INTERVAL
         nearest = 1.0
-        for other in self._detect(rgb):
+        for other in self._detect_some(rgb):
             apart = distance_in_sides(found.square, other.square)
             if apart > SAME_PERSON_DISTANCE and not self._is_same(rgb, found.square, other.square):
                 self._has_company = True
@@ -288,19 +302,44 @@ class BlazePoseTracker:
         if is_clear or not self._looks.is_known:
             self._looks.learn(colors_of(rgb, found.keypoints))
 
+    def _detect_some(self, rgb: RgbImage) -> list[PersonDetection]:
+        """The persons of all parts of the first frame, later of one part after the other."""
+        if not self._looks.is_known:
+            return self._detect.find_all(rgb, in_parts=True)
+        areas = (None, *parts_of_frame(rgb))
+        self._watched += 1
+        return self._detect(rgb, areas[self._watched % len(areas)])
+
+    def _follow_beside(self, rgb: RgbImage, found: FoundLandmarks) -> None:
+        """Find the person beside this one where it was in the last frame."""
+        if self._beside is not None:
+            self._see_beside(found.square, self._find_landmarks(rgb, self._beside.square))
+
+    def _see_beside(self, person: PersonSquare, other: FoundLandmarks) -> None:
+        """Remember the other one, unless it is the person itself or far away."""
+        apart = distance_in_sides(person, other.square)
+        is_beside = other.keypoints.presence >= MIN_PRESENCE and OVERLAPPING < apart < REACHING
+        self._beside = other if is_beside else None
+        if is_beside and apart < NEAR:
+            self._crowded_frames = CROWD_MEMORY
+
     def _is_same(self, rgb: RgbImage, person: PersonSquare, other: PersonSquare) -> bool:
         """Check whether a detection near the person is the person; remember another one's looks.
 
         The detector's squares around small persons lie beside them; their key points do not.
         """
-        if distance_in_sides(person, other) >= NEAR:
+        apart = distance_in_sides(person, other)
+        if apart >= REACHING:
             return False
         found = self._find_landmarks(rgb, other)
         if found.keypoints.presence < MIN_PRESENCE:
             return False
         if distance_in_sides(person, found.square) <= OVERLAPPING:
             return True
-        self._company.learn(colors_of(rgb, found.keypoints))
+        if self._beside is None or apart < distance_in_sides(person, self._beside.square):
+            self._see_beside(person, found)
+        if apart < NEAR:
+            self._company.learn(colors_of(rgb, found.keypoints))
         return False
 
     def _looks_right(self, colors: Float[np.ndarray, "numbers"]) -> bool:

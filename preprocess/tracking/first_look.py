@@ -231,7 +231,7 @@ class PersonFinder:
     def persons(self, rgb: RgbImage) -> list[FoundLandmarks]:
         """Find the largest person and others nearly as large, the largest first."""
         persons: list[FoundLandmarks] = []
-        for detection in self._detect.find_all(rgb):
+        for detection in self._detect.find_all(rgb, in_parts=True):
             rough = self._landmarks(rgb, detection.square)
             if rough.keypoints.presence >= MIN_PRESENCE and not any(
                 distance_in_sides(other.square, rough.square) < OVERLAPPING for other in persons

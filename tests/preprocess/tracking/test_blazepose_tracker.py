@@ -19,6 +19,7 @@ from preprocess.tracking.blazepose_networks import (
     parts_of_frame,
     refine,
 )
+from preprocess.tracking.first_look import PersonFinder
 from preprocess.tracking.video_tracking import ProblemFinder, TrackingProblem
 
 SIZE = (270, 480)
@@ -183,6 +184,23 @@ def test_a_person_who_walks_past_is_not_followed(striped, plain, is_in_front):
     assert len(found_frames) == 24 if not is_in_front else len(found_frames) > 10
 
 
+def test_persons_side_by_side_are_separated(striped, plain):
+    """Their arms reach into each other's square, but hide little of each other."""
+    left, beside, width = 40, 190, 480
+    tracker = BlazePoseTracker(person=1)
+    found = [tracker(scene((striped, left), (plain, beside), width=width)) for _ in range(3)][-1]
+    assert found is not None
+    assert not found.crowded
+    size_px = (width, SIZE[1])
+    mask = found.mask.resample(size_px, size_px) > 0.5
+    other = np.zeros(mask.shape, dtype=bool)
+    other[:, beside : beside + SIZE[0]] = plain.alpha > 0.5
+    own = np.zeros(mask.shape, dtype=bool)
+    own[:, left : left + SIZE[0]] = striped.alpha > 0.5
+    assert (mask & own & ~other).sum() > 0.95 * (own & ~other).sum()
+    assert (mask & other).sum() < 0.04 * other.sum()  # 0.053 before they were separated
+
+
 def test_a_small_person_is_not_another_one(striped):
     """The detector's square lies beside so small a person."""
     tracker, size = BlazePoseTracker(), (67, 120)
@@ -203,6 +221,7 @@ def test_each_of_two_persons_in_a_wide_picture_can_be_followed(striped, plain, p
     found = BlazePoseTracker(person=person)(picture)
     assert found is not None
     assert abs(hips(found) - middle(430 * (person - 1))) < 30
+    assert len(PersonFinder().persons(picture)) == 2
 
 
 def test_a_person_who_leaves_and_returns_is_found_again(plain):
