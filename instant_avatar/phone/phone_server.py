@@ -4,6 +4,7 @@ import asyncio
 import json
 import tempfile
 import threading
+import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -98,6 +99,7 @@ class PhoneServer:
                 web.get("/", self._index),
                 web.get("/live", self._go_live),
                 web.get("/page/{file}", self._file),
+                web.get("/films", self._begun),
                 web.post("/films", self._begin),
                 web.get("/films/{number}", self._state),
                 web.put("/films/{number}", self._piece),
@@ -169,6 +171,9 @@ class PhoneServer:
         return answer
 
     def _enter(self, request: web.Request) -> web.Response:
+        session = _session(request)
+        if self._access.is_known(session):  # it keeps its films
+            return web.Response(status=303, headers={"Location": "/", **HEADERS})
         session = self._access.enter(request.query["token"])
         if session is None:
             raise FilmRefused(403, REFUSED)
@@ -236,8 +241,18 @@ class PhoneServer:
         begun = {"film": film.number, "avatar": film.place.name, "next": 0}
         return web.json_response(begun, status=201)
 
+    async def _begun(self, request: web.Request) -> web.Response:
+        """This browser's films that are not over, for a page that was loaded again."""
+        own = [film for film in self._queue if film.owner == _session(request)]
+        return web.json_response(
+            [{"film": film.number, "avatar": film.place.name, "size": film.file.size,
+              "received": film.file.received, "ended": film.file.ended} for film in own]
+        )  # fmt: skip
+
     async def _state(self, request: web.Request) -> web.Response:
-        return self._progress(self._film(request))
+        film = self._film(request)
+        film.heard_at = time.monotonic()  # a page that waits for a choice is not silent
+        return self._progress(film)
 
     def _progress(self, film: Film) -> web.Response:
         file = film.file

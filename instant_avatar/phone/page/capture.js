@@ -6,8 +6,10 @@ const $ = (id) => document.getElementById(id);
 const COUNTDOWN_S = 5;
 const PIECE_MS = 100; // length of what the camera hands over at once
 const SPOKEN_AGAIN_MS = 9000;
+const OFFERED_MS = 120000; // time in which a person may go on with a film after the page was loaded again
+const HEARTBEAT_MS = 5000; // a film ends when nothing is heard of its page
 const KINDS = ["video/webm;codecs=h264", "video/mp4;codecs=avc1.42E01E", "video/webm;codecs=vp8", "video/webm", "video/mp4"];
-let adding = "", making = "", facing = "environment", stream = null, shown = "", playing = "";
+let resume = null, adding = "", making = "", facing = "environment", stream = null, shown = "", playing = "";
 
 function view(name) {
   for (const id of ["home", "filming", "done"]) $(id).hidden = id !== name;
@@ -39,16 +41,26 @@ function say(text) {
   speechSynthesis.speak(new SpeechSynthesisUtterance(text));
 }
 
-/** Begin a film and listen to what the server tells of it; resolves when it is this film's turn. */
+/** Begin a film; resolves when it is its turn. */
 async function begin(type, size) {
-  view("filming");
-  $("map").replaceChildren(); $("preview").hidden = true; $("preview").removeAttribute("src"); $("seconds").textContent = $("seen").textContent = $("sent").textContent = ""; $("progress").value = 0;
+  viewFilm();
   const body = JSON.stringify({ name: $("name").value, type, size, avatar: adding });
   const { film, avatar } = await ask("films", { method: "POST", body });
+  await follow(film, avatar);
+  return film;
+}
+
+function viewFilm() {
+  view("filming");
+  $("map").replaceChildren(); $("preview").hidden = true; $("preview").removeAttribute("src"); $("seconds").textContent = $("seen").textContent = $("sent").textContent = ""; $("progress").value = 0;
+}
+
+/** Listen to what the server tells of a film; resolves when it is its turn. */
+async function follow(film, avatar) {
   making = avatar;
   const events = new EventSource(`films/${film}/messages`);
   const on = (kind, act) => events.addEventListener(kind, (event) => act(JSON.parse(event.data)));
-  on("advice", ({ text, time }) => { say(text); $("advice").dataset.time = time; });
+  on("advice", ({ text, time }) => { if ($("offer").hidden) say(text); $("advice").dataset.time = time; });
   on("seconds", ({ seconds }) => {
     $("seconds").textContent = `${seconds.toFixed(0)} s looked at`;
     if (making && making === shown) $("note").textContent = `Making the avatar: ${$("seconds").textContent} …`; // a stored film
@@ -70,12 +82,44 @@ async function begin(type, size) {
   on("failed", ({ text }) => { making = shown = ""; finish(); home(); warn(text); });
   on("over", () => { events.close(); listEarlier(); });
   await new Promise((resolve) => on("state", ({ state, behind }) => {
-    if (state === "waiting") say(`Waiting for ${behind.join(", ")} …`);
+    if (state === "waiting" && $("offer").hidden) say(`Waiting for ${behind.join(", ")} …`);
     if (state === "filming") resolve();
     if (state === "done" && shown === avatar) $("note").textContent = "It is ready.";
   }));
   play(avatar);
-  return film;
+}
+
+/** Go on with a film that this browser began before the page was loaded again. */
+async function recall() {
+  const begun = (await ask("films")).at(-1);
+  if (!begun || $("home").hidden) return;
+  const { film, avatar, size, received, ended } = begun, path = `films/${film}`;
+  viewStored();
+  follow(film, avatar);
+  const file = ended ? null : await offer(path, begun);
+  [$("stage").hidden, $("offer").hidden] = [false, true];
+  if (file) await transfer(film, new Stored(file));
+  else learn((await ask(`${path}/end?size=${received}`, { method: "POST" })).reason);
+}
+
+/** Let a person choose how a film ends; resolves with the rest of it, a file, or null. */
+async function offer(path, { avatar, size, received }) {
+  const megabytes = (bytes) => (bytes / 1e6).toFixed(1);
+  $("advice").textContent = size
+    ? `This page was loaded again when ${megabytes(received)} of ${megabytes(size)} MB of ${avatar} were sent. Choose the same video: the rest follows.`
+    : `This page was loaded again while it filmed ${avatar}. What was filmed until then is kept; “Film more” adds to its avatar.`;
+  $("same").hidden = !size;
+  [$("stage").hidden, $("offer").hidden] = [true, false];
+  const heartbeat = setInterval(() => ask(path, { once: true }).catch(() => {}), HEARTBEAT_MS);
+  const file = await new Promise((resolve) => {
+    resume = (given) => { if (given.size === size) resolve(given); else warn(`That is another video: ${avatar} has ${megabytes(size)} MB.`); };
+    $("same").onclick = () => { $("stored").value = ""; $("stored").click(); };
+    $("finish").onclick = () => resolve(null);
+    setTimeout(() => resolve(null), OFFERED_MS);
+  });
+  resume = null;
+  clearInterval(heartbeat);
+  return file;
 }
 
 /** Start the player of an avatar; before there is one, it waits for the film's package. */
@@ -91,6 +135,11 @@ async function transfer(film, source) {
     $("sent").textContent = `${(bytes / 1e6).toFixed(1)} MB sent`;
     if (source instanceof Stored) $("progress").value = bytes / source.end;
   });
+  learn(reason);
+}
+
+/** Show what is made of a film that has come, or why it ended early. */
+function learn(reason) {
   if (making) {
     say("Making the avatar …");
     open(making, "Making the avatar …");
@@ -98,10 +147,20 @@ async function transfer(film, source) {
   if (reason) warn(reason);
 }
 
-async function upload(file) {
-  if (!file) return;
+/** The view of a film without a camera. */
+function viewStored() {
+  viewFilm();
   $("stage").classList.add("ended");
   $("stop").hidden = $("turn").hidden = true;
+}
+
+async function upload(file) {
+  if (!file) return;
+  if (resume) {
+    resume(file);
+    return;
+  }
+  viewStored();
   try {
     const film = await begin(file.type || "video/mp4", file.size);
     say("Learning while the film arrives …");
@@ -248,3 +307,4 @@ for (const kind of ["dragover", "dragleave", "drop"]) {
 }
 for (const kind of ["click", "drop"]) addEventListener(kind, () => { $("warning").hidden = true; }, true); // seen
 listEarlier();
+recall().catch((error) => { home(); warn(error.message); });

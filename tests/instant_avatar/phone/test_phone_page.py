@@ -210,6 +210,69 @@ def test_a_film_begins_without_the_figures_of_the_one_before(page):
     assert text_of(browser, "sent") == ""
 
 
+def reload(browser):
+    browser.run("window.before = true; location.reload()")
+    until(lambda: browser.run("!window.before && !!document.getElementById('live')?.onclick"), 60.0)
+
+
+def test_a_page_that_is_loaded_again_goes_on_with_a_file(page, run):
+    browser, queue = page
+    browser.run(
+        """(async () => {
+          const note = { name: "Ben", type: "video/mp4", size: 5_000_000 };
+          const body = JSON.stringify(note);
+          const { film } = await (await fetch("films", { method: "POST", body })).json();
+          await fetch(`films/${film}?offset=0`, { method: "PUT", body: new Uint8Array(1_500_000) });
+        })()"""
+    )  # the page ends here
+    film = queue.take_next(60.0)
+    reload(browser)
+    until(lambda: "1.5 of 5.0 MB of Ben were sent" in browser.text(), 60.0)
+    film.heard_at -= 20.0
+    silent_since = film.heard_at
+    until(lambda: film.heard_at > silent_since, 60.0)  # the film waits for the choice
+    choose_video(browser, size=4)
+    until(lambda: "That is another video" in browser.text(), 60.0)
+    assert film.file.received == 1_500_000
+    choose_video(browser, size=5_000_000)
+    until(lambda: film.file.ended, 60.0)
+    assert film.file.received == 5_000_000
+    until(lambda: "Making the avatar" in browser.text(), 60.0)
+    reload(browser)  # also while it is learnt from
+    until(lambda: "Making the avatar" in browser.text(), 60.0)
+    film.run.path.mkdir()
+    shutil.copy(run / "avatar.iavatar", film.run.path)
+    film.tell("avatar", name="Ben", final=True)
+    until(lambda: "It is ready." in browser.text(), 60.0)
+    queue.finish(film)
+    reload(browser)
+    until(lambda: browser.run("document.querySelectorAll('#avatars button').length") == 2, 60.0)
+    assert not browser.run("document.getElementById('home').hidden")
+
+
+def test_a_page_that_is_loaded_again_keeps_what_it_filmed(camera_film, tmp_path):
+    queue, access = FilmQueue(tmp_path / "out", 30.0), AccessControl()
+    queue.folder.mkdir()
+    server = PhoneServer(queue, access, None)
+    server.start("127.0.0.1", [(8749, None)])
+    with Browser(tmp_path / "browser", flags=camera_flags(camera_film)) as browser:
+        browser.go(f"http://127.0.0.1:8749/?token={access.token}")
+        until(lambda: browser.run("!!document.getElementById('live')?.onclick"), 60.0)
+        browser.click("Film here, with advice")
+        film = queue.take_next(60.0)
+        until(lambda: film.file.received > 50_000, 60.0)
+        browser.go(f"http://127.0.0.1:8749/?token={access.token}")  # the tab was closed
+        until(lambda: "while it filmed avatar" in browser.text(), 60.0)
+        received = film.file.received
+        assert not film.file.ended
+        assert browser.run("document.getElementById('same').offsetParent === null")
+        browser.click("Make the avatar of what came")
+        until(lambda: "Making the avatar" in browser.text(), 60.0)
+        assert film.file.ended
+        assert film.file.received == film.file.path.stat().st_size == received
+    server.close()
+
+
 def test_a_film_of_the_pages_camera_becomes_an_avatar_in_its_player(camera_film, tmp_path):
     command = [
         sys.executable, "-m", "instant_avatar.phone.phone_command", "--out", str(tmp_path / "out"),

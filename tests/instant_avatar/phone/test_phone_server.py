@@ -195,6 +195,21 @@ def test_another_browser_does_not_see_the_film(phone):
     assert phone.ask("PUT", f"/films/{film}?offset=0", b"x", cookie=other).status == 404
 
 
+def test_a_browser_finds_its_films_again_also_with_a_new_address(phone):
+    film = phone.begin()
+    phone.ask("PUT", f"/films/{film}?offset=0", CONTENT[:1000])
+    entered = phone.ask("GET", f"/?token={phone.access.token}")
+    assert entered.status == 303
+    assert "Set-Cookie" not in entered.headers
+    (begun,) = json.loads(phone.ask("GET", "/films").content)
+    assert begun == {
+        "film": film, "avatar": "Anna", "size": len(CONTENT), "received": 1000, "ended": False,
+    }  # fmt: skip
+    other = phone.ask("GET", f"/?token={phone.access.token}", cookie="")
+    other = other.headers["Set-Cookie"].split(";")[0]
+    assert json.loads(phone.ask("GET", "/films", cookie=other).content) == []
+
+
 def test_a_full_disk_ends_the_film_and_keeps_what_came(phone, queue, monkeypatch):
     film = phone.begin()
     assert phone.ask("PUT", f"/films/{film}?offset=0", CONTENT[:1000]).status == 200
