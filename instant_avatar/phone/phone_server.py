@@ -126,15 +126,26 @@ class PhoneServer:
 
         self._runner = runner
         self._loop.run_until_complete(listen())
-        threading.Thread(target=self._loop.run_forever, daemon=True).start()
+        self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
+        self._thread.start()
 
     def close(self) -> None:
         """End all connections."""
         for film in self._queue:
             film.is_over = True
-        closing = asyncio.run_coroutine_threadsafe(self._runner.cleanup(), self._loop)
-        closing.result(timeout=10.0)
+
+        async def end() -> None:
+            await self._runner.cleanup()
+            left = asyncio.all_tasks() - {asyncio.current_task()}
+            for task in left:
+                task.cancel()
+            await asyncio.gather(*left, return_exceptions=True)
+
+        asyncio.run_coroutine_threadsafe(end(), self._loop).result(timeout=10.0)
         self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.run_until_complete(asyncio.sleep(0.0))  # its sockets are closed in a next round
+        self._loop.close()
 
     @web.middleware
     async def _guard(

@@ -211,7 +211,8 @@ def test_a_film_begins_without_the_figures_of_the_one_before(page):
 
 
 def reload(browser):
-    browser.run("window.before = true; location.reload()")
+    browser.run("window.before = true")
+    browser.go(browser.run("location.href"))
     until(lambda: browser.run("!window.before && !!document.getElementById('live')?.onclick"), 60.0)
 
 
