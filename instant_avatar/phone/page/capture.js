@@ -97,7 +97,7 @@ async function recall() {
   viewStored();
   follow(film, avatar);
   const file = ended ? null : await offer(path, begun);
-  [$("stage").hidden, $("offer").hidden] = [false, true];
+  $("offer").hidden = true;
   if (file) await transfer(film, new Stored(file));
   else learn((await ask(`${path}/end?size=${received}`, { method: "POST" })).reason);
 }
@@ -109,7 +109,7 @@ async function offer(path, { avatar, size, received }) {
     ? `This page was loaded again when ${megabytes(received)} of ${megabytes(size)} MB of ${avatar} were sent. Choose the same video: the rest follows.`
     : `This page was loaded again while it filmed ${avatar}. What was filmed until then is kept; “Film more” adds to its avatar.`;
   $("same").hidden = !size;
-  [$("stage").hidden, $("offer").hidden] = [true, false];
+  $("offer").hidden = false;
   const heartbeat = setInterval(() => ask(path, { once: true }).catch(() => {}), HEARTBEAT_MS);
   const file = await new Promise((resolve) => {
     resume = (given) => { if (given.size === size) resolve(given); else warn(`That is another video: ${avatar} has ${megabytes(size)} MB.`); };

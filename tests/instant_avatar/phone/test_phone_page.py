@@ -294,6 +294,8 @@ def test_a_film_of_the_pages_camera_becomes_an_avatar_in_its_player(camera_film,
             until(lambda: "seen" in browser.text(), 600.0)
             assert browser.run("document.documentElement.scrollWidth") <= 360
             until(lambda: browser.run("!document.getElementById('preview').hidden"), 600.0)
+            stop = "document.getElementById('stop').getBoundingClientRect().bottom"
+            assert browser.run(f"{stop} <= innerHeight")  # also below advice, figures and preview
             browser.click("Stop")
             until(lambda: browser.run("!document.getElementById('done').hidden"), 900.0)
             until(lambda: browser.run("document.getElementById('poster').naturalWidth"), 60.0)
