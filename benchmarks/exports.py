@@ -223,7 +223,9 @@ def mesh_file(package: AvatarPackage, views: Sequence[ComparedView], triangles: 
     manifest = package.manifest
     rows = tuple(range(len(poses)))
     animation = SkeletonAnimation.of(motion, rows, FRAME_RATE, manifest.rest_joints[0])
-    mesh = extract_mesh(package.tables["hq"], triangles=triangles, textured=True)
+    mesh = extract_mesh(
+        package.tables["hq"], triangles=triangles, picture_by=Player(package).render_canonical
+    )
     return encode_glb(mesh, manifest, animation, name="avatar")
 
 

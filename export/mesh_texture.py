@@ -1,7 +1,8 @@
 """Texture of a mesh: charts that xatlas unwraps, with gutters of their own colors between them.
 
 A texture filter reads texels beside a chart's border, and a mipmap averages over several; both read
-the chart's own colors as far as `GUTTER_PX`.
+the chart's own colors as far as `GUTTER_PX`. Colors along the surface's normals miss what is seen
+from aside (folds, a brow, fog), so pictures of the avatar from around it correct them.
 """
 
 from collections.abc import Callable
@@ -9,7 +10,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Int, Int32, UInt8
+from jaxtyping import Bool, Float, Float32, Int, Int32, UInt8
+
+from capture.camera import Camera
+from export.splat_colors import cameras_around
 
 TEXEL_M = 0.002
 """Edge of a texel on the surface, about, metres: as fine as the bricks' voxels."""
@@ -22,11 +26,25 @@ GUTTER_PX = 12
 first three mipmaps do not mix."""
 SUBPIXEL_BITS = 8
 """Bits of a corner's place within a texel when triangles are drawn."""
+VIEWS = 16
+"""Pictures of the avatar that correct a texture."""
+PIXEL_M = 0.003
+"""Size of their pixels on the avatar, about, metres."""
+PICTURE_BLUR_PX = 0.75
+"""Standard deviation of a blur that makes a texture as coarse as these pictures, texels."""
+MIN_COSINE = 0.2
+"""Cosine between view and normal below which a texel counts as not seen."""
+MAX_HIDDEN_M = 0.006
+"""Depth behind the nearest surface from which a texel counts as hidden, metres."""
+OWN_WEIGHT = 0.1
+"""Weight of a texel's color along its normal, in pictures that see it squarely."""
 ColorAt = Callable[
     [Float32[np.ndarray, "points 3"], Float32[np.ndarray, "points 3"]],
     UInt8[np.ndarray, "points 3"],
 ]
 """Returns the colors of points on the surface, from their normals."""
+PictureBy = Callable[[Camera], UInt8[np.ndarray, "height width 4"]]
+"""Returns a picture of the avatar in its canonical pose, with straight alpha."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -86,8 +104,9 @@ def draw_texture(
     positions: Float32[np.ndarray, "vertices 3"],
     normals: Float32[np.ndarray, "vertices 3"],
     color_at: ColorAt,
+    picture_by: PictureBy,
 ) -> Texture:
-    """Draw the texture of an unwrapped mesh from the colors of its surface."""
+    """Draw the texture of an unwrapped mesh from the colors of its surface and from pictures."""
     places = mesh.coordinates * np.float32(mesh.side_px) - np.float32(0.5)
     face_at = _draw_faces(places[mesh.faces], mesh.side_px)
     rows, columns = np.nonzero(face_at >= 0)
@@ -102,7 +121,74 @@ def draw_texture(
     image[rows, columns] = color_at(points, directions)
     # single texels may see a voxel that no picture shows: in small concave places, lips and eyelids
     image = cv2.medianBlur(_fill_gutters(image, face_at >= 0), 3)
-    return Texture(image=image, coordinates=mesh.coordinates)
+    coarse = cv2.GaussianBlur(image.astype(np.float32), (0, 0), PICTURE_BLUR_PX)
+    total = np.zeros((len(points), 3), dtype=np.float32)
+    weight = np.full((len(points), 1), OWN_WEIGHT, dtype=np.float32)
+    for camera in cameras_around(positions, views=VIEWS, pixel_m=PIXEL_M):
+        seen, cosines, missing = _missing_colors(
+            camera, picture_by(camera), positions, mesh.faces, places, coarse, points, directions
+        )
+        total[seen] += cosines * missing
+        weight[seen] += cosines
+    better = image[rows, columns] + total / weight
+    image[rows, columns] = np.clip(np.round(better), 0, 255).astype(np.uint8)
+    return Texture(image=_fill_gutters(image, face_at >= 0), coordinates=mesh.coordinates)
+
+
+def _missing_colors(
+    camera: Camera,
+    picture: UInt8[np.ndarray, "height width 4"],
+    positions: Float32[np.ndarray, "vertices 3"],
+    faces: Int32[np.ndarray, "faces 3"],
+    places: Float32[np.ndarray, "vertices 2"],
+    coarse: Float32[np.ndarray, "rows columns 3"],
+    points: Float32[np.ndarray, "texels 3"],
+    directions: Float32[np.ndarray, "texels 3"],
+) -> tuple[Int[np.ndarray, "seen"], Float32[np.ndarray, "seen 1"], Float32[np.ndarray, "seen 3"]]:
+    """Compare a picture with the mesh, drawn by the same camera.
+
+    Args:
+        places: Of the vertices in the texture `coarse`, texels.
+        points: Of the texels, and the surface's normals there.
+
+    Returns:
+        The texels that are seen, the cosine between view and normal, and what the picture has more.
+    """
+    pixels, depths = _project(camera, positions)
+    faces = faces[np.argsort(-depths[faces].sum(axis=1))]  # nearer ones are drawn over farther ones
+    face_at = _draw_faces(pixels[faces], len(picture))
+    y, x = np.nonzero((face_at >= 0) & (picture[..., 3] > 127))
+    corners = faces[face_at[y, x]]
+    shares = _shares_of_corners(np.stack([x, y], axis=1), pixels[corners])
+    more = np.zeros((*picture.shape[:2], 3), dtype=np.float32)
+    more[y, x] = picture[y, x, :3] - _sample(
+        coarse, np.einsum("pc,pcx->px", shares, places[corners])
+    )
+    nearest = np.full(picture.shape[:2], -np.inf)
+    nearest[y, x] = (shares * depths[corners]).sum(axis=1)
+    centers, away = _project(camera, points)
+    towards = camera.center_world - points
+    cosines = (towards * directions).sum(axis=1) / np.linalg.norm(towards, axis=1)
+    column, row = np.round(centers).astype(int).T
+    seen = np.flatnonzero((cosines > MIN_COSINE) & (away < nearest[row, column] + MAX_HIDDEN_M))
+    return seen, cosines[seen, None].astype(np.float32), _sample(more, centers[seen])
+
+
+def _project(
+    camera: Camera, points: Float32[np.ndarray, "points 3"]
+) -> tuple[Float32[np.ndarray, "points 2"], Float[np.ndarray, "points"]]:
+    """Return where points are seen, px from the center of the first pixel, and their depths."""
+    depths = points @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
+    return (camera.project(points) - 0.5).astype(np.float32), depths
+
+
+def _sample(
+    image: Float32[np.ndarray, "rows columns 3"], places: Float[np.ndarray, "points 2"]
+) -> Float32[np.ndarray, "points 3"]:
+    """Read an image between pixels, bilinearly."""
+    shape = len(places) // 1024 + 1, 1024  # OpenCV takes at most 32,767 rows
+    x, y = (np.resize(each, shape).astype(np.float32) for each in places.T)
+    return cv2.remap(image, x, y, cv2.INTER_LINEAR).reshape(-1, 3)[: len(places)]
 
 
 def _draw_faces(

@@ -167,6 +167,17 @@ class Player:
         except InputError as cause:
             raise cause if str(path) in str(cause) else InputError(f"{path}: {cause}") from cause
 
+    def render_canonical(self, camera: Camera) -> UInt8[np.ndarray, "height width 4"]:
+        """Draw the avatar in its canonical pose, where it was learnt; straight alpha."""
+        return self.render(
+            BodyPose(
+                root_rotation=np.zeros(3),
+                root_translation=np.zeros(3),
+                joint_rotations=self.manifest.canonical_rotations,
+            ),
+            camera,
+        )
+
     def render(
         self,
         pose: BodyPose,

@@ -37,15 +37,17 @@ MIN_ALPHA = 1.0 / 512.0
 """Least alpha, and least light that is left before a Gaussian, that count."""
 
 
-def cameras_around(positions: Float[np.ndarray, "splats 3"]) -> list[Camera]:
-    """Cameras around points, y up, that show all of them."""
+def cameras_around(
+    positions: Float[np.ndarray, "points 3"], views: int = VIEWS, pixel_m: float = PIXEL_M
+) -> list[Camera]:
+    """Cameras around points, y up, that show all of them; pixels are squares of `pixel_m`."""
     low, high = positions.min(axis=0), positions.max(axis=0)
     middle, size_m = 0.5 * (low + high), MARGIN * float(np.linalg.norm(high - low))
-    side = int(np.ceil(size_m / PIXEL_M))
+    side = int(np.ceil(size_m / pixel_m))
     focal, distance_m = side * DISTANCE_SIZES, DISTANCE_SIZES * size_m
     found = []
-    for number in range(VIEWS):
-        turn = 2.0 * np.pi * number / VIEWS
+    for number in range(views):
+        turn = 2.0 * np.pi * number / views
         tilt = ELEVATION_RAD if number % 2 else -ELEVATION_RAD
         # the first camera, before the body, looks along -z with y down
         axes = Rotation.from_euler("YX", [np.pi + turn, tilt]).as_matrix().T

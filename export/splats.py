@@ -48,6 +48,8 @@ SHELLS = (
     Shell(0.012, 0.02, 0.8, 0.0005, 0.95),
 )
 """From the outermost, chosen by pictures from 1.4 to 7 mm a pixel (dev/log/player.md)."""
+FIRM_DENSITY = 25.0
+"""Density at the surface under which they lie, 1/m."""
 MAX_CROSSED_M2 = 3.85
 """Area of the voxels' faces between in and out, square metres, from which on Gaussians lie farther
 apart, as in wide clothes: a `.ply` has at most 12 MB."""
@@ -91,7 +93,7 @@ class GaussianSplats:
 def build_splats(package: AvatarPackage, pose: BodyPose | None = None) -> GaussianSplats:
     """Lay Gaussians under an avatar's surface, and move them to a pose (default: canonical)."""
     tables, player = package.tables["hq"], Player(package)
-    level = LevelSet.of(tables.bricks)
+    level = LevelSet.of(tables.bricks, FIRM_DENSITY)
     crossings = sum(np.count_nonzero(np.diff(level.heights > 0.0, axis=axis)) for axis in range(3))
     wider = max(1.0, np.sqrt(crossings * tables.bricks.voxel_m**2 / MAX_CROSSED_M2))
     meshes = [extract_mesh(tables, level, spacing_m=wider * shell.spacing_m) for shell in SHELLS]
@@ -104,13 +106,8 @@ def build_splats(package: AvatarPackage, pose: BodyPose | None = None) -> Gaussi
     positions, axes, colors, opacities, joints, weights = (
         np.concatenate(each) for each in zip(*parts, strict=True)
     )
-    rest = BodyPose(
-        root_rotation=np.zeros(3),
-        root_translation=np.zeros(3),
-        joint_rotations=package.manifest.canonical_rotations,
-    )
     cameras = cameras_around(positions)
-    pictures = [picture_on_white(premultiply(player.render(rest, each))) for each in cameras]
+    pictures = [picture_on_white(premultiply(player.render_canonical(each))) for each in cameras]
     colors = fit_colors(positions, axes, opacities, colors, cameras, pictures)
     if pose is not None:
         bones = player.world_from_canonical(pose)

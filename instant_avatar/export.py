@@ -18,6 +18,7 @@ from capture.input_error import InputError
 from export.gltf import SkeletonAnimation, encode_glb, encode_vrm, text_of_glb
 from export.package.manifest import Manifest
 from export.package.package_file import AvatarPackage, read_package
+from export.player import Player
 from export.skinned_mesh import SkinnedMesh, extract_mesh
 from export.splats import build_splats, encode_ply, encode_spz
 from instant_avatar.animation.driving_motion import (
@@ -180,7 +181,11 @@ def _build_mesh(
         textured = False
         console.info("note: colors of vertices instead of a texture, which needs xatlas.")
     with console.status("extracting the surface"):
-        mesh = extract_mesh(package.tables["hq"], triangles=arguments.triangles, textured=textured)
+        mesh = extract_mesh(
+            package.tables["hq"],
+            triangles=arguments.triangles,
+            picture_by=Player(package).render_canonical if textured else None,
+        )
         if arguments.to == "glb":
             content = _encode_animated(mesh, package.manifest, motion, name)
             if arguments.out.suffix.lower() == ".gltf":

@@ -13,12 +13,16 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from export.gltf import SkeletonAnimation, encode_glb, encode_vrm
+from export.mesh_texture import _draw_faces, _project
 from export.package.package_file import read_package
+from export.player import Player
 from export.skinned_mesh import SURFACE_DENSITY, _level_function, extract_mesh
+from export.splat_colors import cameras_around
 from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import body_from_rest, rotation_matrices, world_from_body
 from preprocess.poses.pose_format_registry import read_poses
 from tests.export.test_isosurface import is_closed, volume
+from tests.export.test_mesh_texture import show_nothing
 
 TYPES = {5126: "<f4", 5125: "<u4", 5123: "<u2", 5121: "u1"}
 SIZES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -224,7 +228,7 @@ def test_a_still_pose_is_a_motion_too(mesh, package, motion):
 def simple(package):
     """The same of three thousand triangles, with a texture."""
     pytest.importorskip("xatlas")
-    return extract_mesh(package.tables["hq"], triangles=3000, textured=True)
+    return extract_mesh(package.tables["hq"], triangles=3000, picture_by=show_nothing)
 
 
 def texels(mesh, shares, smaller=1):
@@ -264,6 +268,18 @@ def test_few_triangles_keep_the_shape_and_its_colors(simple, mesh):
         expected = mesh.colors[nearest].astype(float)
         off = np.abs(texels(simple, np.array(shares), smaller) - expected).mean(axis=1)
         assert np.median(off[away < 0.004]) < 6.0
+
+
+def test_its_outline_is_as_wide_as_the_avatars(mesh, package):
+    player, wider = Player(package), []
+    for camera in cameras_around(mesh.positions, views=4, pixel_m=0.002):
+        pixels = _project(camera, mesh.positions)[0]
+        drawn = _draw_faces(pixels[mesh.faces], camera.size_px[0]) >= 0
+        seen = player.render_canonical(camera)[..., 3] > 127
+        rim = seen & ~ndimage.binary_erosion(seen)
+        # OpenCV draws borders, so faces are half a pixel wider
+        wider.append(2.0 * ((drawn.sum() - float(seen.sum())) / rim.sum() - 0.5))
+    assert abs(np.mean(wider)) < 0.8  # mm; 1.2 at a density of 25
 
 
 def test_a_texture_is_read_by_another_reader(simple, package, motion):

@@ -11,11 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from export.package.package_file import read_package
 from export.player import Player, picture_on_white, premultiply
-from export.skinned_mesh import extract_mesh
+from export.skinned_mesh import LevelSet, extract_mesh
 from export.splat_colors import cameras_around, fit_colors
 from export.splats import (
     COARSE_PIXEL_M,
     DEPTH_PER_PIXEL,
+    FIRM_DENSITY,
     SHELLS,
     GaussianSplats,
     build_splats,
@@ -125,7 +126,9 @@ def test_an_spz_holds_the_same_gaussians_in_few_bytes(splats):
 
 
 def test_they_lie_in_shells_under_the_surface_and_clear_of_it(package, splats):
-    mesh = extract_mesh(package.tables["hq"], spacing_m=SHELLS[0].spacing_m)
+    tables = package.tables["hq"]
+    level = LevelSet.of(tables.bricks, FIRM_DENSITY)
+    mesh = extract_mesh(tables, level, spacing_m=SHELLS[0].spacing_m)
     surface = KDTree(mesh.positions)
     far, nearest = surface.query(splats.positions)
     inward = np.sum((mesh.positions[nearest] - splats.positions) * mesh.normals[nearest], axis=1)
