@@ -249,7 +249,7 @@ class PhoneServer:
             avatar=str(given.get("avatar") or ""),
         )  # fmt: skip
         film.on_message = lambda: self._loop.call_soon_threadsafe(self._wake, film.number)
-        begun = {"film": film.number, "avatar": film.place.name, "next": 0}
+        begun = {"film": film.number, "avatar": film.place.name}
         return web.json_response(begun, status=201)
 
     async def _begun(self, request: web.Request) -> web.Response:
