@@ -23,6 +23,8 @@ which it counts as seen (66°)."""
 BORDER_PX = 0.5, 3.0
 """Distances from the person's outline up to which a pixel shows the background's color, and from
 which the skin's alone: a video has one color for each 2 x 2 pixels, and smears it."""
+LIMB_MARGIN_CELLS = 1
+"""Cells of 3 cm around a limb in which clothes and errors of the pose may hide what is behind."""
 SEEN_FRAME_SHARE = 0.03
 """Share of the frames that must show a patch squarely for it to count as seen in full: in a few
 frames a tracker may turn the person round."""
@@ -68,7 +70,7 @@ class SkinEvidence:
         if depths.min() <= 0.0:  # a person behind the camera is not in the image either
             return
         plane = in_camera[:, :2] / depths[:, None] * depths.mean()
-        shown = visible_points(plane, depths, cosines)
+        shown = visible_points(plane, depths, cosines, margin_cells=LIMB_MARGIN_CELLS)
         within = _pixels_within_border(in_camera, frame)
         shown &= within > 0.0
         cosines = cosines * _smooth_step(within, *BORDER_PX)

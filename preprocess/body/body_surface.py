@@ -10,6 +10,7 @@ from typing import final
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
+from scipy.ndimage import minimum_filter
 from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import splu
 
@@ -18,6 +19,8 @@ from capture.source import AlphaMask
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.parametric_body import ShapedBody
 
+LIMB_DEPTH_M = 0.1
+"""Distance behind a point from which another belongs to another limb, metres."""
 MAX_COTANGENT = 10.0
 """Bound of a corner's cotangent: slivers would dominate."""
 
@@ -85,6 +88,7 @@ def visible_points(
     *,
     cell_m: float = 0.03,
     tolerance_m: float = 0.03,
+    margin_cells: int = 0,
 ) -> Bool[np.ndarray, "points"]:
     """Points that face the camera unoccluded, by a depth buffer of coarse cells.
 
@@ -95,6 +99,8 @@ def visible_points(
             face away occlude nothing.
         cell_m: Edge of a cell: no less than the points' spacing.
         tolerance_m: Largest distance behind the nearest point of its cell, beyond its own slope.
+        margin_cells: Cells by which clothes and errors of the pose may widen limbs: a point that
+            lies farther than `LIMB_DEPTH_M` behind another so near in the image is hidden, too.
     """
     cell = np.floor((image_points - image_points.min(axis=0)) / cell_m).astype(np.int64)
     columns = int(cell[:, 1].max()) + 1
@@ -104,7 +110,12 @@ def visible_points(
     np.minimum.at(nearest, flat[faces], depth[faces])
     steep = np.clip(cosine, 0.1, 1.0)
     slope = cell_m * np.sqrt(1.0 - steep**2) / steep
-    return faces & (depth <= nearest[flat] + tolerance_m + slope)
+    shown = faces & (depth <= nearest[flat] + tolerance_m + slope)
+    if margin_cells:
+        image = np.append(nearest, np.full(-len(nearest) % columns, np.inf)).reshape(-1, columns)
+        around = minimum_filter(image, 2 * margin_cells + 1, mode="constant", cval=np.inf)
+        shown &= depth <= around.reshape(-1)[flat] + LIMB_DEPTH_M
+    return shown
 
 
 def visible_from_anywhere(

@@ -189,8 +189,8 @@ class BlazePoseTracker:
         """The person without the limbs of another one, and whether the two may be mixed up."""
         if self._beside is None:
             return replace(person, crowded=self._crowded_frames > CROWD_MEMORY - SEEN_AGO)
-        mask, removed = separate_mask(person, self._beside.keypoints)
-        return replace(person, mask=mask, crowded=removed > MAX_MIXED)
+        mask, mixed = separate_mask(person, self._beside.keypoints)
+        return replace(person, mask=mask, crowded=mixed > MAX_MIXED)
 
     def _follow(self, rgb: RgbImage) -> FoundLandmarks | None:
         """The person, where the last frame's key points say; None if it is not there."""

@@ -1,7 +1,6 @@
 """Separates the mask of one person from another person beside it.
 
-The network that segments a person takes in hands and legs of others that reach into its square. A
-pixel belongs to the person whose limbs are nearer to it.
+The network that segments a person takes in hands and legs of others that reach into its square.
 """
 
 import cv2
@@ -17,24 +16,31 @@ LIMBS = (
     (23, 25), (25, 27), (27, 31), (27, 29), (24, 26), (26, 28), (28, 32), (28, 30),
 )  # fmt: skip
 """Pairs of key points: arms with hands, head, and legs with feet."""
+LIMB_RADIUS = 0.1
+"""Distance from a person's limbs within which its skin and clothes lie, trunk lengths (5 cm)."""
 MIN_VISIBILITY = 0.5
 """Visibility of both ends below which a limb of the other person is not drawn: it may be a guess
 that lies across the person."""
 
 
 def separate_mask(person: PersonKeypoints, other: PersonKeypoints) -> tuple[CroppedMask, float]:
-    """Remove from a person's mask the pixels that are nearer to another one's limbs.
+    """Remove from a person's mask what another one's limbs reach into it.
 
-    Returns the mask, and the share of its area that was removed, in [0, 1].
+    Pixels that are nearer to the other's limbs go, unless they are within `LIMB_RADIUS` of the
+    person's: a hand may lie before the other's chest. Returns the mask, and the share of its area
+    that is nearer to the other, in [0, 1].
     """
     mask = person.mask
     own, others = (
         _distance_to_limbs(mask, each.image_px, each.visibility >= least)
         for each, least in ((person, 0.0), (other, MIN_VISIBILITY))
     )
-    kept = np.where(own <= others, mask.values, 0).astype(np.uint8)
-    before, after = ((values > 127).sum() for values in (mask.values, kept))
-    share = float(1.0 - after / max(1, before))
+    middles = person.image_px[list(TRUNK)].reshape(2, 2, 2).mean(axis=1)
+    px_per_pixel = float(np.hypot(*mask.image_from_crop[:, 0]))
+    radius = LIMB_RADIUS * float(np.hypot(*(middles[1] - middles[0]))) / px_per_pixel
+    is_others, is_person = own > others, mask.values > 127
+    kept = np.where(is_others & (own > radius), 0, mask.values).astype(np.uint8)
+    share = float((is_others & is_person).sum() / max(1, is_person.sum()))
     return CroppedMask(values=kept, image_from_crop=mask.image_from_crop), share
 
 

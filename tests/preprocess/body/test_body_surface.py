@@ -16,6 +16,7 @@ from preprocess.body.body_surface import (
     soft_iou,
     splat_silhouette,
     vertex_normals,
+    visible_points,
 )
 from preprocess.body.kinematics import rotation_matrices
 
@@ -127,3 +128,28 @@ def test_a_surface_is_smoothed_as_heat_spreads_on_a_sphere():
     np.testing.assert_allclose(smooth[:, 3], 1.0, atol=1e-9)
     # a normal is a spherical harmonic of degree 1, of eigenvalue 2 / r²
     np.testing.assert_allclose(smooth[:, :3], values[:, :3] / (1.0 + 0.02**2 / 0.05**2), atol=5e-3)
+
+
+def test_what_lies_behind_a_limb_is_hidden_beside_it_too():
+    """A near strip 0.3 m before a far wall: clothes and a wrong pose may widen the strip."""
+    wall = np.stack(np.meshgrid(np.arange(0.01, 0.6, 0.02), np.arange(0.01, 0.3, 0.02)), -1)
+    wall = wall.reshape(-1, 2)
+    strip = wall[(wall[:, 0] > 0.24) & (wall[:, 0] < 0.36)]
+    points = np.concatenate([wall, strip])
+    depth = np.repeat([2.3, 2.0], [len(wall), len(strip)])
+    facing = np.ones(len(points))
+    hard = visible_points(points, depth, facing)[: len(wall)]
+    wide = visible_points(points, depth, facing, margin_cells=1)[: len(wall)]
+    beside = np.maximum(0.25 - wall[:, 0], wall[:, 0] - 0.35)
+    assert not hard[beside < 0.01].any()
+    assert hard[beside > 0.03].all()
+    assert not wide[beside < 0.03].any()
+    assert wide[beside > 0.06].all()
+    assert visible_points(points, depth, facing, margin_cells=1)[len(wall) :].all()
+
+
+def test_a_slanted_surface_hides_nothing_of_itself():
+    plane = np.stack(np.meshgrid(np.arange(0.01, 0.6, 0.02), np.arange(0.01, 0.3, 0.02)), -1)
+    plane = plane.reshape(-1, 2)
+    depth, cosine = 2.0 + 1.2 * plane[:, 0], np.full(len(plane), 1.0 / np.hypot(1.0, 1.2))
+    assert visible_points(plane, depth, cosine, margin_cells=1).all()

@@ -53,3 +53,10 @@ def test_the_mask_may_be_of_other_pixels_than_the_frame():
 
 def test_every_limb_has_two_ends_among_the_key_points():
     assert {point for limb in LIMBS for point in limb} <= set(range(33))
+
+
+def test_a_hand_before_the_others_chest_stays():
+    one, other = person((16, 32)), person((36, 28))
+    mask, _ = separate_mask(one, other)
+    assert (mask.values[28, 20:36] == 255).all()  # the arm, which ends in the other's trunk
+    assert mask.values[24, 36] == 0
