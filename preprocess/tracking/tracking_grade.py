@@ -108,9 +108,9 @@ class TrackingGrade:
         """Reasons why the poses are not good enough for an avatar; empty if they are."""
         objections = []
         if self.doubtful_share > MAX_DOUBTFUL_SHARE:
-            objections.append(
-                f"{self.main_doubt} in {self.main_doubt_frames} of {self.frames} frames"
-            )
+            most = f"{self.main_doubt} in {self.main_doubt_frames} of {self.frames} frames"
+            others = len(self.doubts) - self.main_doubt_frames
+            objections.append(f"{most}, and {others} more are doubtful" if others else most)
         if self.missed_share > MAX_MISSED_SHARE:
             objections.append(
                 f"the person was missed in {self.missed_share:.0%} of the frames that seem to "

@@ -133,6 +133,14 @@ def test_a_cut_film_is_named_where_it_is_cut(shaped):
     assert (cut.start_s, cut.end_s) == (1.0, round(31 / FPS, 2))
 
 
+def test_a_refusal_for_several_reasons_counts_them_all(shaped):
+    problems = np.zeros(FRAMES, dtype=np.int64)
+    problems[:20] = PROBLEM_BITS[TrackingProblem.CROWDED]
+    problems[20:35] = PROBLEM_BITS[TrackingProblem.TOP]
+    (objection,) = grade(shaped, keypoints=replace(some_keypoints(), problems=problems)).objections
+    assert objection.endswith("mixed up in 20 of 60 frames, and 15 more are doubtful")
+
+
 def test_frames_with_another_person_near_are_left_out_unless_they_are_most(shaped):
     problems = np.zeros(FRAMES, dtype=np.int64)
     problems[10:20] = PROBLEM_BITS[TrackingProblem.CROWDED]
