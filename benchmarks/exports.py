@@ -100,10 +100,11 @@ window.splats = async (url, shot, skeleton) => {
     figure.updateMatrixWorld();
     followSkeleton(splats, figure.getObjectByProperty("isSkinnedMesh", true))();
   }
+  const empty = draw(new THREE.Scene(), shot);
   let picture, before;
   for (let same = 0, frame = 0; same < 2 && frame < 30; frame++) { // sorting takes its time
     picture = draw(scene, shot);
-    same = picture === before ? same + 1 : 0;
+    same = picture === before && picture !== empty ? same + 1 : 0;
     before = picture;
     await new Promise((resolve) => setTimeout(resolve, 100));
   }
