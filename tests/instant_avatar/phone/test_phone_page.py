@@ -264,6 +264,11 @@ def test_a_page_that_is_loaded_again_keeps_what_it_filmed(camera_film, tmp_path)
         until(lambda: film.file.received > 50_000, 60.0)
         browser.go(f"http://127.0.0.1:8749/?token={access.token}")  # the tab was closed
         until(lambda: "while it filmed avatar" in browser.text(), 60.0)
+        film.tell("seconds", seconds=7.0)
+        film.tell("map", svg="", seen=0.44)
+        until(lambda: text_of(browser, "seen") == "44 % of you seen", 60.0)
+        mark = "getComputedStyle(document.getElementById('seen'), '::before').content"
+        assert browser.run(mark) == '" · "'  # though nothing was sent from this page
         received = film.file.received
         assert not film.file.ended
         assert browser.run("document.getElementById('same').offsetParent === null")
