@@ -1,6 +1,7 @@
 """A headless Chromium for tests, driven by the DevTools protocol through a pipe."""
 
 import base64
+import contextlib
 import io
 import itertools
 import json
@@ -147,11 +148,11 @@ class Browser:
     def worker_threads(self) -> int:
         """Threads that run workers, in all of its processes; Linux names them."""
         family = psutil.Process(self._process.pid).children(recursive=True)
-        names = [
-            (Path("/proc") / str(process.pid) / "task" / str(thread.id) / "comm").read_text()
-            for process in family
-            for thread in process.threads()
-        ]
+        names = []
+        for process in family:
+            for path in Path("/proc", str(process.pid), "task").glob("*/comm"):
+                with contextlib.suppress(OSError):  # a thread that has ended meanwhile
+                    names.append(path.read_text())
         return sum(name.startswith("DedicatedWorker") for name in names)
 
     def press(self, key: str) -> None:
