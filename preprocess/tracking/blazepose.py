@@ -56,11 +56,12 @@ MIN_BODY_IOU = 0.4
 
 
 class PersonLooks:
-    """Remembers the colors of one person's chest and thighs."""
+    """Remembers the colors of one person's chest and thighs, and how far they vary."""
 
     def __init__(self) -> None:
         """Knows no person yet."""
         self._colors = np.zeros(2 * len(QUANTILES) * 3)
+        self._variation = 0.0
         self._pictures = 0
 
     @property
@@ -72,10 +73,17 @@ class PersonLooks:
         """Mean difference between colors and the person's, in units of CIELAB."""
         return float(np.abs(colors - self._colors).mean())
 
+    def is_like(self, other: "PersonLooks") -> bool:
+        """True if another's colors are no farther away than these vary, as those in a mirror."""
+        return other.is_known and self.distance(other._colors) < self._variation
+
     def learn(self, colors: Float[np.ndarray, "numbers"]) -> None:
         """Remember the colors of an image that shows the person."""
+        away = self.distance(colors) if self.is_known else 0.0
         self._pictures += 1
-        self._colors += max(LEARNING_RATE, 1 / self._pictures) * (colors - self._colors)
+        rate = max(LEARNING_RATE, 1 / self._pictures)
+        self._colors += rate * (colors - self._colors)
+        self._variation += rate * (away - self._variation)
 
 
 def colors_of(rgb: RgbImage, found: PersonKeypoints) -> Float[np.ndarray, "numbers"]:
@@ -190,7 +198,8 @@ class BlazePoseTracker:
         if self._beside is None:
             return replace(person, crowded=self._crowded_frames > CROWD_MEMORY - SEEN_AGO)
         mask, mixed = separate_mask(person, self._beside.keypoints)
-        return replace(person, mask=mask, crowded=mixed > MAX_MIXED)
+        is_alike = self._looks.is_like(self._company)
+        return replace(person, mask=mask, crowded=is_alike or mixed > MAX_MIXED)
 
     def _follow(self, rgb: RgbImage) -> FoundLandmarks | None:
         """The person, where the last frame's key points say; None if it is not there."""
