@@ -135,7 +135,12 @@ class PhoneServer:
             film.is_over = True
 
         async def end() -> None:
+            assert self._runner.server is not None
+            transports = [each.transport for each in self._runner.server.connections]
             await self._runner.cleanup()
+            for each in transports:
+                if each is not None:
+                    each.abort()  # TLS would wait for the browser to close, too
             left = asyncio.all_tasks() - {asyncio.current_task()}
             for task in left:
                 task.cancel()
