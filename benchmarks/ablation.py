@@ -1,173 +1,70 @@
-"""What each mechanism of training buys, and the paper's own ablations.
+"""What each mechanism of training buys.
 
-    python -m benchmarks.ablation [--tables mechanisms|paper] [--few CAPTURE] [--keep FOLDER]
-        [--seconds S] [--quick] [--json FILE] [--write docs/ablation.md]
+    python -m benchmarks.ablation [--few CAPTURE] [--keep FOLDER] [--quick] [--write PAGE]
 
-First, each mechanism is left out in turn on phone-like films, and each prior of estimated poses on
-few frames of one and of a capture of your own (`benchmarks.mechanisms`). Then the paper's tables on
-an exact sample: losses, empty-space skipping, root finding, refinement; all variants of a table are
-trained in turns in one process, with one thread, each for the same seconds of one core and then
-again for the same number of steps, and scored by the exact renderer on held-out frames and on poses
-that were never filmed. There are no thresholds here.
+Each mechanism is left out in turn on phone-like films, and each prior of estimated poses on few
+frames of one and of a capture of your own (`benchmarks.mechanisms`). There are no thresholds here.
 """
 
-import json
-import sys
 import tempfile
-import time
-from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from statistics import mean
+from typing import Literal
 
 import tyro
 
-from avatar.avatar_model import Avatar
-from avatar.evaluation.held_out import HeldOutFrame
-from avatar.rig import Rig
-from avatar.training.frame_stream import TrainingFrame
-from baselines.instant_avatar.samplers import BaselineScheme
-from benchmarks.ablation_page import AblationPage, mechanism_lines, written
-from benchmarks.hardware import Hardware
-from benchmarks.mechanisms import CaptureScores, measured_scores
-from benchmarks.paired_training import (
-    TrainingBudget,
-    Variant,
-    VariantOutcome,
-    VariantRun,
-    score_variant,
-    train_variants,
+from benchmarks.mechanisms import (
+    FEW_FRAME_MECHANISMS,
+    MECHANISMS,
+    MORE_STEPS,
+    CaptureScores,
+    Mechanism,
+    MechanismScore,
+    measured_scores,
 )
-from benchmarks.sample_training import film_sample, load_trainer, open_sample, training_config
-from benchmarks.scheme_timing import SchemeTiming, time_scheme
-from benchmarks.stopwatch import limit_threads
-from benchmarks.training_quality import NOISE, novel_pose_frames, with_true_poses
-from preprocess.capture_session import Capture
+from benchmarks.sample_training import film_sample
 
+COMMAND = "python -m benchmarks.ablation --write docs/ablation.md"
 PHONE_PX = 270
 """Longer side of phone-like pictures."""
 FEW = 8
 """Frames of a capture of few frames, the held-out one included."""
-TIMED_POSES = 3
-"""Novel poses that every scheme draws."""
-PAPER = "union grid, Broyden (the paper)"
-POSES_AS_GIVEN = {"refine_poses": False}
-LOSS_VARIANTS = [
-    Variant(name="full", changes=POSES_AS_GIVEN),
-    Variant(name="w/o alpha loss", changes={**POSES_AS_GIVEN, "alpha_weight": 0.0}),
-    Variant(name="w/o hard surface", changes={**POSES_AS_GIVEN, "hard_surface_weight": 0.0}),
-    Variant(
-        name="w/o occupancy-based regulariser",
-        changes={**POSES_AS_GIVEN, "empty_space_weight": 0.0},
-    ),
-    Variant(name="w/o total variation", changes={**POSES_AS_GIVEN, "density_tv_weight": 0.0}),
-    Variant(
-        name="global sparsity instead",
-        changes=POSES_AS_GIVEN,
-        scheme=BaselineScheme(empty_term="global"),
-    ),
-]
-NO_EMPTY_SPACE = {**POSES_AS_GIVEN, "empty_space_weight": 0.0}
-CORRESPONDENCE_VARIANTS = [
-    Variant(
-        name="union grid, cells", changes=POSES_AS_GIVEN, scheme=BaselineScheme(skipping="union")
-    ),
-    Variant(
-        name="per-frame grids, cells",
-        changes=POSES_AS_GIVEN,
-        scheme=BaselineScheme(skipping="frame"),
-    ),
-    Variant(
-        name="no skipping, cells", changes=NO_EMPTY_SPACE, scheme=BaselineScheme(skipping="none")
-    ),
-]
-BROYDEN_VARIANTS = [
-    Variant(
-        name="canonical occupancy, Broyden",
-        changes=POSES_AS_GIVEN,
-        scheme=BaselineScheme(roots="broyden"),
-    ),
-    Variant(
-        name=PAPER,
-        changes=POSES_AS_GIVEN,
-        scheme=BaselineScheme(skipping="union", roots="broyden"),
-    ),
-    Variant(
-        name="no skipping, Broyden",
-        changes=NO_EMPTY_SPACE,
-        scheme=BaselineScheme(skipping="none", roots="broyden"),
-    ),
-]
-REFINEMENT_VARIANTS = [
-    Variant(name="poses as given", changes=POSES_AS_GIVEN),
-    Variant(name="poses refined", changes={"refine_poses": True}),
-]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Ablation:
-    """Trains every variant, and prints the tables."""
+    """Trains without each mechanism, and prints the tables."""
 
-    tables: Literal["all", "mechanisms", "paper"] = "all"
-    """What is measured: the mechanisms, the paper's tables, or both."""
     subjects: tuple[Literal[1, 2, 3], ...] = (1, 2)
     """Who is filmed as by a phone."""
     seeds: tuple[int, ...] = (0,)
-    """Of training, for the mechanisms."""
+    """Of training."""
     few: Path | None = None
     """Capture of a few photographs, for the priors of estimated poses."""
     quick: bool = False
-    """Two seconds and twenty steps each: whether it runs, not what comes out."""
-    size: int = 128
-    """Width and height of the pictures."""
-    seconds: float = 20.0
-    """Core seconds for each variant."""
-    steps: int = 400
-    """Steps for each variant, where they are counted."""
-    mechanism_steps: int = 600
+    """Twenty steps each: whether it runs, not what comes out."""
+    steps: int = 600
     """Steps without each mechanism."""
-    json: Path | None = None
-    """File for the figures."""
     write: Path | None = None
     """Markdown file whose tables are replaced; text outside its marks is kept."""
     keep: Path | None = None
     """Folder for what is filmed; what lies there is used again."""
 
 
-class AblationData(NamedTuple):
-    """What is trained on, and what is scored."""
-
-    recording: Capture
-    rig: Rig
-    frames: list[TrainingFrame]
-    held_out: list[HeldOutFrame]
-    novel: list[HeldOutFrame]
-
-
 def main() -> None:
     """The benchmark."""
     job = tyro.cli(Ablation, prog="python -m benchmarks.ablation", description=__doc__)
     if job.quick:
-        job = replace(job, seconds=2.0, steps=20, mechanism_steps=20)
-    hardware = Hardware.here()
+        job = replace(job, steps=20)
     with tempfile.TemporaryDirectory() as temporary:
         folder = job.keep or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
-        if job.tables != "paper":
-            show(job, "mechanisms", mechanism_lines(list(run_mechanisms(job, folder))))
-        if job.tables == "mechanisms":
-            return
-        page = run_ablation(job, hardware, folder)
-    show(job, "tables", page.lines())
-    if job.json is not None:
-        job.json.write_text(json.dumps(asdict(page), indent=1) + "\n")
-
-
-def show(job: Ablation, mark: str, lines: list[str]) -> None:
-    """Prints tables, and writes them between their marks of the page."""
+        lines = mechanism_lines(list(run_mechanisms(job, folder)))
     print("\n".join(lines))
     if job.write is not None:
-        job.write.write_text(written(mark, lines, job.write))
+        job.write.write_text(written(lines, job.write))
 
 
 def run_mechanisms(job: Ablation, folder: Path) -> Iterator[CaptureScores]:
@@ -179,7 +76,7 @@ def run_mechanisms(job: Ablation, folder: Path) -> Iterator[CaptureScores]:
             name = f"{capture.name}-{frames or 'all'}-seed{seed}.json"
             yield measured_scores(
                 capture, folder / name,
-                size_px=PHONE_PX, steps=job.mechanism_steps, seed=seed, frames=frames,
+                size_px=PHONE_PX, steps=job.steps, seed=seed, frames=frames,
                 dance=None if frames is None else films[-1] / "dance.npz",
             )  # fmt: skip
 
@@ -193,106 +90,93 @@ def film_by_phone(folder: Path, subject: Literal[1, 2, 3], *, quick: bool) -> Pa
     )  # fmt: skip
 
 
-def run_ablation(job: Ablation, hardware: Hardware, folder: Path) -> AblationPage:
-    """Measures all tables, and prints each row on standard error when it is ready."""
-    began = time.process_time()
-    scene = load_data(film_sample(folder / f"sample{job.size}", job.size))
-    runs = train_on_scene(
-        scene,
-        [*LOSS_VARIANTS, *CORRESPONDENCE_VARIANTS, *BROYDEN_VARIANTS],
-        TrainingBudget(seconds=job.seconds),
-    )
-    by_time = outcomes_of(runs, scene)
-    occupancy_ms, ours = occupancy_update_ms(runs[0]), runs[0].trainer.avatar
-    del runs
-    counted = TrainingBudget(steps=job.steps)
-    runs = train_on_scene(
-        scene, [LOSS_VARIANTS[0], *CORRESPONDENCE_VARIANTS, *BROYDEN_VARIANTS], counted
-    )
-    by_steps = outcomes_of(runs, scene)
-    schemes = time_schemes(ours, _run_named(runs, PAPER).trainer.avatar, scene)
-    del runs
-    noisy_capture = film_sample(folder / f"noisy{job.size}", job.size, **NOISE)
-    noisy = load_data(noisy_capture)
-    noisy = noisy._replace(held_out=with_true_poses(noisy_capture, noisy.held_out, noisy.rig))
-    budget = TrainingBudget(seconds=job.seconds)
-    return AblationPage(
-        hardware=hardware.lines(),
-        size=job.size,
-        seconds=job.seconds,
-        steps=job.steps,
-        pictures=(len(scene.frames), len(scene.held_out), len(scene.novel), TIMED_POSES),
-        occupancy_ms=occupancy_ms,
-        losses=by_time[: len(LOSS_VARIANTS)],
-        by_time=[by_time[0], *by_time[len(LOSS_VARIANTS) :]],
-        by_steps=by_steps,
-        scheme_timings=schemes,
-        exact=outcomes_of(train_on_scene(scene, REFINEMENT_VARIANTS, budget), scene),
-        noisy=outcomes_of(train_on_scene(noisy, REFINEMENT_VARIANTS, budget), noisy),
-        core_minutes=(time.process_time() - began) / 60.0,
-    )
+def mechanism_lines(captures: Sequence[CaptureScores]) -> list[str]:
+    """What each mechanism buys: a table of the whole films, and one of the few frames."""
+    lines = [f"`{COMMAND}`", ""]
+    for title, rows in (
+        ("Mechanisms, one by one", MECHANISMS),
+        ("Few-frame priors, one by one", FEW_FRAME_MECHANISMS),
+    ):
+        names = {row.name for row in rows[2:]}
+        found = [each for each in captures if names & {score.name for score in each.scores}]
+        if not found:
+            continue
+        lines += [f"## {title}", ""]
+        lines += [
+            f"* {each.capture}, {each.size_px} px, seed {each.seed}, {each.steps} steps: "
+            f"{each.measured}; with all mechanisms {_levels(each.scores[0])}, "
+            f"{each.scores[0].step_ms:.1f} core-ms a step"
+            for each in found
+        ]
+        head = ["without", "core-ms saved", *(f"{c.capture}, seed {c.seed}" for c in found)]
+        head += ["mean loss, dB", "its time would buy, dB", "lines"]
+        lines += ["", *_table(head, _mechanism_cells(rows, found)), ""]
+    return lines[:-1]
 
 
-def load_data(capture: Path) -> AblationData:
-    """A filmed sample, every frame made ready."""
-    limit_threads(1)
-    recording = open_sample(capture)
-    rig = Rig.from_shaped_body(recording.shaped)
-    seen = load_trainer(recording, rig, training_config(recording, 60.0))
-    return AblationData(recording, rig, seen.frames, seen.held_out, novel_pose_frames(capture, rig))
+def _mechanism_cells(
+    rows: Sequence[Mechanism], found: Sequence[CaptureScores]
+) -> list[tuple[str, ...]]:
+    """What is lost without each mechanism on each capture (novel / held out), and on average."""
+    full, longer, *_ = rows
+    by_name = [{score.name: score for score in each.scores} for each in found]
+    gains = [
+        -mean(_loss(each[full.name], each[longer.name])) for each in by_name if longer.name in each
+    ]
+    slope = mean(gains) / (MORE_STEPS - 1.0) if gains else 0.0
+    cells = []
+    for row in rows[1:]:
+        pairs = [(each[full.name], each[row.name]) for each in by_name if row.name in each]
+        if not pairs:
+            continue
+        saved = mean(a.step_ms - b.step_ms for a, b in pairs)
+        lost = [
+            _loss_text(each[full.name], each[row.name]) if row.name in each else "-"
+            for each in by_name
+        ]
+        bought = slope * saved / mean(a.step_ms for a, _ in pairs)
+        last = ("", "") if row is longer else (f"{bought:+.2f}", str(row.lines or "few"))
+        overall = mean(mean(_loss(a, b)) for a, b in pairs)
+        cells.append((row.name, f"{saved:.1f}", *lost, f"{overall:+.2f}", *last))
+    return cells
 
 
-def train_on_scene(
-    scene: AblationData, variants: list[Variant], budget: TrainingBudget
-) -> list[VariantRun]:
-    """Every variant after its budget."""
-    return train_variants(variants, budget, scene.recording, scene.rig, scene.frames)
+def _loss(full: MechanismScore, without: MechanismScore) -> list[float]:
+    """What is lost on novel poses, if there are any, and on held-out frames, dB."""
+    pairs = [(full.novel, without.novel), (full.held_out, without.held_out)]
+    return [a - b for a, b in pairs if a is not None and b is not None]
 
 
-def outcomes_of(runs: Iterable[VariantRun], scene: AblationData) -> list[VariantOutcome]:
-    """What became of them."""
-    outcomes = []
-    for run in runs:
-        outcomes.append(score_variant(run, scene.held_out, scene.novel))
-        print(outcomes[-1], file=sys.stderr, flush=True)
-    return outcomes
+def _loss_text(full: MechanismScore, without: MechanismScore) -> str:
+    """`_loss`, how much less the player is like the renderer, and how much more is fog."""
+    losses = _loss(full, without)
+    if full.player is not None and without.player is not None:
+        losses.append(full.player - without.player)
+    text = " / ".join(f"{loss:+.2f}" for loss in losses)
+    if full.half_transparent is None or without.half_transparent is None:
+        return text
+    return f"{text}, {100.0 * (without.half_transparent - full.half_transparent):+.1f} % fog"
 
 
-def occupancy_update_ms(run: VariantRun) -> float:
-    """What keeping the canonical occupancy costs a step: every variant pays it, ours alone must."""
-    every = run.trainer.config.occupancy_interval
-    began = time.process_time()
-    for _ in range(3):
-        run.trainer._update_occupancy(0.0)
-    return 1000.0 * (time.process_time() - began) / 3 / every
+def _levels(score: MechanismScore) -> str:
+    novel = "" if score.novel is None else f"{score.novel:.2f} dB novel, "
+    player = "" if score.player is None else f", player to renderer {score.player:.2f} dB"
+    fog = score.half_transparent
+    firm = "" if fog is None else f", {100.0 * fog:.1f} % of the pixels half transparent"
+    return f"{novel}{score.held_out:.2f} dB held out{player}{firm}"
 
 
-def _run_named(runs: list[VariantRun], name: str) -> VariantRun:
-    return next(run for run in runs if run.variant.name == name)
+def written(lines: Sequence[str], path: Path) -> str:
+    """The file's text with the tables replaced and the text around them kept."""
+    begin, end = "<!-- mechanisms: begin -->", "<!-- mechanisms: end -->"
+    text = path.read_text() if path.exists() else f"# What each mechanism buys\n\n{begin}{end}\n"
+    before, after = text.split(begin)[0], text.split(end)[1]
+    return before + "\n".join([begin, *lines, end]) + after
 
 
-def time_schemes(ours: Avatar, theirs: Avatar, scene: AblationData) -> list[SchemeTiming]:
-    """Two avatars, ours and that of the paper's own training, drawn by each scheme."""
-    step = max(1, len(scene.novel) // TIMED_POSES)
-    pictures = scene.novel[::step][:TIMED_POSES]
-    rows = [
-        time_scheme("canonical occupancy, cells", ours, pictures, scheme=None),
-        time_scheme(
-            "per-frame grid, cells", ours, pictures, scheme=BaselineScheme(skipping="frame")
-        ),
-        time_scheme("no skipping, cells", ours, pictures, scheme=BaselineScheme(skipping="none")),
-        time_scheme(
-            "per-frame grid, Broyden (the paper)", theirs, pictures,
-            scheme=BaselineScheme(skipping="frame", roots="broyden"),
-        ),
-        time_scheme(
-            "no skipping, Broyden", theirs, pictures,
-            scheme=BaselineScheme(skipping="none", roots="broyden"),
-        ),
-    ]  # fmt: skip
-    for row in rows:
-        print(row, file=sys.stderr, flush=True)
-    return rows
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    rule = ["---", *["--:"] * (len(head) - 1)]
+    return ["| " + " | ".join(cells) + " |" for cells in (head, rule, *rows)]
 
 
 if __name__ == "__main__":

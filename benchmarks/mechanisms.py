@@ -28,7 +28,6 @@ from avatar.training.held_out_pose_fitting import fit_test_poses
 from avatar.training.trainer import Trainer, cosine_decay
 from baselines.systems.compared_capture import ComparedCapture
 from benchmarks.hardware import Hardware
-from benchmarks.paired_training import SLICE_S
 from benchmarks.sample_training import open_sample
 from benchmarks.stopwatch import limit_threads
 from export.build import export_avatar
@@ -41,6 +40,8 @@ SCORED_FRAMES = 6
 """Held-out frames, and novel poses, that each row is scored on, spread evenly."""
 DANCE_POSES = 8
 """Poses of a dance in which player and renderer are compared."""
+SLICE_S = 0.5
+"""Core time after which it is the next one's turn."""
 MORE_STEPS = 1.1
 """Factor of the steps in the row that trains longer."""
 

@@ -1,4 +1,4 @@
-"""One step and the encoding alone: ours, plain torch, and the paper's algorithm."""
+"""One step and the encoding alone: ours, and plain torch with autograd on the same samples."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,17 +9,12 @@ from torch import Tensor
 
 from avatar.config import TrainConfig
 from avatar.kernels import operations
-from avatar.kernels.operands import MarchSettings
-from avatar.radiance_field import sample_tv_pairs
+from avatar.kernels.numba_priors import OPACITY_LENGTH_M
+from avatar.kernels.operands import HashLevels, MarchSettings, RaySamples
+from avatar.radiance_field import RadianceField, sample_tv_pairs
 from avatar.training.replay_buffer import ReplayBuffer, TrainingBatch
 from avatar.training.training_step import compute_gradients
 from baselines import torch_reference
-from baselines.instant_avatar.autograd_steps import (
-    AutogradField,
-    PaperStepInputs,
-    autograd_step,
-    paper_step,
-)
 from benchmarks.measurements import Measurement
 from benchmarks.sample_training import LoadedTrainer
 from benchmarks.stopwatch import time_interleaved
@@ -27,8 +22,52 @@ from benchmarks.stopwatch import time_interleaved
 POINTS = 65_536
 
 
+class AutogradField:
+    """A field's parameters, and its forward pass as autograd sees it."""
+
+    def __init__(self, field: RadianceField) -> None:
+        """Copies the parameters of `field`."""
+        self.levels: HashLevels = field.levels
+        self.parameters = [p.detach().clone().requires_grad_() for p in field.parameters()]
+
+    def raw_outputs_at(self, points: Float32[Tensor, "points 3"]) -> Float32[Tensor, "points 4"]:
+        """Raw outputs at canonical points."""
+        table, first, first_bias, second, second_bias = self.parameters
+        features = torch_reference.encode(points, table, self.levels)
+        return torch.relu(features @ first + first_bias) @ second + second_bias
+
+
+def centimeter_opacity(raw: Float32[Tensor, "points 4"]) -> Float32[Tensor, "points"]:
+    """Opacity of one centimetre."""
+    density = torch.exp(raw[:, 3].clamp(max=torch_reference.MAX_LOG_DENSITY))
+    return 1.0 - torch.exp(-density * OPACITY_LENGTH_M)
+
+
+def autograd_step(
+    field: AutogradField,
+    samples: RaySamples,
+    empty: Float32[Tensor, "empty 3"],
+    pairs: Float32[Tensor, "pairs 3"],
+    batch: TrainingBatch,
+    config: TrainConfig,
+) -> tuple[Tensor, ...]:
+    """Gradients of the loss with respect to the field's parameters, by what the recipe asks."""
+    asked = [samples.points, empty, pairs]
+    raw, raw_empty, raw_pairs = field.raw_outputs_at(torch.cat(asked)).split(
+        [len(some) for some in asked]
+    )
+    rendered = torch_reference.composite(raw, samples.offsets, samples.counts, config.sample_step_m)
+    loss = torch_reference.loss_per_ray(
+        rendered, batch.target, config.alpha_weight, config.hard_surface_weight
+    ).mean()
+    one, other = centimeter_opacity(raw_pairs).chunk(2)
+    total = loss + config.empty_space_weight * centimeter_opacity(raw_empty).mean()
+    total = total + config.density_tv_weight * (one - other).abs().mean()
+    return torch.autograd.grad(total, field.parameters)
+
+
 def step_marks(seen: LoadedTrainer) -> list[Measurement]:
-    """The step on 1,024 rays of one frame, by all three."""
+    """The step on 1,024 rays of one frame, by both."""
     trainer, config = seen.trainer, seen.trainer.config
     avatar, field = trainer.avatar, trainer.avatar.field
     frame = seen.frames[len(seen.frames) // 3]
@@ -41,8 +80,7 @@ def step_marks(seen: LoadedTrainer) -> list[Measurement]:
     chance = _seeded()
     empty = avatar.occupancy.sample_empty(config.empty_space_points, chance)
     near = sample_tv_pairs(samples.points, config, chance)
-    plain, scene = AutogradField(field), PaperStepInputs.of(avatar.rig, frame, seen.frames, grid)
-    counts: list[tuple[int, int]] = []
+    plain = AutogradField(field)
 
     def ours(config: TrainConfig = config) -> None:
         field.table_grad.zero_()
@@ -55,40 +93,18 @@ def step_marks(seen: LoadedTrainer) -> list[Measurement]:
         "ours": ours,
         "torch": lambda: autograd_step(plain, samples, empty, near, batch, config),
         "march": lambda: torch_reference.march(batch.rays, replay.correspondences, grid, how),
-        "paper": lambda: counts.append(
-            paper_step(scene, plain, batch, empty, config)
-        ),
     }  # fmt: skip
     ours(replace(config, faint_gradient_share=0.0))
     strays = _largest_difference(field.parameters(), alternatives["torch"]())
-    times = time_interleaved(alternatives, fewer_rounds={"paper": 2})
-    kept, roots = (count / config.rays for count in counts[-1])
-    return _step_marks(times, len(samples.points) / config.rays, strays, kept, roots, batch)
-
-
-def _step_marks(
-    times: dict[str, float],
-    mine: float,
-    strays: float,
-    kept: float,
-    roots: float,
-    batch: TrainingBatch,
-) -> list[Measurement]:
-    ms = {name: 1000.0 * time for name, time in times.items()}
-    rays = f"{len(batch.target):,} rays of one frame"
+    ms = {name: 1000.0 * time for name, time in time_interleaved(alternatives).items()}
     return [
         Measurement(
             name="one step vs plain torch on the same samples, times",
             value=ms["torch"] / ms["ours"], required="4", stretch_goal="8",
-            context=f"{rays}, {mine:.1f} samples/ray: {ms['ours']:.1f} ms with marching, torch "
+            context=f"{config.rays:,} rays of one frame, {len(samples.points) / config.rays:.1f} "
+            f"samples/ray: {ms['ours']:.1f} ms with marching, torch "
             f"{ms['torch']:.0f} ms without (its own marching: +{ms['march']:.0f} ms, not counted); "
             f"largest difference of a gradient {strays:.0e} of its largest",
-        ),
-        Measurement(
-            name="one step vs the paper's algorithm in plain torch, times",
-            value=ms["paper"] / ms["ours"], required="100", stretch_goal="400",
-            context=f"same rays: {ms['paper']:,.0f} ms; {kept:.1f} of 128 samples/ray survive the "
-            f"union grid, the field is queried at {roots:.1f} roots/ray",
         ),
     ]  # fmt: skip
 

@@ -17,9 +17,6 @@ from pathlib import Path
 import tyro
 
 from avatar.rig import Rig
-from benchmarks.builds import build_marks
-from benchmarks.correspondence_lookup import warp_marks
-from benchmarks.empty_space_skipping import skipping_marks
 from benchmarks.hardware import Hardware
 from benchmarks.measurements import Measurement, markdown_rows
 from benchmarks.sample_training import (
@@ -29,20 +26,16 @@ from benchmarks.sample_training import (
     train_for_core_seconds,
     training_config,
 )
-from benchmarks.startup import measure_peak_memory, measure_startup
 from benchmarks.step_timing import encode_marks, step_marks
 from benchmarks.stopwatch import limit_threads
-from benchmarks.thread_scaling import scaling_marks
 from benchmarks.training_quality import (
     measure_by_core_seconds,
     measure_by_wall_time,
     measure_pose_refinement,
 )
 from instant_avatar.cli.command_line import run_command
-from preprocess.poses.pose_format_registry import read_poses
 
 SIZE_PX = 256
-PHONE_SIZE_PX = 304
 TEN_MINUTES = 600.0
 """What patience adds to a minute, at 540 px."""
 WARMUP_TRAINING_SECONDS = 15.0
@@ -54,7 +47,7 @@ class Training:
     """Measures the training core and prints one table."""
 
     quick: bool = False
-    """Only single operations: neither quality nor start-up nor memory."""
+    """Only single operations, without quality."""
     json: Path | None = None
     """File for the figures."""
     keep: Path | None = None
@@ -82,8 +75,7 @@ def run_benchmark(job: Training) -> int:
 def all_marks(job: Training, folder: Path) -> Iterator[Measurement]:
     """All rows; each is also told on standard error as soon as it is known."""
     small = film_sample(folder / f"sample{SIZE_PX}", SIZE_PX)
-    phone = film_sample(folder / "phone", PHONE_SIZE_PX, like_a_phone=True)
-    groups = [scaling_marks(phone), operation_marks(small)]
+    groups = [operation_marks(small)]
     if not job.quick:
         groups += [
             measure_by_core_seconds(folder),
@@ -105,10 +97,6 @@ def operation_marks(capture: Path) -> Iterator[Measurement]:
     train_for_core_seconds(seen.trainer, WARMUP_TRAINING_SECONDS)
     yield from step_marks(seen)
     yield from encode_marks(seen)
-    novel = read_poses(capture / "truth" / "novel" / "poses.npz")
-    yield from warp_marks(seen, novel[len(novel) // 2].joint_rotations)
-    yield from build_marks(capture)
-    yield from skipping_marks(seen)
 
 
 def large_marks(folder: Path) -> Iterator[Measurement]:
@@ -116,8 +104,6 @@ def large_marks(folder: Path) -> Iterator[Measurement]:
     large = film_sample(folder / "sample540", 540, frames=300, turns=5.0)
     asked = {"held out": ("33", "37"), "novel poses": ("30.5", "34")}
     yield from measure_by_wall_time(large, asked)
-    yield from measure_startup(large)
-    yield from measure_peak_memory(large, folder / "run540")
     printed = dict.fromkeys(asked, ("", ""))
     yield from measure_by_wall_time(large, printed, seconds=TEN_MINUTES)
 

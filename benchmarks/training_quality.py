@@ -1,7 +1,7 @@
 """Quality of an avatar over training time, on the studio's sample."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -118,7 +118,7 @@ def measure_by_core_seconds(folder: Path) -> Iterator[Measurement]:
 
 def measure_by_wall_time(
     capture: Path,
-    targets: dict[str, tuple[str, str]],
+    targets: Mapping[str, tuple[str, str]],
     *,
     seconds: float = WALL_SECONDS,
 ) -> Iterator[Measurement]:
