@@ -1,6 +1,12 @@
 """What was measured beside what was asked for, as one table."""
 
-from dataclasses import dataclass
+import json
+import sys
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from benchmarks.hardware import Hardware
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,6 +25,23 @@ class Measurement:
     required: str = ""
     stretch_goal: str = ""
     context: str = ""
+
+
+def print_measurements(measurements: Iterable[Measurement], path: Path | None) -> None:
+    """Print each on standard error as soon as it is known, then all as a table; write them to path.
+
+    Args:
+        measurements: Measured while they are iterated.
+        path: JSON file; None for none.
+    """
+    hardware, marks = Hardware.here(), list[Measurement]()
+    for mark in measurements:
+        print(f"{mark.name}: {mark.value} ({mark.context})", file=sys.stderr, flush=True)
+        marks.append(mark)
+    print("\n".join([*hardware.lines(), "", *markdown_rows(marks)]))
+    if path is not None:
+        content = {"hardware": asdict(hardware), "marks": [asdict(mark) for mark in marks]}
+        path.write_text(json.dumps(content, indent=1) + "\n")
 
 
 def markdown_rows(marks: list[Measurement]) -> list[str]:

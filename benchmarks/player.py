@@ -11,20 +11,19 @@ thresholds here: whether a mark is reached is for the reader to see.
 """
 
 import itertools
-import json
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
 
 from avatar.training import checkpoint
 from avatar.training.trainer import Trainer
-from benchmarks.hardware import ROOT, Hardware
-from benchmarks.measurements import Measurement, markdown_rows
+from benchmarks.hardware import ROOT
+from benchmarks.measurements import Measurement, print_measurements
 from benchmarks.player_cost import frame_time_marks, load_time_marks, package_marks, time_bake
 from benchmarks.player_fidelity import (
     ComparedView,
@@ -65,25 +64,18 @@ def main() -> int:
 
 def measure(job: PlayerBenchmark) -> int:
     """Measures and prints."""
-    hardware = Hardware.here()
     with tempfile.TemporaryDirectory() as temporary:
-        marks = list(measured(job, job.keep or Path(temporary)))
-    print("\n".join([*hardware.lines(), "", *markdown_rows(marks)]))
-    if job.json is not None:
-        content = {"hardware": asdict(hardware), "marks": [asdict(mark) for mark in marks]}
-        job.json.write_text(json.dumps(content, indent=1) + "\n")
+        print_measurements(measured(job, job.keep or Path(temporary)), job.json)
     return 0
 
 
 def measured(job: PlayerBenchmark, folder: Path) -> Iterator[Measurement]:
-    """All rows; each is also told on standard error as soon as it is known."""
+    """All rows."""
     subjects = (1,) if job.quick else (1, 2)
     groups = [subject_marks(folder, subject, quick=job.quick) for subject in subjects]
     if job.person is not None and job.dance is not None:
         groups.append(person_marks(folder, job.person, job.dance))
-    for mark in itertools.chain.from_iterable(groups):
-        print(f"{mark.name}: {mark.value} ({mark.context})", file=sys.stderr, flush=True)
-        yield mark
+    return itertools.chain.from_iterable(groups)
 
 
 def subject_marks(folder: Path, subject: int, *, quick: bool) -> Iterator[Measurement]:

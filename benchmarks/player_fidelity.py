@@ -13,9 +13,8 @@ from avatar.evaluation.held_out import HeldOutFrame
 from avatar.evaluation.image_metrics import composite_on_white, ground_truth_on_white, psnr
 from avatar.render import render
 from avatar.training.frame_stream import prepare_stream
-from benchmarks.end_to_end import novel_observations
 from benchmarks.measurements import Measurement
-from benchmarks.sample_training import open_sample
+from benchmarks.sample_training import novel_observations, open_sample
 from capture.camera import Camera
 from export.package.player_tables import QUALITY_TIERS
 from export.player import Player, premultiply

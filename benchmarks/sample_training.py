@@ -14,6 +14,7 @@ from avatar.training.trainer import cosine_decay
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.capture_session import Capture
+from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
 
 
@@ -43,6 +44,12 @@ def film_sample(out: Path, size: int, **more: Any) -> Path:
 def open_sample(capture: Path, *, frames: slice | None = None, size: int | None = None) -> Capture:
     """A filmed sample or another capture, as it is or with a longer side of `size` pixels."""
     return open_capture(CaptureInputs(video=capture, frames=frames), size_px=size)
+
+
+def novel_observations(capture: Path) -> list[Observation]:
+    """The poses that were never filmed, with their true pictures and masks."""
+    wanted = CaptureInputs(video=capture / "truth" / "novel", cameras=str(capture / "cameras.npz"))
+    return [seen for seen in open_capture(wanted).observations() if isinstance(seen, Observation)]
 
 
 def training_config(recording: Capture, seconds: float, **changes: Any) -> TrainConfig:

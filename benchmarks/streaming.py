@@ -7,19 +7,16 @@ from outside; then again from inside, for what no report says. There are no thre
 """
 
 import itertools
-import json
-import sys
 import tempfile
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
 
-from benchmarks.hardware import Hardware
 from benchmarks.kill_and_resume import measure_kills
 from benchmarks.long_video import measure_memory_growth
-from benchmarks.measurements import Measurement, markdown_rows
+from benchmarks.measurements import Measurement, print_measurements
 from benchmarks.realtime_run import measure_realtime
 from benchmarks.sample_training import film_sample
 from benchmarks.streaming_quality import measure_streaming_quality
@@ -46,17 +43,13 @@ class StreamingOptions:
 def main() -> None:
     """The benchmark."""
     job = tyro.cli(StreamingOptions, prog="python -m benchmarks.streaming", description=__doc__)
-    hardware = Hardware.here()
     with tempfile.TemporaryDirectory() as temporary:
-        marks = list(measure_all(job, job.keep or Path(temporary), Path(temporary)))
-    print("\n".join([*hardware.lines(), "", *markdown_rows(marks)]))
-    if job.json is not None:
-        content = {"hardware": asdict(hardware), "marks": [asdict(mark) for mark in marks]}
-        job.json.write_text(json.dumps(content, indent=1) + "\n")
+        scratch = Path(temporary)
+        print_measurements(measure_all(job, job.keep or scratch, scratch), job.json)
 
 
 def measure_all(job: StreamingOptions, folder: Path, scratch: Path) -> Iterator[Measurement]:
-    """All rows; each is also told on standard error as soon as it is known."""
+    """All rows."""
     capture = film_sample(folder / f"turning{job.size}", job.size, frames=job.frames, turns=2.0)
     groups = [measure_realtime(capture, scratch / "played"), measure_streaming_quality(capture)]
     if not job.quick:
@@ -64,9 +57,7 @@ def measure_all(job: StreamingOptions, folder: Path, scratch: Path) -> Iterator[
     if not job.quick and job.kills:
         small = film_sample(folder / "small", 96, frames=60, turns=1.0)
         groups.append(measure_kills(small, scratch / "killed", kills=job.kills))
-    for mark in itertools.chain.from_iterable(groups):
-        print(f"{mark.name}: {mark.value} ({mark.context})", file=sys.stderr, flush=True)
-        yield mark
+    return itertools.chain.from_iterable(groups)
 
 
 if __name__ == "__main__":

@@ -7,18 +7,16 @@ There are no thresholds here: whether a mark is reached is for the reader to see
 """
 
 import itertools
-import json
 import sys
 import tempfile
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
 
 from avatar.rig import Rig
-from benchmarks.hardware import Hardware
-from benchmarks.measurements import Measurement, markdown_rows
+from benchmarks.measurements import Measurement, print_measurements
 from benchmarks.sample_training import (
     film_sample,
     load_trainer,
@@ -29,7 +27,6 @@ from benchmarks.sample_training import (
 from benchmarks.step_timing import encode_marks, step_marks
 from benchmarks.stopwatch import limit_threads
 from benchmarks.training_quality import (
-    measure_by_core_seconds,
     measure_by_wall_time,
     measure_pose_refinement,
 )
@@ -62,30 +59,22 @@ def main() -> int:
 
 def run_benchmark(job: Training) -> int:
     """Measures and prints."""
-    hardware = Hardware.here()
     with tempfile.TemporaryDirectory() as temporary:
-        marks = list(all_marks(job, job.keep or Path(temporary)))
-    print("\n".join([*hardware.lines(), "", *markdown_rows(marks)]))
-    if job.json is not None:
-        content = {"hardware": asdict(hardware), "marks": [asdict(mark) for mark in marks]}
-        job.json.write_text(json.dumps(content, indent=1) + "\n")
+        print_measurements(all_marks(job, job.keep or Path(temporary)), job.json)
     return 0
 
 
 def all_marks(job: Training, folder: Path) -> Iterator[Measurement]:
-    """All rows; each is also told on standard error as soon as it is known."""
+    """All rows."""
     small = film_sample(folder / f"sample{SIZE_PX}", SIZE_PX)
     groups = [operation_marks(small)]
     if not job.quick:
         groups += [
-            measure_by_core_seconds(folder),
             measure_by_wall_time(small, {"held out": ("33", "36"), "novel poses": ("31", "34")}),
             measure_pose_refinement(folder),
             large_marks(folder),
         ]
-    for mark in itertools.chain.from_iterable(groups):
-        print(f"{mark.name}: {mark.value} ({mark.context})", file=sys.stderr, flush=True)
-        yield mark
+    return itertools.chain.from_iterable(groups)
 
 
 def operation_marks(capture: Path) -> Iterator[Measurement]:

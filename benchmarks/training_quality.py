@@ -14,14 +14,12 @@ from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.rig import Rig
 from avatar.training.frame_stream import prepare_stream
 from avatar.training.train import Trainer, train, warm_up
-from benchmarks.end_to_end import novel_observations
 from benchmarks.hardware import Hardware
 from benchmarks.measurements import Measurement
 from benchmarks.sample_training import (
     film_sample,
-    load_trainer,
+    novel_observations,
     open_sample,
-    train_for_core_seconds,
     training_config,
 )
 from benchmarks.stopwatch import limit_threads
@@ -94,26 +92,6 @@ def train_online(
         pass
     inbox.close()
     return trainer, held
-
-
-def measure_by_core_seconds(folder: Path) -> Iterator[Measurement]:
-    """128 px, one thread: each time is a run of its own."""
-    recording = open_sample(film_sample(folder / "sample128", 128))
-    rig = Rig.from_shaped_body(recording.shaped)
-    for seconds, least, moonshot in ((5.0, "32", "34"), (10.0, "34", "36"), (60.0, "36", "39")):
-        limit_threads(1)
-        seen = load_trainer(recording, rig, training_config(recording, seconds))
-        warm_up(seen.trainer)
-        train_for_core_seconds(seen.trainer, seconds)
-        held, trainer = mean_psnr(seen.trainer.avatar, seen.held_out), seen.trainer
-        yield Measurement(
-            name=f"128 px, {seconds:.0f} core-seconds: held out, PSNR dB",
-            value=held.psnr,
-            required=least,
-            stretch_goal=moonshot,
-            context=f"in the mask {held.psnr_mask:.2f}; {trainer.steps:,} steps; poses refined; "
-            f"making {len(seen.frames)} frames ready took {seen.ready_seconds:.1f} core-s more",
-        )
 
 
 def measure_by_wall_time(
