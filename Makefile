@@ -26,8 +26,8 @@ demo: install
 web: install # what `ia-play --web` needs: onnxruntime-web, pinned, through npm
 	$(BIN)/python -m instant_avatar.animation.web_server
 
-results: install # docs/results.md: about an hour on two cores (calculated from its parts); MOTION=track.npz films a track of poses, PLAN=whole runs all
-	$(BIN)/python -m benchmarks.results --write docs/results.md $(if $(PLAN),--plan $(PLAN)) $(if $(MOTION),--motion $(MOTION))
+results: install # docs/results.md: about an hour on two cores (calculated from its parts); MOTION=track.npz films a track of poses
+	$(BIN)/python -m benchmarks.results --write docs/results.md $(if $(MOTION),--motion $(MOTION))
 
 test: install # on one thread: these tests are small, a second thread costs more CPU time than it saves
 	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -q -m "not slow"

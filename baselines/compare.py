@@ -62,10 +62,10 @@ class CompareArguments:
     The preset "small" is each method at the size that learns most in a minute of one core; "paper"
     has the paper's sizes, of which a step takes seconds to minutes (Anim-NeRF: 8 GB of memory).
 
-    OUT then holds table.md, comparison.json, pictures.png (truth, then each method), and for each
-    method scores.json (with commit, machine and versions) and its pictures of held-out frames and,
-    for a sample, of novel poses. A method that is there already is not trained again; Ctrl-C keeps
-    those that are done.
+    OUT then holds table.md, pictures.png (truth, then each method), and for each method scores.json
+    (with commit, machine, versions and the curve) and its pictures of held-out frames and, for a
+    sample, of novel poses. A method that is there already is not trained again; Ctrl-C keeps those
+    that are done.
 
     Exit codes: 0 done, 2 bad input, 3 disk full, 130 Ctrl-C.
     """
@@ -88,8 +88,6 @@ class CompareArguments:
     """Folder to write."""
     overwrite: Annotated[bool, FlagCreatePairsOff] = False
     """Train methods again that are in OUT already."""
-    redo_older: Annotated[bool, FlagCreatePairsOff] = False
-    """Train those methods again that another commit trained."""
 
     def validate(self) -> None:
         """Checks ranges and folders.
@@ -163,7 +161,6 @@ def compare(arguments: CompareArguments, console: Console) -> int:
     results = [json.loads((arguments.out / name / "scores.json").read_text()) for name in done]
     if results:
         table = comparison_table(results)
-        write_text_atomically(arguments.out / "comparison.json", json.dumps(results, indent=1))
         write_text_atomically(arguments.out / "table.md", table)
         _write_sheet(arguments.out, done)
         print(table, end="")  # noqa: T201 - the table goes to stdout, for scripts
@@ -172,14 +169,10 @@ def compare(arguments: CompareArguments, console: Console) -> int:
 
 def _is_done(arguments: CompareArguments, name: str) -> bool:
     """Whether a method was trained before, under the same conditions, and is to be kept."""
-    from benchmarks.hardware import Hardware
-
     scores = arguments.out / name / "scores.json"
-    kept = json.loads(scores.read_text()) if scores.is_file() else {}
-    if "made_on" not in kept:  # nothing, or by an earlier form of this program
+    if not scores.is_file():
         return False
-    if arguments.redo_older and kept["made_on"]["commit"] != Hardware.here().commit:
-        return False
+    kept = json.loads(scores.read_text())
     before, now = kept["conditions"], arguments.conditions(name)
     changed = [
         f"{key} {before.get(key)}, now {now[key]}" for key in now if before.get(key) != now[key]

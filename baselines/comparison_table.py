@@ -1,4 +1,4 @@
-"""Results of a comparison as Markdown: scores at the end, over time, and what time is missing."""
+"""Results of a comparison as Markdown: scores at the end, and what time is missing."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,7 @@ MIN_SLOPE_DB = 0.1
 
 
 def comparison_table(results: Sequence[dict[str, Any]]) -> str:
-    """Both tables of one capture: at the end of training, and over time."""
+    """The table of one capture at the end of training."""
     results = [with_better_poses(each) for each in results]
     head = ["", "core-s", "steps", "core-ms a step"]
     head += [title.format(told) for told in KINDS.values() for _, _, title, _ in COLUMNS]
@@ -32,8 +32,7 @@ def comparison_table(results: Sequence[dict[str, Any]]) -> str:
         ]
         for each in results
     ]  # fmt: skip
-    kind = "held_out" if results[0]["novel"]["psnr"] is None else "novel"
-    return "\n".join([*markdown(head, rows), "", *markdown(*_by_time(results, kind)), ""])
+    return "\n".join([*markdown(head, rows), ""])
 
 
 def with_better_poses(result: Mapping[str, Any]) -> dict[str, Any]:
@@ -49,31 +48,6 @@ def with_better_poses(result: Mapping[str, Any]) -> dict[str, Any]:
             means = {key: fmean(score[key] for score in better) for _, key, _, _ in COLUMNS}
             found[f"{kind}_fitted"] = {**means, "frames": better}
     return found
-
-
-def _by_time(results: Sequence[dict[str, Any]], kind: str) -> tuple[list[str], list[list[str]]]:
-    """PSNR over time on a few frames, and the time that each needs for the product's last value."""
-    ours = next((each["curve"] for each in results if each["method"] == "ours"), [])
-    longest = max((each["curve"] for each in results), key=len)
-    counted = results[0]["conditions"]["steps"] is not None
-    times = [point["steps" if counted else "core_seconds"] for point in longest]
-    unit = "steps" if counted else "core-s"
-    head = [f"{KINDS[kind]} in fitted poses, PSNR after"]
-    head += [f"{round(time):,} {unit}" for time in times]
-    rows = []
-    if ours:
-        head.append("as good as ours at the end")
-    for each in results:
-        row = [each["method"], *(number(point[kind], 2) for point in each["curve"])]
-        row += ["-"] * (len(times) + 1 - len(row))
-        if ours:
-            row.append(
-                ""
-                if each["method"] == "ours"
-                else time_to_reach(each["curve"], kind, ours[-1][kind])
-            )
-        rows.append(row)
-    return head, rows
 
 
 def time_to_reach(curve: Sequence[dict[str, Any]], kind: str, wanted: float) -> str:

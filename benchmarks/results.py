@@ -1,22 +1,21 @@
 """The paper's tables with ours and the baselines, at equal core time: docs/results.md.
 
-    python -m benchmarks.results [--motion TRACK] [--plan whole] [--write docs/results.md]
+    python -m benchmarks.results [--motion TRACK] [--write docs/results.md]
 
 For each subject an exact and a phone-like sample are filmed and `python -m baselines.compare` is
-run on both, as many at a time as there are --jobs. What is in OUT already is not made again: Ctrl-C
-or SIGTERM (the second one ends it at once) and the same command continue, with the most important
-comparisons first. Times are the processor's, so that other programs hardly count; commit, machine
-and versions come from the score files.
+run on both, as many at a time as there are --jobs. What is in OUT already is not made again: the
+same command continues after Ctrl-C, with the most important comparisons first. Times are the
+processor's, so that other programs hardly count; commit, machine and versions come from the score
+files.
 """
 
 import json
 import subprocess
 import sys
-import threading
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, final
+from typing import Any, Literal
 
 import cv2
 import tyro
@@ -25,7 +24,7 @@ from benchmarks.hardware import ROOT
 from benchmarks.results_page import BEGIN, END, ComparedSample, results_lines
 from capture.atomic_files import write_text_atomically
 from capture.input_error import InputError
-from instant_avatar.cli.command_line import INTERRUPTED, run_command
+from instant_avatar.cli.command_line import run_command
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 
 ORDER = ("anim-nerf", "neural-body", "snarf", "instant-ngp", "ours")
@@ -38,11 +37,12 @@ PICTURES = {"exact": "results.webp", "phone": "results-phone.webp"}
 
 @dataclass(frozen=True, kw_only=True)
 class ResultsJob:
-    """Films the samples, compares the systems on each, and writes the page."""
+    """Films the samples, compares the systems on each, and writes the page.
 
-    plan: Literal["short", "whole"] = "short"
-    """short: Anim-NeRF and ours on S1 to S3 for a minute, all methods on S1, and five minutes on
-    S1 (about 110 core-minutes). whole: all methods on all of them, one and five minutes."""
+    Anim-NeRF and ours on S1 to S3 for a minute, all methods on S1, and five minutes on S1: about
+    110 core-minutes.
+    """
+
     motion: Path | None = None
     """Track whose poses the actors take while they are filmed, such as one of PeopleSnapshot; if
     not given, the studio's own turn."""
@@ -52,12 +52,14 @@ class ResultsJob:
     """Frames of each film."""
     jobs: int = 2
     """Comparisons at a time; each takes one core."""
-    redo_older: bool = False
-    """Train again what another commit trained; otherwise the page names such cells."""
     out: Path = Path("results")
     """Folder for samples and comparisons."""
     write: Path | None = None
     """Markdown file whose tables are replaced; its pictures lie beside it."""
+
+
+ComparedAs = tuple[int, Literal["phone", "exact"], float]
+"""Subject, kind of film, and core seconds of training."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,78 +82,32 @@ def run(job: ResultsJob) -> int:
     Raises:
         InputError: If OUT holds samples that were filmed otherwise.
     """
-    planned = plan(job.plan)
+    planned = plan()
     samples = list(dict.fromkeys(each.sample for each in planned))
     _claim(job)
     for sample in samples:
         film(job, sample)
-    codes, comparisons = [0], RunningComparisons()
-    with ThreadPoolExecutor(job.jobs) as pool:
-        running = [pool.submit(compare, job, each, comparisons) for each in planned]
-        try:
-            for finished in as_completed(running):
-                codes.append(finished.result())
-                done = f"{len(codes) - 1} of {len(planned)} comparisons"
-                print(done, file=sys.stderr, flush=True)
-                write_page(job, samples)
-        except BaseException:
-            comparisons.stop()
-            raise
-        finally:
-            try:
-                pool.shutdown(cancel_futures=True)
-            except KeyboardInterrupt:
-                comparisons.stop()  # the second signal ends them at once
-                raise
-            write_page(job, samples)  # an interrupted run has a page, too
+    codes, pool = [0], ThreadPoolExecutor(job.jobs)
+    running = [pool.submit(compare, job, each) for each in planned]
+    try:
+        for finished in as_completed(running):
+            codes.append(finished.result())
+            print(f"{len(codes) - 1} of {len(planned)} comparisons", file=sys.stderr, flush=True)
+            write_page(job, samples)
+    finally:  # Ctrl-C reaches those that are running, too
+        pool.shutdown(cancel_futures=True)
+        write_page(job, samples)  # an interrupted run has a page, too
     return max(codes)
 
 
-@final
-class RunningComparisons:
-    """Processes that are running, each in a session of its own: they end with this one."""
-
-    def __init__(self) -> None:
-        """None is running."""
-        self._running: list[subprocess.Popen[bytes]] = []
-        self._is_stopped = False
-        self._lock = threading.Lock()
-
-    def run(self, command: list[str]) -> int:
-        """Runs a command to its end; its exit code, that of Ctrl-C once they were stopped."""
-        with self._lock:
-            if self._is_stopped:
-                return INTERRUPTED
-            process = subprocess.Popen(
-                command, cwd=ROOT, stdout=subprocess.DEVNULL, start_new_session=True
-            )
-            self._running.append(process)
-        code = process.wait()
-        return code if code >= 0 else 128 - code  # as a shell tells a signal
-
-    def stop(self) -> None:
-        """Asks what runs to stop as Ctrl-C does, the second time at once; nothing starts later."""
-        with self._lock:
-            self._is_stopped = True
-            for process in self._running:
-                process.terminate()
-
-
-def plan(name: str) -> list[PlannedComparison]:
-    """The comparisons of a plan, the most important ones first; later ones may repeat methods."""
+def plan() -> list[PlannedComparison]:
+    """The comparisons, the most important ones first; later ones may repeat methods."""
     kinds: tuple[Literal["phone", "exact"], ...] = ("phone", "exact")
-    everything = [
-        (subject, kind, seconds) for seconds in (60.0, 300.0) for subject in (1, 2, 3)
-        for kind in kinds
-    ]  # fmt: skip
-    first = [each for each in everything if each[2] == 60.0]
-    ordered = [(each, MAIN) for each in first]
-    if name == "short":
-        ordered += [((1, kind, 60.0), _without("snarf")) for kind in kinds]
-        ordered += [((1, kind, 300.0), MAIN) for kind in kinds]
-        ordered += [((1, kind, 60.0), ORDER) for kind in kinds]
-    else:
-        ordered += [(each, ORDER) for each in everything]
+    first: list[ComparedAs] = [(subject, kind, 60.0) for subject in (1, 2, 3) for kind in kinds]
+    ordered: list[tuple[ComparedAs, tuple[str, ...]]] = [(each, MAIN) for each in first]
+    ordered += [((1, kind, 60.0), _without("snarf")) for kind in kinds]
+    ordered += [((1, kind, 300.0), MAIN) for kind in kinds]
+    ordered += [((1, kind, 60.0), ORDER) for kind in kinds]
     return [
         PlannedComparison(
             sample=ComparedSample(subject=subject, kind=kind, seconds=seconds), methods=methods
@@ -192,15 +148,16 @@ def film(job: ResultsJob, sample: ComparedSample) -> None:
     film_capture(place, config)
 
 
-def compare(job: ResultsJob, planned: PlannedComparison, comparisons: RunningComparisons) -> int:
+def compare(job: ResultsJob, planned: PlannedComparison) -> int:
     """Compares the methods on a sample; the exit code."""
     sample = planned.sample
     command = [
         sys.executable, "-m", "baselines.compare", str((job.out / sample.name).resolve()),
         "--seconds", f"{sample.seconds:g}", "--out", str(folder_of(job, sample)),
-        "--methods", *planned.methods, *(["--redo-older"] if job.redo_older else []),
+        "--methods", *planned.methods,
     ]  # fmt: skip
-    return comparisons.run(command)
+    code = subprocess.run(command, cwd=ROOT, stdout=subprocess.DEVNULL, check=False).returncode
+    return code if code >= 0 else 128 - code  # as a shell tells a signal
 
 
 def folder_of(job: ResultsJob, sample: ComparedSample) -> Path:
@@ -236,15 +193,9 @@ def write_page(job: ResultsJob, samples: list[ComparedSample]) -> None:
 
 
 def _scores(job: ResultsJob, sample: ComparedSample) -> list[dict[str, Any]]:
-    """What the score files of a sample hold, in the order of the methods; not of earlier forms."""
-    paths = [scores_of(job, sample, name) for name in ORDER]
-    read = [json.loads(path.read_text()) for path in paths if path.is_file()]
-    return [each for each in read if "made_on" in each]
-
-
-def scores_of(job: ResultsJob, sample: ComparedSample, method: str) -> Path:
-    """Where the scores of a method on a sample lie."""
-    return folder_of(job, sample) / method / "scores.json"
+    """What the score files of a sample hold, in the order of the methods."""
+    paths = [folder_of(job, sample) / name / "scores.json" for name in ORDER]
+    return [json.loads(path.read_text()) for path in paths if path.is_file()]
 
 
 if __name__ == "__main__":
