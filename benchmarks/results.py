@@ -58,10 +58,6 @@ class ResultsJob:
     """Markdown file whose tables are replaced; its pictures lie beside it."""
 
 
-ComparedAs = tuple[int, Literal["phone", "exact"], float]
-"""Subject, kind of film, and core seconds of training."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class PlannedComparison:
     """Methods that are to be compared on a sample."""
@@ -103,16 +99,22 @@ def run(job: ResultsJob) -> int:
 def plan() -> list[PlannedComparison]:
     """The comparisons, the most important ones first; later ones may repeat methods."""
     kinds: tuple[Literal["phone", "exact"], ...] = ("phone", "exact")
-    first: list[ComparedAs] = [(subject, kind, 60.0) for subject in (1, 2, 3) for kind in kinds]
-    ordered: list[tuple[ComparedAs, tuple[str, ...]]] = [(each, MAIN) for each in first]
-    ordered += [((1, kind, 60.0), _without("snarf")) for kind in kinds]
-    ordered += [((1, kind, 300.0), MAIN) for kind in kinds]
-    ordered += [((1, kind, 60.0), ORDER) for kind in kinds]
-    return [
-        PlannedComparison(
-            sample=ComparedSample(subject=subject, kind=kind, seconds=seconds), methods=methods
+
+    def planned(
+        methods: tuple[str, ...], seconds: float = 60.0, subjects: tuple[int, ...] = (1,)
+    ) -> list[PlannedComparison]:
+        samples = (
+            ComparedSample(subject=subject, kind=kind, seconds=seconds)
+            for subject in subjects
+            for kind in kinds
         )
-        for (subject, kind, seconds), methods in ordered
+        return [PlannedComparison(sample=sample, methods=methods) for sample in samples]
+
+    return [
+        *planned(MAIN, subjects=(1, 2, 3)),
+        *planned(_without("snarf")),
+        *planned(MAIN, seconds=300.0),
+        *planned(ORDER),
     ]
 
 
