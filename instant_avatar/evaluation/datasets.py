@@ -149,8 +149,7 @@ def _open_prepared(
     if not (place / "images").is_dir():
         raise InputError(
             f"{place} holds no images/. The data set's own files (a video, camera.pkl, HDF5) are "
-            "prepared first: python -m benchmarks.people_snapshot, in a checkout "
-            "(docs/evaluation.md)."
+            "prepared first, by InstantAvatar's preprocess_PeopleSnapshot.py (docs/evaluation.md)."
         )
     train, test = (
         SplitFrames(folder=place, poses=_existing(place / poses), frames=frames)
