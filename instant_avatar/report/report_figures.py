@@ -1,6 +1,5 @@
-"""Figures as SVG: the learning curve, and the body from four sides by how well it was seen."""
+"""The body from four sides as SVG, by how well it was seen."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -13,74 +12,9 @@ from avatar.evaluation.coverage import MIN_WELL_SEEN_COSINE, Coverage
 from avatar.evaluation.skin_patches import pose_patches
 from avatar.rig import canonical_rotations
 from instant_avatar.report.page_rendering import render_template
-from instant_avatar.report.report_schema import CurvePoint
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.body_surface import visible_points
 from preprocess.body.parametric_body import ShapedBody
-
-SVG_WIDTH, SVG_HEIGHT = 720, 320
-"""Size of the plot with its margins, in SVG units."""
-LEFT, RIGHT, TOP, BOTTOM = 46, 16, 26, 48
-"""Margins of the plot, for its labels, in SVG units."""
-TICK_SECONDS = (0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 30.0, 60.0, 300.0)
-"""Distances of the ticks of the time axis, of which the first that gives at most 8 is used."""
-SCORE_LABELS = {"psnr_mask": ("masked", "inside the mask"), "psnr": ("whole", "whole image")}
-"""CSS class and label of each score of the curve."""
-
-
-def curve_svg(curve: Sequence[CurvePoint]) -> Markup:
-    """Plot held-out PSNR over training time: whole image, and inside the mask.
-
-    Each video has its own line, because its held-out frames cannot be compared with another's.
-    Return an empty string if nothing was scored.
-    """
-    curve = [point for point in curve if point.psnr is not None]
-    values = [
-        value for point in curve for value in (point.psnr, point.psnr_mask) if value is not None
-    ]
-    if not values:
-        return Markup("")
-    low, high = 5 * int(min(values) // 5), 5 * int(max(values) // 5 + 1)
-    end = max(max(point.wall_seconds for point in curve), 1e-6)
-    step = next((step for step in TICK_SECONDS if end / step <= 8.0), TICK_SECONDS[-1])
-
-    def x(seconds: float) -> float:
-        return round(LEFT + (SVG_WIDTH - LEFT - RIGHT) * seconds / end, 1)
-
-    def y(decibels: float) -> float:
-        return round(TOP + (SVG_HEIGHT - TOP - BOTTOM) * (high - decibels) / (high - low), 1)
-
-    def dots(score: str, video: int) -> list[tuple[float, float, str]]:
-        return [
-            (
-                x(point.wall_seconds),
-                y(value),
-                f"{point.wall_seconds:.1f} s: {value:.2f} dB {SCORE_LABELS[score][1]}, mean over "
-                f"{len(point.frames)} held-out frames",
-            )
-            for point in curve
-            if point.video == video and (value := getattr(point, score)) is not None
-        ]
-
-    starts = {point.video: x(point.wall_seconds) for point in reversed(curve)}
-    return render_template(
-        "curve.svg",
-        width=SVG_WIDTH,
-        height=SVG_HEIGHT,
-        left=LEFT,
-        right=SVG_WIDTH - RIGHT,
-        top=TOP,
-        grid=[(y(decibels), decibels) for decibels in range(low, high + 1, 5)],
-        ticks=[(x(step * k), f"{step * k:g}") for k in range(int(end / step) + 1)],
-        videos=[(at, video) for video, at in sorted(starts.items()) if len(starts) > 1],
-        lines=[
-            (kind, dots(score, video))
-            for score, (kind, _) in SCORE_LABELS.items()
-            for video in sorted(starts)
-            if dots(score, video)
-        ],
-    )
-
 
 VIEW_AXES = {"front": (0, 1.0), "left": (2, -1.0), "back": (0, -1.0), "right": (2, 1.0)}
 """Axis of the body, and its sign, that points right in each view."""

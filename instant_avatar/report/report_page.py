@@ -7,7 +7,6 @@ from typing import Any
 from markupsafe import Markup
 
 from instant_avatar.report.page_rendering import render_template
-from instant_avatar.report.report_figures import curve_svg
 from instant_avatar.report.report_schema import Report
 
 SHOWN_VALUES = ("frames", "training", "held_out", "stream", "package", "machine")
@@ -56,7 +55,6 @@ def report_page(
         verdict=verdict,
         report=report,
         frames=report.frames.sentence(),
-        curve=curve_svg(report.curve),
         body_map=body_map,
         pairs=pairs,
         animation=animation,

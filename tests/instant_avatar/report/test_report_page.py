@@ -6,7 +6,6 @@ from dataclasses import is_dataclass, replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import get_args, get_type_hints
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ from avatar.evaluation.all_round_verdict import AllRoundVerdict
 from avatar.events import HeldOutScore
 from instant_avatar.cli.shared_options import capture_name
 from instant_avatar.report.page_rendering import data_uri, encode_webp, webp_data_uri
-from instant_avatar.report.report_figures import curve_svg
 from instant_avatar.report.report_page import ComparisonPair, report_page
 from instant_avatar.report.report_schema import (
     CurvePoint,
@@ -119,20 +117,12 @@ def test_nan_and_infinity_become_null():
 
 
 def test_the_page_names_earlier_videos():
-    marks = (
-        point(2.0, 24.0),
-        replace(point(40.0, 20.0), video=2),
-        replace(point(50.0, 21.0), video=2),
-    )
     earlier = EarlierVideoStats(
         videos=("first <1>.mp4",), frames_trained=54, wall_seconds=30.0, replayed_key_frames=40
     )
-    page = report_page(report(earlier_videos=earlier, curve=marks), name="second.mp4", verdict="")
+    page = report_page(report(earlier_videos=earlier), name="second.mp4", verdict="")
     assert "first &lt;1&gt;.mp4" in page
     assert "40 key frames" in page
-    svg = ElementTree.fromstring(curve_svg(marks))
-    lines = [line.get("points").split() for line in svg.findall("polyline[@class='whole']")]
-    assert [len(line) for line in lines] == [1, 2]
 
 
 def test_a_point_of_the_curve_survives_a_checkpoint():
@@ -287,22 +277,6 @@ def test_the_page_names_no_file_that_is_not_there():
         solved, name="clip", verdict="Sharp.", next_steps={"Play": "ia-play 'a run/x.iavatar'"}
     )
     assert "ia-play &#39;a run/x.iavatar&#39;" in page
-
-
-def test_the_curve_goes_up_when_the_score_does():
-    svg = ElementTree.fromstring(curve_svg((point(2.0, 24.0), point(5.0, 29.0), point(9.0, 29.0))))
-    (line,) = svg.findall("polyline")
-    places = [tuple(map(float, pair.split(","))) for pair in line.get("points").split()]
-    (x0, y0), (x1, y1), (x2, y2) = places
-    assert x0 < x1 < x2
-    assert y0 > y1 == y2
-    assert (x1 - x0) / (x2 - x1) == pytest.approx(3.0 / 4.0, abs=0.01)
-    width, height = map(float, svg.get("viewBox").split()[2:])
-    assert all(0.0 < x < width and 0.0 < y < height for x, y in places)
-
-
-def test_nothing_measured_draws_nothing():
-    assert curve_svg((point(2.0, None),)) == ""
 
 
 def paths_in(record, above=""):
