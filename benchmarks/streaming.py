@@ -1,6 +1,6 @@
 """A video played at its own speed: what is learnt when it ends, and how soon it is ready.
 
-    python -m benchmarks.streaming [--quick] [--kills 20] [--json FILE] [--keep DIR]
+    python -m benchmarks.streaming [--json FILE] [--keep DIR]
 
 Films the sample turning twice in 20 s, plays it into ia-ingest as a user would, and looks at it
 from outside; then again from inside, for what no report says. There are no thresholds here.
@@ -14,8 +14,6 @@ from pathlib import Path
 
 import tyro
 
-from benchmarks.kill_and_resume import measure_kills
-from benchmarks.long_video import measure_memory_growth
 from benchmarks.measurements import Measurement, print_measurements
 from benchmarks.realtime_run import measure_realtime
 from benchmarks.sample_training import film_sample
@@ -30,10 +28,6 @@ class StreamingOptions:
     """Width and height of the pictures."""
     frames: int = 600
     """Frames of the video, at 30 a second."""
-    kills: int = 20
-    """How often a run is killed."""
-    quick: bool = False
-    """Neither kills nor memory."""
     json: Path | None = None
     """File for the figures."""
     keep: Path | None = None
@@ -52,11 +46,6 @@ def measure_all(job: StreamingOptions, folder: Path, scratch: Path) -> Iterator[
     """All rows."""
     capture = film_sample(folder / f"turning{job.size}", job.size, frames=job.frames, turns=2.0)
     groups = [measure_realtime(capture, scratch / "played"), measure_streaming_quality(capture)]
-    if not job.quick:
-        groups.append(measure_memory_growth(capture, folder / f"looped{job.size}"))
-    if not job.quick and job.kills:
-        small = film_sample(folder / "small", 96, frames=60, turns=1.0)
-        groups.append(measure_kills(small, scratch / "killed", kills=job.kills))
     return itertools.chain.from_iterable(groups)
 
 
