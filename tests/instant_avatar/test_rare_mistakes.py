@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.source_opening import open_source
 from instant_avatar import check
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.poses.pose_file import write_motion
@@ -55,34 +54,6 @@ def change_masks(folder: Path, change) -> None:
 
 
 @pytest.mark.slow
-def test_a_cropped_video_is_detected_by_its_principal_point_and_corrected(
-    capture, diagnosed, tmp_path
-):
-    cut = 18
-    frames = list(open_source(capture / "video.mp4").frames())
-    pictures = capture / "images"
-    pictures.mkdir()
-    for frame in frames:
-        bgr = cv2.cvtColor(frame.rgb[:, cut:], cv2.COLOR_RGB2BGR)
-        cv2.imwrite(str(pictures / f"{frame.index:06d}.png"), bgr)
-    (capture / "video.mp4").unlink()
-    change_masks(capture, lambda _, mask: mask[:, cut:])
-    with np.load(capture / "cameras.npz") as stored:
-        np.savez(capture / "cameras.npz", **{**stored, "width": SIDE - cut})
-    code, found = diagnosed("--fix", tmp_path / "mended")
-    assert code == 0
-    assert found["cause"] == "focal"
-    assert found["iou"]["after_fix"] > 0.75 > 0.5 > found["iou"]["now"]
-    with (
-        np.load(tmp_path / "mended" / "cameras.npz") as mended,
-        np.load(capture / "cameras.npz") as stored,
-    ):
-        moved = mended["intrinsic"] - stored["intrinsic"]
-        assert moved[0, 2] == pytest.approx(-cut, abs=1.5)
-        assert abs(moved[1, 2]) < 1.5
-
-
-@pytest.mark.slow
 def test_poses_of_another_person_from_the_middle_on_are_no_offset(capture, diagnosed):
     motion = read_poses(capture / "poses.npz")
     motion.root_translations[FRAMES // 2 :, 0] += 0.9
@@ -104,17 +75,3 @@ def test_boxes_are_called_boxes_and_no_focal_length_is_fitted_to_them(capture, d
     _, found = diagnosed()
     assert any("boxes" in anomaly for anomaly in found["anomalies"])
     assert found["corrections"] == []
-
-
-@pytest.mark.slow
-def test_a_reversed_video_is_detected_and_corrected(capture, diagnosed, tmp_path):
-    true = read_poses(capture / "poses.npz")
-    back = true.select_rows(np.arange(FRAMES)[::-1], np.arange(FRAMES))
-    write_motion(capture / "poses.npz", back)
-    code, found = diagnosed("--fix", tmp_path / "mended")
-    assert (code, found["cause"], len(found["corrections"])) == (0, "frame_rate", 1)
-    assert found["iou"]["after_fix"] > found["iou"]["now"] + 0.1
-    mended = read_poses(tmp_path / "mended" / "poses.npz")
-    np.testing.assert_array_equal(mended.frames, np.arange(FRAMES))
-    np.testing.assert_allclose(mended.joint_rotations, true.joint_rotations, atol=1e-9)
-    np.testing.assert_allclose(mended.root_translations, true.root_translations, atol=1e-9)

@@ -1,8 +1,7 @@
-"""The traps that once cost decibels, and that each of them would still bite.
+"""Traps that once cost decibels.
 
 Cached densities are the highest that a cell has shown: they rise before the surface. What ends a
-ray by them must continue it by metres, not samples; no picture may end by them at all;
-and a cell must not forget a thin surface because one probe has missed it.
+ray by them must continue it by metres, not samples.
 """
 
 import dataclasses
@@ -25,7 +24,6 @@ from avatar.kernels.operands import (
     MarchSettings,
     RayBatch,
 )
-from avatar.occupancy_grid import MIN_STEP_OPACITY, OCCUPANCY_DECAY, OccupancyGrid
 from avatar.render import render
 from avatar.rig import Rig
 from avatar.training.frame_stream import TrainingFrame, prepare_stream
@@ -98,56 +96,6 @@ def test_a_grazing_ray_reaches_the_bottom_of_the_surfaces_cell_whatever_the_step
     assert depth == pytest.approx(expected, abs=2.5 * step_m * sine)
 
 
-def test_a_grace_of_four_samples_would_cut_it_off_before():
-    """At 15 mm a grace of four samples is one of 6 cm; at 2.5 mm it ends above the surface."""
-    depths = [lowest(0.3, step_m, 4 * step_m) for step_m in (0.015, 0.005, 0.0025)]
-    assert depths[0] > CANONICAL_M
-    assert depths[1] < 0.7 * CANONICAL_M
-    assert depths[2] < 0.4 * CANONICAL_M
-
-
-# --- a sheet that most probes miss ------------------------------------------------------------
-
-
-SHEET = 0.15
-"""Of a cell's height, how much the sheet fills: a probe's chance to hit it."""
-
-
-def forgotten(rig, *, decay: float, updates: int) -> float:
-    """Share of a thin sheet's cells that count as empty after repeated probes."""
-    occupancy, generator = OccupancyGrid(rig), torch.Generator().manual_seed(0)
-    grid = occupancy.density_grid
-    layer = int((float(rig.rest_joints[6, 2]) + 0.05 - rig.box_low[2]) * grid.cells_per_m[2])
-    middle = float(rig.box_low[2] + (layer + 0.5) / grid.cells_per_m[2])
-    thickness_m = SHEET / float(grid.cells_per_m[2])
-
-    def log_density_at(points):
-        return torch.where((points[:, 2] - middle).abs() < thickness_m / 2, 6.0, -20.0)
-
-    sheet = torch.from_numpy(rig.skin_distance <= 0.08)[:, :, layer]
-    shares = []
-    for update in range(updates):
-        occupancy.update(
-            log_density_at, share=1.0, decay=decay, sample_step_m=0.01, generator=generator
-        )
-        if update >= updates // 2:
-            shares.append(
-                float((grid.density[:, :, layer][sheet] < MIN_STEP_OPACITY / 0.01).float().mean())
-            )
-    return float(np.mean(shares))
-
-
-@pytest.mark.slow
-def test_a_decay_of_six_tenths_with_one_probe_a_cell_would_forget_thin_surfaces(rig):
-    """A probe misses with probability 1 - p; after n misses in a row the cell counts as empty."""
-    for decay, misses in ((0.6, 11), (OCCUPANCY_DECAY, 51)):
-        assert misses == math.ceil(
-            math.log(math.exp(6.0) / (MIN_STEP_OPACITY / 0.01)) / -math.log(decay)
-        )
-        share = forgotten(rig, decay=decay, updates=160)
-        assert share == pytest.approx((1.0 - SHEET) ** misses, rel=0.15, abs=1e-3)
-
-
 # --- a person ---------------------------------------------------------------------------------
 
 
@@ -199,12 +147,10 @@ class Taught:
         return found
 
 
-def taught(clip: Filmed, steps: int, *, grace_steps: int | None = None, marks: int = 5) -> Taught:
-    """Trains a clip for a number of steps, optionally with an opaque margin in samples."""
+def taught(clip: Filmed, steps: int, *, marks: int = 5) -> Taught:
+    """Trains a clip for a number of steps."""
     config = TrainConfig.for_budget(30.0, footprint_m=clip.footprint_m)
     config = dataclasses.replace(config, refine_poses=False)
-    if grace_steps is not None:
-        config = dataclasses.replace(config, opaque_margin_m=grace_steps * config.sample_step_m)
     trainer, scores = Trainer(clip.rig, config), []
     for frame in clip.frames:
         trainer.add_frame(frame)
@@ -225,13 +171,8 @@ def small() -> Taught:
 
 
 @pytest.fixture(scope="module")
-def large_clip() -> Filmed:
-    return filmed(540)
-
-
-@pytest.fixture(scope="module")
-def large(large_clip) -> Taught:
-    return taught(large_clip, LARGE_STEPS)
+def large() -> Taught:
+    return taught(filmed(540), LARGE_STEPS)
 
 
 @pytest.mark.slow
@@ -250,11 +191,3 @@ def test_no_frame_falls_back_between_marks(small, large):
         scores = np.array(learner.marks)
         assert len(scores) == 5
         assert (np.maximum.accumulate(scores, axis=0) - scores).max() < 1.0
-
-
-@pytest.mark.slow
-def test_training_with_a_grace_counted_in_samples_would_be_worse(large_clip, large):
-    ragged = taught(large_clip, LARGE_STEPS, grace_steps=4)
-    losses = np.array(large.overlaps()) - np.array(ragged.overlaps())
-    assert losses.mean() > 0.0  # 0.001 to 0.004
-    assert np.mean(ragged.marks[-1]) < np.mean(large.marks[-1]) - 0.5  # 1.0 to 1.6 dB

@@ -87,15 +87,6 @@ def test_a_painted_backdrop_is_refused_where_the_camera_moves(tmp_path):
             film_capture(tmp_path / "c", config)
 
 
-def test_a_pose_file_says_in_which_space_it_is(capture, tmp_path):
-    assert read_poses(capture / "poses.npz").space == "camera"
-    with np.load(capture / "poses.npz") as arrays:
-        changed = {**arrays, "space": np.array("moon")}
-    np.savez(tmp_path / "poses.npz", **changed)
-    with pytest.raises(InputError, match=r"expected world or camera"):
-        read_poses(tmp_path / "poses.npz")
-
-
 def test_the_room_is_closed_and_the_floor_is_darker_about_the_feet():
     room, camera = FurnishedRoom.furnished("room", 96, 0), staging.standing_camera(1.7, 96)
     feet = np.array([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0]])

@@ -179,37 +179,3 @@ def test_the_same_seed_films_the_same_and_another_seed_does_not(capture, tmp_pat
     )
     assert first == again
     assert first != other
-
-
-def test_nothing_is_left_when_the_shoot_is_stopped(tmp_path):
-    def stop(done, total):
-        if done == 2:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        film_capture(tmp_path / "stopped", SMALL, stop)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_an_old_capture_survives_a_stopped_overwrite(capture, tmp_path):
-    out = tmp_path / "capture"
-    film_capture(out, ShootConfig(frames=1, size=32))
-    before = (out / "video.mp4").read_bytes()
-
-    def stop(done, total):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        film_capture(out, SMALL, stop, overwrite=True)
-    assert (out / "video.mp4").read_bytes() == before
-    film_capture(out, ShootConfig(frames=3, size=32), overwrite=True)
-    assert len(list(frames_of(out / "video.mp4"))) == 3
-    assert [path.name for path in tmp_path.iterdir()] == ["capture"]
-
-
-def test_a_folder_that_is_no_capture_is_never_overwritten(tmp_path):
-    (tmp_path / "thesis.txt").write_text("years of work")
-    for overwrite in (False, True):
-        with pytest.raises(InputError, match=r"holds thesis\.txt"):
-            film_capture(tmp_path, SMALL, overwrite=overwrite)
-    assert (tmp_path / "thesis.txt").exists()
