@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from capture.input_error import InputError
 from capture.source import ASSUMED_FPS
 from preprocess.body.body_pose import Motion
-from preprocess.body.kinematics import rotation_matrices
+from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
 
 MAX_JOINT_ANGLE_RAD = 4.0 * np.pi
 """Largest angle of a joint in any pose. An axis-angle needs π; optimizers may leave 2π or 3π."""
@@ -25,14 +25,16 @@ MAX_DISTANCE_M = 500.0
 """Largest median distance from the origin, metres."""
 SUSPICIOUS_DISTANCE_M = 50.0
 """Median distance from the origin beyond which the unit is in doubt, metres."""
-FLIP_RAD = 0.5 * np.pi
-"""Rotation of the root between two frames from which it may be a flip."""
+FLIP_RAD, FLIP_TIMES = 0.5, 6.0
+"""Rotation between two poses from which it may be a flip: so much, and so many usual ones more."""
 MAX_TURN_RAD_PER_S = 16.0
 """Fastest rotation of a person, 2.5 turns a second."""
+MAX_JOINT_RAD_PER_S = 25.0
+"""Fastest rotation of a joint."""
 MAX_FLIP_FRAMES = 8
 """Most poses in a row that are flipped."""
 MAX_DETOUR_RAD = 0.25
-"""Largest deviation of the root from its usual speed between the poses around a flip."""
+"""Largest deviation of a rotation from its usual speed between the poses around a flip."""
 MAX_FLIP_SHARE = 0.1
 """Largest share of flipped poses; if there are more, these are no frames of a video."""
 
@@ -46,9 +48,13 @@ def require_plausible(motion: Motion, path: Path | str) -> Motion:
 
 
 def invalidate_implausible_rows(motion: Motion) -> Motion:
-    """Return the motion with rows that bend a joint too far, or flip, marked as not valid."""
+    """Return the motion with rows that bend a joint too far, or flip, marked as not valid.
+
+    Joints that flip by themselves, as wrists do, turn with the poses before and after them.
+    """
     bent = exceeds_joint_limits(motion.joint_rotations)
-    return replace(motion, valid=motion.valid & ~bent & ~find_flips(motion))
+    kept = replace(motion, valid=motion.valid & ~bent & ~find_flips(motion))
+    return replace(kept, joint_rotations=_without_joint_flips(kept))
 
 
 def exceeds_joint_limits(
@@ -61,28 +67,62 @@ def exceeds_joint_limits(
 def find_flips(motion: Motion) -> Bool[np.ndarray, "poses"]:
     """Find short runs of poses that face another way than those before and after them.
 
-    Trackers take front for back now and then, for a few frames. A run begins or ends with a turn
-    that is too fast for a person; its other end may be smooth, where the person is seen from the
-    side. Where many poses are flipped, they are photographs.
+    Trackers take front for back now and then, for a few frames. Where many poses are flipped, they
+    are photographs.
     """
     flips, rows = np.zeros(len(motion), bool), np.flatnonzero(motion.valid)
-    if len(rows) < 3:
-        return flips
-    roots, gaps_s = rotation_matrices(motion.root_rotations[rows]), np.diff(_times_s(motion)[rows])
-    turned = _angles_between(roots[:-1], roots[1:])
+    roots = rotation_matrices(motion.root_rotations[rows])
+    for start, end in _flipped_runs(roots, _times_s(motion)[rows], MAX_TURN_RAD_PER_S):
+        flips[rows[start:end]] = True
+    return flips
+
+
+def _without_joint_flips(motion: Motion) -> Float[np.ndarray, "poses 23 3"]:
+    """Joint rotations, those of flipped runs interpolated between the poses around them."""
+    joints, rows = motion.joint_rotations.copy(), np.flatnonzero(motion.valid)
+    times_s = _times_s(motion)[rows]
+    for joint in range(joints.shape[1]):
+        rotations = rotation_matrices(joints[rows, joint])
+        for start, end in _flipped_runs(rotations, times_s, MAX_JOINT_RAD_PER_S):
+            before, after = rotations[start - 1], rotations[end]
+            way = axis_angles_from_matrices(before.T @ after)
+            passed = times_s[start:end] - times_s[start - 1]
+            steps = passed[:, None] / (times_s[end] - times_s[start - 1]) * way
+            turned = before @ rotation_matrices(steps)
+            joints[rows[start:end], joint] = axis_angles_from_matrices(turned)
+    return joints
+
+
+def _flipped_runs(
+    rotations: Float[np.ndarray, "poses 3 3"],
+    times_s: Float[np.ndarray, "poses"],
+    max_rad_per_s: float,
+) -> list[tuple[int, int]]:
+    """First pose and end of each short run of rotations unlike those before and after it.
+
+    A run begins or ends with a turn that is too fast for a person; its other end may be smooth,
+    where the person is seen from the side. None where these are too many for a video, or where all
+    poses are far apart.
+    """
+    runs: list[tuple[int, int]] = []
+    count, gaps_s = len(rotations), np.diff(times_s)
+    if count < 3:
+        return runs
+    turned = _angles_between(rotations[:-1], rotations[1:])
     usual = float(np.median(turned))
-    for jump in np.flatnonzero((turned > FLIP_RAD) & (turned > MAX_TURN_RAD_PER_S * gaps_s)):
-        if flips[rows[jump]]:
+    fast = np.maximum(FLIP_RAD + FLIP_TIMES * usual, max_rad_per_s * gaps_s)
+    for jump in np.flatnonzero(turned > fast):
+        if runs and jump < runs[-1][1]:
             continue  # the end of a run
         for length in range(1, MAX_FLIP_FRAMES + 1):
             starts = np.array([jump + 1, jump + 1 - length])
-            starts = starts[(starts > 0) & (starts + length < len(rows))]
-            detours = _angles_between(roots[starts - 1], roots[starts + length])
+            starts = starts[(starts > 0) & (starts + length < count)]
+            detours = _angles_between(rotations[starts - 1], rotations[starts + length])
             found = starts[detours < MAX_DETOUR_RAD + 1.5 * usual * (length + 1)]
             if len(found):
-                flips[rows[found[0] : found[0] + length]] = True
+                runs.append((int(found[0]), int(found[0]) + length))
                 break
-    return flips if flips.sum() <= MAX_FLIP_SHARE * len(rows) else np.zeros_like(flips)
+    return runs if sum(end - start for start, end in runs) <= MAX_FLIP_SHARE * count else []
 
 
 def implausibility_reason(motion: Motion) -> str | None:
