@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from capture.input_error import InputError
 from capture.source import ASSUMED_FPS
 from preprocess.body.body_pose import Motion
-from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
+from preprocess.body.kinematics import JOINT_NAMES, axis_angles_from_matrices, rotation_matrices
 
 MAX_JOINT_ANGLE_RAD = 4.0 * np.pi
 """Largest angle of a joint in any pose. An axis-angle needs π; optimizers may leave 2π or 3π."""
@@ -171,6 +171,14 @@ def plausibility_warnings(motion: Motion) -> Iterator[str]:
         yield (
             f"{len(flips)} of {len(motion)} poses (the first is row {flips[0]}) face another way "
             "than those just before and after them: front was taken for back. They are left out."
+        )
+    moved = (_without_joint_flips(motion) != motion.joint_rotations).any(axis=-1)
+    if moved.any():
+        row, joint = np.argwhere(moved)[0]
+        yield (
+            f"{int(moved.any(axis=1).sum())} of {len(motion)} poses (the first is row {row}) turn a "
+            "joint another way than those just before and after them (there the "
+            f"{JOINT_NAMES[joint + 1].replace('_', ' ')}). It is interpolated."
         )
     distance_m = _median_distance_m(motion)
     if distance_m > SUSPICIOUS_DISTANCE_M:

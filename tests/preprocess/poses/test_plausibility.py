@@ -13,6 +13,8 @@ from preprocess.poses.plausibility import (
     require_plausible,
 )
 
+WRIST = 19
+"""Row of the left wrist among the joints without the root."""
 POSES = 30
 
 
@@ -123,10 +125,17 @@ def take_front_for_back(motion: Motion, rows: list[int]) -> Motion:
 
 @pytest.mark.parametrize(
     ("step_rad", "rows"),
-    [(0.03, [20, 21, 22]), (0.03, [5]), (0.2, [1, 2]), (0.2, [4, 5, 6]), (0.2, [32, 33, 34])],
+    [
+        (0.03, [20, 21, 22]),
+        (0.03, [5]),
+        (0.03, [34, 35, 36]),
+        (0.2, [1, 2]),
+        (0.2, [4, 5, 6]),
+        (0.2, [32, 33, 34]),
+    ],
 )
 def test_front_taken_for_back_is_left_out_and_named(step_rad, rows):
-    """Also where the run begins or ends in a side view, without a jump."""
+    """Also near a side view, where the turn is 65 degrees, or has no jump at one end."""
     motion = take_front_for_back(turning(60, step_rad), rows)
     assert np.flatnonzero(~require_plausible(motion, "poses.npz").valid).tolist() == rows
     (sentence,) = plausibility_warnings(motion)
@@ -140,3 +149,31 @@ def test_turns_of_films_and_photographs_are_no_flips():
     cut.root_rotations[30:, 1] += np.pi
     for motion in (turning(60, 0.5), cut, turning(8, 0.5 * np.pi), turning(8, 2.0)):
         assert require_plausible(motion, "poses.npz").valid.all()
+
+
+def test_a_wrist_that_flips_is_interpolated_and_named():
+    """Half a turn of the left wrist for three of 60 poses; a wrist that waves fast stays."""
+    motion = turning(60, 0.03)
+    joints = motion.joint_rotations.copy()
+    joints[:, WRIST, 0] = 0.02 * np.arange(60)
+    joints[:, WRIST + 1, 2] = 0.6 * np.sin(np.arange(60))
+    flipped = joints.copy()
+    flipped[20:23, WRIST, 0] += 2.5
+    motion = replace(motion, joint_rotations=flipped)
+    kept = require_plausible(motion, "poses.npz")
+    np.testing.assert_allclose(kept.joint_rotations, joints, atol=1e-6)
+    assert kept.valid.all()
+    (sentence,) = plausibility_warnings(motion)
+    assert "3 of 60 poses (the first is row 20)" in sentence
+    assert "the left wrist" in sentence
+
+
+def test_poses_that_are_far_apart_stay_as_they_are():
+    """Twelve poses of a dance: one differs from both its neighbors, which are alike."""
+    angles = 0.5 * np.array([0, 1, 2, 0, 1, 2, 2, 5, 2, 1, 0, 1])
+    motion = turning(12, 0.0)
+    motion.root_rotations[:, 1] = angles
+    motion.joint_rotations[:, WRIST, 0] = angles
+    kept = require_plausible(motion, "poses.npz")
+    assert kept.valid.all()
+    np.testing.assert_array_equal(kept.joint_rotations, motion.joint_rotations)
