@@ -176,8 +176,8 @@ def plausibility_warnings(motion: Motion) -> Iterator[str]:
     if moved.any():
         row, joint = np.argwhere(moved)[0]
         yield (
-            f"{int(moved.any(axis=1).sum())} of {len(motion)} poses (the first is row {row}) turn a "
-            "joint another way than those just before and after them (there the "
+            f"{int(moved.any(axis=1).sum())} of {len(motion)} poses (the first is row {row}) turn "
+            "a joint another way than those just before and after them (there the "
             f"{JOINT_NAMES[joint + 1].replace('_', ' ')}). It is interpolated."
         )
     distance_m = _median_distance_m(motion)
