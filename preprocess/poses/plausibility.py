@@ -118,9 +118,9 @@ def _flipped_runs(
             starts = np.array([jump + 1, jump + 1 - length])
             starts = starts[(starts > 0) & (starts + length < count)]
             detours = _angles_between(rotations[starts - 1], rotations[starts + length])
-            found = starts[detours < MAX_DETOUR_RAD + 1.5 * usual * (length + 1)]
-            if len(found):
-                runs.append((int(found[0]), int(found[0]) + length))
+            likely = starts[detours < MAX_DETOUR_RAD + 1.5 * usual * (length + 1)]
+            if len(likely):
+                runs.append((int(likely[0]), int(likely[0]) + length))
                 break
     return runs if sum(end - start for start, end in runs) <= MAX_FLIP_SHARE * count else []
 
