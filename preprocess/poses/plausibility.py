@@ -26,8 +26,8 @@ MAX_DISTANCE_M = 500.0
 SUSPICIOUS_DISTANCE_M = 50.0
 """Median distance from the origin beyond which the unit is in doubt, metres."""
 FLIP_RAD, FLIP_TIMES = 0.5, 6.0
-"""Rotation between two poses from which it may be a flip: the sum of an angle and of that multiple of
-the median rotation."""
+"""Rotation between two poses from which it may be a flip: the sum of an angle and of that
+multiple of the median rotation."""
 MAX_TURN_RAD_PER_S = 16.0
 """Fastest rotation of a person, 2.5 turns a second."""
 MAX_JOINT_RAD_PER_S = 25.0
