@@ -11,7 +11,7 @@ import onnx
 from jaxtyping import Shaped
 from onnx import TensorProto, helper, numpy_helper
 
-from dev.tflite_model import FlatTable, TfliteModel, TfliteOperator
+from dev.tflite_model import TfliteModel, TfliteOperator
 
 CHANNELS_FIRST = (0, 3, 1, 2)
 """Order of a tensor's dimensions for ONNX; `CHANNELS_LAST` turns it back."""
@@ -107,21 +107,21 @@ class OnnxWriter:
     def _sum(self, operator: TfliteOperator) -> str:
         values = [self._values[index] for index in operator.inputs]
         options = operator.options
-        return self._activated(self._add("Add", values), options.number(0, "<b") if options else 0)
+        value = self._add("Add", values)
+        return self._activated(value, options.FusedActivationFunction() if options else 0)
 
     def _concatenation(self, operator: TfliteOperator) -> str:
-        axis = options_of(operator).number(0)
+        axis = operator.options.Axis()
         if len(self._model.shapes[operator.output]) == 4:
             axis = CHANNELS_FIRST.index(axis)
         return self._add("Concat", [self._values[index] for index in operator.inputs], axis=axis)
 
     def _convolution(self, operator: TfliteOperator) -> str:
-        options, (source, weights, *bias) = options_of(operator), operator.inputs
+        options, (source, weights, *bias) = operator.options, operator.inputs
         kernel = self._constants[weights].transpose(0, 3, 1, 2)
         depthwise = operator.kind == "DEPTHWISE_CONV_2D"
         if depthwise:  # (1, rows, columns, channels): a kernel for each channel
             kernel = kernel.transpose(1, 0, 2, 3)
-        after = 4 if depthwise else 3  # a depthwise one has its multiplier at 3
         value = self._add(
             "Conv",
             [
@@ -130,23 +130,23 @@ class OnnxWriter:
                 *(self._constant(self._constants[index]) for index in bias if index >= 0),
             ],
             group=self._model.shapes[source][3] if depthwise else 1,
-            dilations=[options.number(after + 2, default=1), options.number(after + 1, default=1)],
+            dilations=[options.DilationHFactor(), options.DilationWFactor()],
             **self._window(operator, kernel.shape[2:]),
         )
-        return self._activated(value, options.number(after, "<b"))
+        return self._activated(value, options.FusedActivationFunction())
 
     def _max_pooling(self, operator: TfliteOperator) -> str:
-        options = options_of(operator)
-        window = self._window(operator, (options.number(4), options.number(3)))
+        options = operator.options
+        window = self._window(operator, (options.FilterHeight(), options.FilterWidth()))
         value = self._add("MaxPool", [self._values[operator.inputs[0]]], **window)
-        return self._activated(value, options.number(5, "<b"))
+        return self._activated(value, options.FusedActivationFunction())
 
     def _window(self, operator: TfliteOperator, size: tuple[int, ...]) -> dict[str, list[int]]:
         """ONNX's attributes of a sliding window (without dilation, where it pads)."""
-        options = options_of(operator)
-        strides = (options.number(2), options.number(1))
+        options = operator.options
+        strides = (options.StrideH(), options.StrideW())
         before, after = [0, 0], [0, 0]
-        if options.number(0, "<b") == SAME_PADDING:
+        if options.Padding() == SAME_PADDING:
             for axis, (extent, window, stride) in enumerate(
                 zip(self._model.shapes[operator.inputs[0]][1:3], size, strides, strict=True)
             ):
@@ -160,7 +160,7 @@ class OnnxWriter:
         return self._add("Pad", [self._values[source], self._constant(pads)])
 
     def _depth_to_space(self, operator: TfliteOperator) -> str:
-        block = options_of(operator).number(0)
+        block = operator.options.BlockSize()
         source = self._values[operator.inputs[0]]
         return self._add("DepthToSpace", [source], blocksize=block, mode="DCR")
 
@@ -173,15 +173,9 @@ class OnnxWriter:
         return self._add("Transpose", [value], perm=CHANNELS_FIRST) if len(target) == 4 else value
 
     def _resizing(self, operator: TfliteOperator) -> str:
-        options, shape = options_of(operator), self._model.shapes[operator.output]
+        options, shape = operator.options, self._model.shapes[operator.output]
         size = np.array([shape[axis] for axis in CHANNELS_FIRST], np.int64)
-        aligned, half_pixel = options.number(2, "<b"), options.number(3, "<b")
+        aligned, half_pixel = options.AlignCorners(), options.HalfPixelCenters()
         mode = "align_corners" if aligned else "half_pixel" if half_pixel else "asymmetric"
         inputs = [self._values[operator.inputs[0]], "", "", self._constant(size)]
         return self._add("Resize", inputs, mode="linear", coordinate_transformation_mode=mode)
-
-
-def options_of(operator: TfliteOperator) -> FlatTable:
-    """The options of an operator that cannot do without."""
-    assert operator.options is not None, operator.kind
-    return operator.options
