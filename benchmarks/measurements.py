@@ -27,20 +27,24 @@ class Measurement:
     context: str = ""
 
 
-def print_measurements(measurements: Iterable[Measurement], path: Path | None) -> None:
+def print_measurements(
+    measurements: Iterable[Measurement], path: Path | None, title: str = ""
+) -> None:
     """Print each on standard error as soon as it is known, then all as a table; write them to path.
 
     Args:
         measurements: Measured while they are iterated.
         path: JSON file; None for none.
+        title: What all of them were measured on.
     """
     hardware, marks = Hardware.here(), list[Measurement]()
     for mark in measurements:
         print(f"{mark.name}: {mark.value} ({mark.context})", file=sys.stderr, flush=True)
         marks.append(mark)
-    print("\n".join([*hardware.lines(), "", *markdown_rows(marks)]))
+    print("\n".join([*hardware.lines(), title, "", *markdown_rows(marks)]))
     if path is not None:
-        content = {"hardware": asdict(hardware), "marks": [asdict(mark) for mark in marks]}
+        content = {"hardware": asdict(hardware), "title": title}
+        content["marks"] = [asdict(mark) for mark in marks]
         path.write_text(json.dumps(content, indent=1) + "\n")
 
 

@@ -11,18 +11,16 @@ import os
 import subprocess
 import sys
 import tempfile
-import tomllib
-import zlib
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
 from typing import Annotated, Any
 
 import tyro
 
-from benchmarks.hardware import ROOT, Hardware
-from benchmarks.measurements import Measurement, markdown_rows
+from benchmarks.hardware import ROOT
+from benchmarks.measurements import Measurement, print_measurements
 from benchmarks.real import SUBJECTS, IngestRun, RealJob, film_phone_capture, ingest_command
 from benchmarks.real_scores import score_novel_poses
 from benchmarks.tracking_scores import (
@@ -36,14 +34,6 @@ from benchmarks.tracking_scores import (
 from capture.source_opening import open_source
 from preprocess.capture_paths import find_own_masks
 
-WEIGHTS = ROOT / "preprocess" / "tracking" / "weights"
-"""What tracking adds to the installation."""
-OTHER_PACKAGES = frozenset({
-    "av", "filelock", "jaxtyping", "jinja2", "numpy", "onnxruntime", "pillow", "psutil", "rich",
-    "opencv-contrib-python-headless", "scipy", "tyro", "numba", "onnx", "pycolmap", "torch",
-    "trimesh", "fast-simplification", "docstring-parser", "xatlas",
-})  # fmt: skip
-"""What playing, learning and exporting need without a tracker."""
 AVATAR_TARGETS = {
     "held out, fitted poses": ("≥ -3", "≥ -1"),
     "held out, fitted poses, cut out by exact masks": ("≥ -3", "≥ -1"),
@@ -108,21 +98,10 @@ class TrackingJob:
 def main() -> None:
     """The benchmark."""
     asked = tyro.cli(TrackingJob, prog="python -m benchmarks.tracking", description=__doc__)
-    job, hardware = asked.effective, Hardware.here()
-    marks = []
-    for mark in measure_all(job):
-        print(f"{mark.name}: {mark.value} ({mark.context})", file=sys.stderr, flush=True)
-        marks.append(mark)
+    job = asked.effective
     budget = f"{job.steps} steps" if job.steps is not None else f"{job.seconds:g} s of training"
     title = f"{job.frames} frames, {job.size} px tall, {budget}, seed {job.seed}"
-    print("\n".join([*hardware.lines(), title, "", *markdown_rows(marks)]))
-    if job.json is not None:
-        content = {
-            "hardware": asdict(hardware),
-            "title": title,
-            "marks": [asdict(m) for m in marks],
-        }
-        job.json.write_text(json.dumps(content, indent=1) + "\n")
+    print_measurements(measure_all(job), job.json, title)
 
 
 def measure_all(job: TrackingJob) -> Iterator[Measurement]:
@@ -137,7 +116,6 @@ def measure_all(job: TrackingJob) -> Iterator[Measurement]:
         yield from measure_avatars(job, turning)
     if subjects and job.cost:
         yield from measure_costs(job, bare_film(turning[0], job.folder))
-    yield from measure_installation()
     for capture in job.captures:
         yield from measure_real(job, capture)
 
@@ -268,33 +246,6 @@ def measure_costs(job: TrackingJob, film: Path) -> Iterator[Measurement]:
         context=f"second of two runs, the first {first_s:.2f}; played at its own speed, networks "
         f"and kernels loaded; {cpu_s:.2f} core-s",
     )
-
-
-def measure_installation() -> Iterator[Measurement]:
-    """What tracking adds to the installation."""
-    files = [path.read_bytes() for path in WEIGHTS.iterdir() if path.is_file()]
-    packed = sum(len(zlib.compress(content)) for content in files)
-    yield Measurement(
-        name="networks in the installation, MB",
-        value=sum(map(len, files)) / 1e6,
-        required="≤ 25",
-        stretch_goal="≤ 10",
-        context=f"{packed / 1e6:.1f} MB in the wheel",
-    )
-    new = run_time_packages() - OTHER_PACKAGES
-    yield Measurement(
-        name="new run-time packages",
-        value=float(len(new)),
-        required="0",
-        context=", ".join(sorted(new)),
-    )
-
-
-def run_time_packages() -> set[str]:
-    """Names of the packages that playing and learning need."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    needed = [*project["dependencies"], *project["optional-dependencies"]["learn"]]
-    return {each.split(">")[0].strip() for each in needed}
 
 
 def measure_real(job: TrackingJob, capture: Path) -> Iterator[Measurement]:
