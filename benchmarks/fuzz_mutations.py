@@ -1,12 +1,10 @@
 """Whole files made into damaged, hostile and random ones."""
 
-import gzip
 import hashlib
 import io
 import json
 import pickle
 import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -147,27 +145,3 @@ def random_opcodes(rng: np.random.Generator) -> bytes:
     ]
     mixed = (opcodes[c] + part + call for c, part, call in zip(chosen, parts, calls, strict=True))
     return b"\x80\x04" + b"".join(mixed) + b"."
-
-
-def decompression_bomb(rng: np.random.Generator) -> bytes:
-    """A small file that unpacks to more than the cap."""
-    zeros = bytes(64 << 20)
-    way = int(rng.integers(0, 4))
-    if way == 0:
-        packer = zlib.compressobj(9)
-        return b"".join(packer.compress(zeros) for _ in range(24)) + packer.flush()
-    if way == 1:
-        stream = io.BytesIO()
-        with gzip.GzipFile(fileobj=stream, mode="wb") as file:
-            for _ in range(24):
-                file.write(zeros)
-        return stream.getvalue()
-    if way == 2:
-        thing: Any = [0.0]
-        for _ in range(30):
-            thing = [thing] * 10
-        return pickle.dumps(thing)
-    stream = io.BytesIO()
-    header = {"descr": "<f8", "fortran_order": False, "shape": (1 << 33, 3)}
-    np.lib.format.write_array_header_1_0(stream, header)
-    return stream.getvalue() + bytes(64)
