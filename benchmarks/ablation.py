@@ -1,9 +1,9 @@
 """What each mechanism of training buys.
 
-    python -m benchmarks.ablation [--few CAPTURE] [--keep FOLDER] [--quick] [--write PAGE]
+    python -m benchmarks.ablation [--keep FOLDER] [--quick] [--write PAGE]
 
-Each mechanism is left out in turn on phone-like films, and each prior of estimated poses on few
-frames of one and of a capture of your own (`benchmarks.mechanisms`). There are no thresholds here.
+Each mechanism is left out in turn on phone-like films (`benchmarks.mechanisms`). There are no
+thresholds here.
 """
 
 import tempfile
@@ -16,7 +16,6 @@ from typing import Literal
 import tyro
 
 from benchmarks.mechanisms import (
-    FEW_FRAME_MECHANISMS,
     MECHANISMS,
     MORE_STEPS,
     CaptureScores,
@@ -29,8 +28,6 @@ from benchmarks.sample_training import film_sample
 COMMAND = "python -m benchmarks.ablation --write docs/ablation.md"
 PHONE_PX = 270
 """Longer side of phone-like pictures."""
-FEW = 8
-"""Frames of a capture of few frames, the held-out one included."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,8 +38,6 @@ class Ablation:
     """Who is filmed as by a phone."""
     seeds: tuple[int, ...] = (0,)
     """Of training."""
-    few: Path | None = None
-    """Capture of a few photographs, for the priors of estimated poses."""
     quick: bool = False
     """Twenty steps each: whether it runs, not what comes out."""
     steps: int = 600
@@ -68,17 +63,12 @@ def main() -> None:
 
 
 def run_mechanisms(job: Ablation, folder: Path) -> Iterator[CaptureScores]:
-    """The mechanisms on phone-like films, then the priors of estimated poses on few frames."""
-    films = [film_by_phone(folder, subject, quick=job.quick) for subject in job.subjects]
-    few = [films[-1], *([job.few] if job.few is not None else [])]
-    for capture, frames in [*((film, None) for film in films), *((each, FEW) for each in few)]:
+    """The mechanisms on phone-like films."""
+    for subject in job.subjects:
+        film = film_by_phone(folder, subject, quick=job.quick)
         for seed in job.seeds:
-            name = f"{capture.name}-{frames or 'all'}-seed{seed}.json"
-            yield measured_scores(
-                capture, folder / name,
-                size_px=PHONE_PX, steps=job.steps, seed=seed, frames=frames,
-                dance=None if frames is None else films[-1] / "dance.npz",
-            )  # fmt: skip
+            kept = folder / f"{film.name}-seed{seed}.json"
+            yield measured_scores(film, kept, size_px=PHONE_PX, steps=job.steps, seed=seed)
 
 
 def film_by_phone(folder: Path, subject: Literal[1, 2, 3], *, quick: bool) -> Path:
@@ -91,27 +81,23 @@ def film_by_phone(folder: Path, subject: Literal[1, 2, 3], *, quick: bool) -> Pa
 
 
 def mechanism_lines(captures: Sequence[CaptureScores]) -> list[str]:
-    """What each mechanism buys: a table of the whole films, and one of the few frames."""
-    lines = [f"`{COMMAND}`", ""]
-    for title, rows in (
-        ("Mechanisms, one by one", MECHANISMS),
-        ("Few-frame priors, one by one", FEW_FRAME_MECHANISMS),
-    ):
-        names = {row.name for row in rows[2:]}
-        found = [each for each in captures if names & {score.name for score in each.scores}]
-        if not found:
-            continue
-        lines += [f"## {title}", ""]
-        lines += [
+    """What each mechanism buys, as a table of all films."""
+    head = ["without", "core-ms saved", *(f"{c.capture}, seed {c.seed}" for c in captures)]
+    head += ["mean loss, dB", "its time would buy, dB", "lines"]
+    return [
+        f"`{COMMAND}`",
+        "",
+        "## Mechanisms, one by one",
+        "",
+        *(
             f"* {each.capture}, {each.size_px} px, seed {each.seed}, {each.steps} steps: "
             f"{each.measured}; with all mechanisms {_levels(each.scores[0])}, "
             f"{each.scores[0].step_ms:.1f} core-ms a step"
-            for each in found
-        ]
-        head = ["without", "core-ms saved", *(f"{c.capture}, seed {c.seed}" for c in found)]
-        head += ["mean loss, dB", "its time would buy, dB", "lines"]
-        lines += ["", *_table(head, _mechanism_cells(rows, found)), ""]
-    return lines[:-1]
+            for each in captures
+        ),
+        "",
+        *_table(head, _mechanism_cells(MECHANISMS, captures)),
+    ]
 
 
 def _mechanism_cells(
@@ -148,10 +134,8 @@ def _loss(full: MechanismScore, without: MechanismScore) -> list[float]:
 
 
 def _loss_text(full: MechanismScore, without: MechanismScore) -> str:
-    """`_loss`, how much less the player is like the renderer, and how much more is fog."""
+    """`_loss`, and how much more is fog."""
     losses = _loss(full, without)
-    if full.player is not None and without.player is not None:
-        losses.append(full.player - without.player)
     text = " / ".join(f"{loss:+.2f}" for loss in losses)
     if full.half_transparent is None or without.half_transparent is None:
         return text
@@ -160,10 +144,9 @@ def _loss_text(full: MechanismScore, without: MechanismScore) -> str:
 
 def _levels(score: MechanismScore) -> str:
     novel = "" if score.novel is None else f"{score.novel:.2f} dB novel, "
-    player = "" if score.player is None else f", player to renderer {score.player:.2f} dB"
     fog = score.half_transparent
     firm = "" if fog is None else f", {100.0 * fog:.1f} % of the pixels half transparent"
-    return f"{novel}{score.held_out:.2f} dB held out{player}{firm}"
+    return f"{novel}{score.held_out:.2f} dB held out{firm}"
 
 
 def written(lines: Sequence[str], path: Path) -> str:

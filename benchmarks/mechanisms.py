@@ -1,4 +1,4 @@
-"""What each mechanism of training buys: each off in turn, on phone-like films and on few frames.
+"""What each mechanism of training buys: each off in turn, on phone-like films.
 
 A row trains without one mechanism for as many steps as the others, in turns with them, and is
 scored in fitted poses and exposures. A row with a tenth more steps tells what time could buy.
@@ -13,33 +13,22 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from pkgutil import resolve_name
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 from unittest import mock
 
 import numpy as np
 
-from avatar.avatar_model import Avatar
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
-from avatar.evaluation.image_metrics import composite_on_white, psnr
 from avatar.evaluation.unfilmed_views import half_transparent_share, render_unfilmed_views
-from avatar.render import render
 from avatar.training.held_out_pose_fitting import fit_test_poses
 from avatar.training.trainer import Trainer, cosine_decay
 from baselines.systems.compared_capture import ComparedCapture
 from benchmarks.hardware import Hardware
-from benchmarks.sample_training import open_sample
 from benchmarks.stopwatch import limit_threads
-from export.build import export_avatar
-from export.player import Player, premultiply
 from instant_avatar.run.session_start import new_trainer
-from preprocess.body.body_pose import Motion
-from preprocess.poses.pose_format_registry import read_poses
 
 SCORED_FRAMES = 6
 """Held-out frames, and novel poses, that each row is scored on, spread evenly."""
-DANCE_POSES = 8
-"""Poses of a dance in which player and renderer are compared."""
 SLICE_S = 0.5
 """Core time after which it is the next one's turn."""
 MORE_STEPS = 1.1
@@ -171,11 +160,6 @@ MECHANISMS = [
             "avatar.kernels.numba_pose",
         ),
     ),
-]
-"""What phone-like films are trained without, one by one."""
-FEW_FRAME_MECHANISMS = [
-    FULL,
-    LONGER,
     Mechanism(
         name="double well",
         off={"double_well_weight": 0.0},
@@ -217,7 +201,7 @@ FEW_FRAME_MECHANISMS = [
         ),
     ),
 ]
-"""What captures of a few frames are trained without, one by one."""
+"""What films are trained without, one by one."""
 
 
 class MechanismScore(NamedTuple):
@@ -228,8 +212,6 @@ class MechanismScore(NamedTuple):
         step_ms: Core milliseconds a step.
         held_out: PSNR on white of held-out frames in fitted poses, dB.
         novel: The same of poses never filmed; None where there are none.
-        player: PSNR of the exported player to the renderer in poses never filmed, dB; None where
-            it was not exported.
         half_transparent: Share of half-transparent pixels from four sides of poses never filmed.
     """
 
@@ -237,7 +219,6 @@ class MechanismScore(NamedTuple):
     step_ms: float
     held_out: float
     novel: float | None
-    player: float | None = None
     half_transparent: float | None = None
 
 
@@ -290,8 +271,6 @@ def measured_scores(
     size_px: int,
     steps: int,
     seed: int,
-    frames: int | None = None,
-    dance: Path | None = None,
 ) -> CaptureScores:
     """The scores of every row on a capture; what `kept` holds is not measured again.
 
@@ -300,18 +279,12 @@ def measured_scores(
         kept: File of the scores, JSON.
         size_px: Longer side, pixels.
         steps, seed: Of training.
-        frames: How few of its frames are used, to leave out priors of estimated poses; all if None.
-        dance: File of the poses in which the exported player is compared with the renderer.
     """
     if not kept.exists():
-        if frames is None:
-            compared, rows, name = ComparedCapture.open(folder, size_px), MECHANISMS, folder.name
-        else:
-            compared, rows = open_few(folder, size_px, frames), FEW_FRAME_MECHANISMS
-            name = f"{len(compared.frames) + len(compared.held_out)} frames of {folder.name}"
+        compared = ComparedCapture.open(folder, size_px)
         measured = ", ".join(Hardware.here().lines()[:2])
-        scores = list(score_mechanisms(compared, rows, steps, seed, dance and read_poses(dance)))
-        found = CaptureScores(name, seed, steps, size_px, measured, scores)
+        scores = list(score_mechanisms(compared, MECHANISMS, steps, seed))
+        found = CaptureScores(folder.name, seed, steps, size_px, measured, scores)
         kept.write_text(json.dumps(found._asdict(), indent=1) + "\n")
     found = CaptureScores(**json.loads(kept.read_text()))
     return found._replace(scores=[MechanismScore(*score) for score in found.scores])
@@ -322,7 +295,6 @@ def score_mechanisms(
     mechanisms: Sequence[Mechanism],
     steps: int,
     seed: int,
-    dance: Motion | None = None,
 ) -> Iterator[MechanismScore]:
     """Trains without each mechanism, in turns, and scores each row in fitted poses.
 
@@ -330,7 +302,6 @@ def score_mechanisms(
         compared: What is trained and scored on.
         mechanisms: Rows.
         steps, seed: Of training.
-        dance: Poses in which the exported player is compared with the renderer, if it is.
     """
     limit_threads(1)
     runs = [_begin(compared, mechanism, steps, seed) for mechanism in mechanisms]
@@ -344,23 +315,10 @@ def score_mechanisms(
             1e3 * run.spent_s / run.trainer.steps,
             _fitted_psnr(run.trainer, held_out),
             _fitted_psnr(run.trainer, novel) if novel else None,
-            None if dance is None else _player_psnr(run.trainer.avatar, held_out, dance),
             half_transparent_share(render_unfilmed_views(run.trainer.avatar)),
         )
         print(seed, *score, file=sys.stderr, flush=True)
         yield score
-
-
-def open_few(folder: Path, size_px: int, count: int) -> ComparedCapture:
-    """A capture of which at most `count` frames are used, spread evenly.
-
-    Args:
-        folder: Capture.
-        size_px: Longer side, pixels.
-        count: Frames, held-out ones included.
-    """
-    total = open_sample(folder).source.frame_count or count
-    return ComparedCapture.open(folder, size_px, frames=slice(None, None, -(-total // count)))
 
 
 def _begin(compared: ComparedCapture, mechanism: Mechanism, steps: int, seed: int) -> _Run:
@@ -383,19 +341,3 @@ def _some(frames: list[HeldOutFrame]) -> list[HeldOutFrame]:
 def _fitted_psnr(trainer: Trainer, frames: list[HeldOutFrame]) -> float:
     fitted = fit_test_poses(trainer, frames)
     return float(np.mean([score_frame(trainer.avatar, frame).psnr for frame in fitted]))
-
-
-def _player_psnr(avatar: Avatar, held_out: Sequence[HeldOutFrame], dance: Motion) -> float:
-    """PSNR of the player to the renderer in poses of a dance, in the place of held-out frames."""
-    views = [(each.observation.pose, each.observation.camera) for each in held_out]
-    rows = np.linspace(0, len(dance) - 1, DANCE_POSES).round().astype(int)
-    with TemporaryDirectory() as folder:
-        package = Path(folder) / "avatar.iavatar"
-        list(export_avatar(avatar, package, views=views, metrics={}))
-        player, found = Player.load(package, tier="hq"), []
-        for place, row in enumerate(rows):
-            pose, camera = views[place % len(views)]
-            pose = replace(pose, joint_rotations=dance[int(row)].joint_rotations)
-            drawn = composite_on_white(premultiply(player.render(pose, camera)))
-            found.append(psnr(drawn, composite_on_white(render(avatar, pose, camera))))
-    return float(np.mean(found))

@@ -1,20 +1,19 @@
 """The player against what was asked of it: cost, likeness and size on avatars of the sample.
 
     python -m benchmarks.player [--quick] [--json FILE] [--keep FOLDER]
-                                [--person CAPTURE --dance POSES]
 
 Films two actors, learns each for a minute as a user does, bakes what was learnt and plays it on one
 thread. Costs are CPU time, and their ratio to a small reference graph that runs in between; the
-volume renderer's pictures and the studio's are what the player is compared with. A real person's
-capture is learnt the same way, if one is named; then a pose file says how to dance. There are no
-thresholds here: whether a mark is reached is for the reader to see.
+volume renderer's pictures and the studio's are what the player is compared with. There are no
+thresholds here: whether a mark is reached is for the reader to see (`benchmarks.any_film` compares
+the player of real people with the renderer).
 """
 
 import itertools
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,9 +25,7 @@ from benchmarks.hardware import ROOT
 from benchmarks.measurements import Measurement, print_measurements
 from benchmarks.player_cost import frame_time_marks, load_time_marks, package_marks, time_bake
 from benchmarks.player_fidelity import (
-    ComparedView,
     fidelity_marks,
-    views_of_person,
     views_of_sample,
 )
 from benchmarks.sample_training import film_sample
@@ -50,10 +47,6 @@ class PlayerBenchmark:
     """File for the figures."""
     keep: Path | None = None
     """Folder for what is filmed and learnt; what lies there is used again."""
-    person: Path | None = None
-    """A real person's capture folder, with poses and masks."""
-    dance: Path | None = None
-    """A pose file that the real person dances to."""
 
 
 def main() -> int:
@@ -73,8 +66,6 @@ def measured(job: PlayerBenchmark, folder: Path) -> Iterator[Measurement]:
     """All rows."""
     subjects = (1,) if job.quick else (1, 2)
     groups = [subject_marks(folder, subject, quick=job.quick) for subject in subjects]
-    if job.person is not None and job.dance is not None:
-        groups.append(person_marks(folder, job.person, job.dance))
     return itertools.chain.from_iterable(groups)
 
 
@@ -82,41 +73,21 @@ def subject_marks(folder: Path, subject: int, *, quick: bool) -> Iterator[Measur
     """One actor."""
     suffix = "" if subject == 1 else f"_{subject}"
     capture = film_sample(folder / f"sample{SIZE_PX}{suffix}", SIZE_PX, subject=subject)
-    trainer = train_or_load(capture, folder / f"run{SIZE_PX}{suffix}", frames=FRAMES)
+    trainer = train_or_load(capture, folder / f"run{SIZE_PX}{suffix}")
     limit_threads(1)
     shots = views_of_sample(capture, trainer.avatar, frames=FRAMES, stride=2 if quick else 1)
-    package = folder / f"player{SIZE_PX}{suffix}.iavatar"
-    yield from all_marks(f"subject {subject}", trainer, package, shots)
-
-
-def person_marks(folder: Path, capture: Path, dance: Path) -> Iterator[Measurement]:
-    """A real person."""
-    trainer = train_or_load(capture, folder / "run_person", size=SIZE_PX)
-    limit_threads(1)
-    shots = views_of_person(capture, trainer.avatar, dance, size=SIZE_PX)
-    yield from all_marks("real person", trainer, folder / "player_person.iavatar", shots)
-
-
-def all_marks(
-    name: str, trainer: Trainer, package: Path, shots: Mapping[str, Sequence[ComparedView]]
-) -> Iterator[Measurement]:
-    """What is measured of anybody."""
-    bake = time_bake(trainer, package, shots["held out"][:4])
-    yield from package_marks(name, package, bake)
+    package, name = folder / f"player{SIZE_PX}{suffix}.iavatar", f"subject {subject}"
+    yield from package_marks(name, package, time_bake(trainer, package, shots["held out"][:4]))
     yield from load_time_marks(name, package)
     yield from frame_time_marks(name, package, [shot for some in shots.values() for shot in some])
     yield from fidelity_marks(name, package, shots)
 
 
-def train_or_load(
-    capture: Path, run: Path, *, frames: int | None = None, size: int | None = None
-) -> Trainer:
+def train_or_load(capture: Path, run: Path) -> Trainer:
     """Load the trainer that ia-ingest left in a folder; train it first if there is none."""
     if not (run / "checkpoint").exists():
         command = [sys.executable, "-m", "instant_avatar.ingest", str(capture), "--out", str(run)]
-        command += ["--seconds", str(SECONDS), "--overwrite"]
-        command += [] if frames is None else ["--frames", f"0:{frames}"]
-        command += [] if size is None else ["--size", str(size)]
+        command += ["--seconds", str(SECONDS), "--frames", f"0:{FRAMES}", "--overwrite"]
         subprocess.run(command, cwd=ROOT, stdout=sys.stderr, check=True)
     return checkpoint.load(run / "checkpoint")[0]
 

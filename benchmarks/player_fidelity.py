@@ -21,9 +21,7 @@ from export.player import Player, premultiply
 from preprocess.body.body_pose import BodyPose
 from preprocess.capture_session import Capture
 from preprocess.observation import Observation
-from preprocess.poses.pose_format_registry import read_poses
 
-DANCE_POSES = 16
 TARGETS = {"hq": (("≥ 40", "≥ 43"), ("< 0.4", "< 0.1")), "lite": (("", ""), ("< 1.2", "< 0.5"))}
 """By tier: "at least" and "moonshot" of the PSNR to the renderer and of the loss."""
 
@@ -36,13 +34,13 @@ class ComparedView:
 
     Attributes:
         pose, camera: As they are; without lens distortion.
-        exact, truth: On white. No `truth` where a pose was never filmed.
+        rendered, truth: On white.
     """
 
     pose: BodyPose
     camera: Camera
     rendered: RgbPicture
-    truth: RgbPicture | None = None
+    truth: RgbPicture
 
 
 def views_of_sample(
@@ -64,31 +62,6 @@ def views_of_sample(
     return {name: [filmed_view(s, avatar) for s in seen[::stride]] for name, seen in found.items()}
 
 
-def views_of_person(
-    capture: Path, avatar: Avatar, dance: Path, *, size: int
-) -> dict[str, list[ComparedView]]:
-    """Held-out frames of a real person, and the same person dancing in the place of each.
-
-    The dances have no ground truth: they only compare the player with the volume renderer.
-
-    Args:
-        capture: A folder that `ia-ingest` reads.
-        avatar: Learnt from it.
-        size: Longer side of its pictures, in pixels, as it was learnt from.
-        dance: A pose file; of `DANCE_POSES` of its poses, evenly spread, the joints are taken.
-    """
-    recording = open_sample(capture, size=size)
-    held = held_out_observations(recording, avatar, recording.source.frame_count)
-    motion = read_poses(dance)
-    chosen = np.linspace(0, len(motion) - 1, DANCE_POSES).round().astype(int)
-    dances = []
-    for position, row in enumerate(chosen):
-        seen = held[position % len(held)]
-        pose = replace(seen.pose, joint_rotations=motion[row].joint_rotations)
-        dances.append(_unfilmed_view(pose, seen.camera, avatar))
-    return {"held out": [filmed_view(seen, avatar) for seen in held], "dancing": dances}
-
-
 def held_out_observations(
     recording: Capture, avatar: Avatar, frames: int | None
 ) -> list[Observation]:
@@ -101,15 +74,12 @@ def held_out_observations(
 
 def filmed_view(seen: Observation, avatar: Avatar) -> ComparedView:
     """A frame, and what the renderer shows in its place."""
-    return replace(
-        _unfilmed_view(seen.pose, seen.camera, avatar), truth=ground_truth_on_white(seen)
-    )
-
-
-def _unfilmed_view(pose: BodyPose, camera: Camera, avatar: Avatar) -> ComparedView:
-    straight = replace(camera, distortion=())
+    straight = replace(seen.camera, distortion=())
     return ComparedView(
-        pose=pose, camera=straight, rendered=composite_on_white(render(avatar, pose, straight))
+        pose=seen.pose,
+        camera=straight,
+        rendered=composite_on_white(render(avatar, seen.pose, straight)),
+        truth=ground_truth_on_white(seen),
     )
 
 
@@ -123,9 +93,7 @@ def fidelity_marks(
             drawn = [composite_on_white(premultiply(player.render(s.pose, s.camera))) for s in some]
             yield _renderer_mark(f"{name}, {tier}, {kind}", tier, some, drawn)
             filmed = [(s.rendered, d, s.truth) for s, d in zip(some, drawn, strict=True)]
-            told = [(exact, d, truth) for exact, d, truth in filmed if truth is not None]
-            if told:
-                yield _truth_mark(f"{name}, {tier}, {kind}", tier, told)
+            yield _truth_mark(f"{name}, {tier}, {kind}", tier, filmed)
 
 
 def _renderer_mark(
