@@ -176,24 +176,25 @@ class Learnt:
     marks: list[list[HeldOutScore]]
 
 
-@pytest.fixture(scope="session")
-def learnt(rig, clip) -> Learnt:
-    """Trained once for all tests, with a rate that falls after half of the steps."""
+def untaught(rig: Rig, clip: Clip) -> tuple[Trainer, list[HeldOutFrame]]:
+    """A trainer that has a clip's frames, and those that are held out."""
     config = TrainConfig(
-        rays=512,
-        sample_step_m=0.015,
-        finest_m=0.03,
-        levels=6,
-        table_size=1 << 14,
+        rays=512, sample_step_m=0.015, finest_m=0.03, levels=6, table_size=1 << 14,
         refine_poses=False,
-    )
-    trainer = Trainer(rig, config)
-    held = []
+    )  # fmt: skip
+    trainer, held = Trainer(rig, config), []
     for item in prepare_stream(iter(clip.observations), rig, stride=6, total=None):
         if isinstance(item, HeldOutFrame):
             held.append(item)
         else:
             trainer.add_frame(item)
+    return trainer, held
+
+
+@pytest.fixture(scope="session")
+def learnt(rig, clip) -> Learnt:
+    """Trained once for all tests, with a rate that falls after half of the steps."""
+    trainer, held = untaught(rig, clip)
     cells = CorrespondenceGrid.solve(rig, clip.novel.pose.joint_rotations)
     novel = HeldOutFrame(observation=clip.novel, correspondences=cells)
     marks = []

@@ -12,19 +12,17 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.config import TrainConfig
-from avatar.evaluation.held_out import HeldOutFrame, score_frame
+from avatar.evaluation.held_out import score_frame
 from avatar.radiance_field import RadianceField
 from avatar.training import trainer as trainer_module
-from avatar.training.frame_stream import prepare_stream
 from avatar.training.trainer import (
     EMA_HORIZON_STEPS,
     EMA_INTERVAL,
-    Trainer,
     UncompiledAdam,
     step_optimizer,
     update_ema,
 )
+from tests.avatar_fixtures import untaught
 
 
 @pytest.fixture
@@ -74,20 +72,7 @@ def test_later_it_is_the_exponential_mean_over_the_horizon(field):
 
 @pytest.mark.slow
 def test_while_the_rate_is_high_the_mean_is_closer_to_unseen_frames_than_the_last_step(rig, clip):
-    config = TrainConfig(
-        rays=512,
-        sample_step_m=0.015,
-        finest_m=0.03,
-        levels=6,
-        table_size=1 << 14,
-        refine_poses=False,
-    )
-    trainer, held = Trainer(rig, config), []
-    for item in prepare_stream(iter(clip.observations), rig, stride=6, total=None):
-        if isinstance(item, HeldOutFrame):
-            held.append(item)
-        else:
-            trainer.add_frame(item)
+    trainer, held = untaught(rig, clip)
     for _ in range(50 * trainer_module.EMA_INTERVAL):
         trainer.step(rate=1.0, hard_surface_share=1.0)
     last = dataclasses.replace(trainer.avatar, field=trainer.field)

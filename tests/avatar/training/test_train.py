@@ -110,16 +110,20 @@ def after_three_steps(rig, ready, config):
     return [*losses, *trainer.avatar.field.parameters(), grid.density, grid.occupied]
 
 
-def test_one_seed_and_one_thread_give_one_avatar(rig, ready):
+@pytest.fixture
+def one_thread():
     threads = numba.get_num_threads(), torch.get_num_threads()
     numba.set_num_threads(1)
     torch.set_num_threads(1)
-    try:
-        first, again = (after_three_steps(rig, ready, QUICK) for _ in range(2))
-        other = after_three_steps(rig, ready, dataclasses.replace(QUICK, seed=1))
-    finally:
-        numba.set_num_threads(threads[0])
-        torch.set_num_threads(threads[1])
+    yield
+    numba.set_num_threads(threads[0])
+    torch.set_num_threads(threads[1])
+
+
+@pytest.mark.usefixtures("one_thread")
+def test_one_seed_and_one_thread_give_one_avatar(rig, ready):
+    first, again = (after_three_steps(rig, ready, QUICK) for _ in range(2))
+    other = after_three_steps(rig, ready, dataclasses.replace(QUICK, seed=1))
     for a, b in zip(first, again, strict=True):
         assert torch.equal(a, b)
     assert not torch.equal(first[0], other[0])
@@ -390,16 +394,10 @@ def taught_at_a_pace(rig, ready, config, *, pause_s):
     return frames_seen, trainer.avatar.field.parameters()
 
 
+@pytest.mark.usefixtures("one_thread")
 def test_counted_steps_give_one_avatar_however_fast_frames_come(rig, ready):
-    threads = numba.get_num_threads(), torch.get_num_threads()
-    numba.set_num_threads(1)
-    torch.set_num_threads(1)
-    try:
-        config = dataclasses.replace(QUICK, steps=12)
-        at_once, slowly = (taught_at_a_pace(rig, ready, config, pause_s=s) for s in (0.0, 0.03))
-    finally:
-        numba.set_num_threads(threads[0])
-        torch.set_num_threads(threads[1])
+    config = dataclasses.replace(QUICK, steps=12)
+    at_once, slowly = (taught_at_a_pace(rig, ready, config, pause_s=s) for s in (0.0, 0.03))
     assert at_once[0] == slowly[0] == [1, 2, 3, 4] + [5] * 8
     for a, b in zip(at_once[1], slowly[1], strict=True):
         assert torch.equal(a, b)

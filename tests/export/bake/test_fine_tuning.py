@@ -183,50 +183,39 @@ def test_progress_only_grows(tuned):
     assert len(shares) == 13  # four judge, six are learnt from, and three rounds
 
 
+@pytest.fixture
+def exported(stand_in, renderer, coarse, views, tmp_path):
+    """Exports the stand-in, by its player's own pictures unless others are given."""
+    field, path = (stand_in.field_at, stand_in.rig, stand_in.occupied), tmp_path / "avatar.iavatar"
+
+    def export(pictures=4, renderer=renderer, **rest):
+        rest |= {"config": replace(coarse, fine_tuning_pictures=pictures), "metrics": {}}
+        return export_field(*field, path, views=list(views.values()), renderer=renderer, **rest)
+
+    return export
+
+
 @pytest.mark.parametrize("baked_first", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_ctrl_c_while_tuning_leaves_the_package_as_baked(
-    stand_in, renderer, coarse, views, tables, tmp_path, monkeypatch, baked_first
+    exported, tables, monkeypatch, baked_first
 ):
     def interrupted(share):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(build, "bake_tables", lambda *given: tables)
 
-    (report,) = export_field(
-        stand_in.field_at,
-        stand_in.rig,
-        stand_in.occupied,
-        tmp_path / "avatar.iavatar",
-        views=list(views.values()),
-        metrics={},
-        renderer=renderer,
-        config=replace(coarse, fine_tuning_pictures=4),
-        progress=interrupted,
-        baked_first=baked_first,
-    )
+    (report,) = exported(progress=interrupted, baked_first=baked_first)
     assert report.fine_tuning_psnr is None
     assert any("interrupted" in warning for warning in report.warnings) is not baked_first
     package = read_package(report.path)
     assert np.array_equal(package.tables["hq"].bricks.voxels, tables.bricks.voxels)
 
 
-def test_the_fine_tuned_package_has_the_graphs_that_were_checked_as_baked(
-    stand_in, renderer, coarse, views, tmp_path, monkeypatch
-):
+def test_the_fine_tuned_package_has_the_graphs_that_were_checked_as_baked(exported, monkeypatch):
     checked = []
     check = build.check_graph
     monkeypatch.setattr(build, "check_graph", lambda *given: checked.append(0) or check(*given))
-    first, tuned = export_field(
-        stand_in.field_at,
-        stand_in.rig,
-        stand_in.occupied,
-        tmp_path / "avatar.iavatar",
-        views=list(views.values()),
-        metrics={},
-        renderer=renderer,
-        config=replace(coarse, fine_tuning_pictures=4),
-        baked_first=True,
-    )
+    first, tuned = exported(baked_first=True)
     assert tuned.fine_tuning_psnr is not None
     assert len(checked) == sum(build.GRAPH_CHECK_PICTURES.values())  # each once
     assert tuned.largest_difference == first.largest_difference
@@ -273,27 +262,16 @@ def test_haze_about_a_faint_core_is_inside_the_surface_of_a_thick_field(stand_in
 
 @pytest.mark.slow
 def test_where_the_player_is_far_from_the_renderer_bytes_choose_the_voxels(
-    stand_in, renderer, coarse, views, tables, tmp_path
+    exported, renderer, tables
 ):
     def paler(pose, camera):
         picture = renderer(pose, camera).copy()
         picture[..., :3] += 0.08 * (picture[..., 3:] - picture[..., :3])
         return picture
 
-    def exported(exact):
-        (report,) = export_field(
-            stand_in.field_at,
-            stand_in.rig,
-            stand_in.occupied,
-            tmp_path / "avatar.iavatar",
-            views=list(views.values()),
-            metrics={},
-            renderer=exact,
-            config=replace(coarse, fine_tuning_pictures=2),
-        )
-        return read_package(report.path)
-
-    usual, thick = exported(renderer), exported(paler)
+    usual, thick = (
+        read_package(next(exported(pictures=2, renderer=each)).path) for each in (renderer, paler)
+    )
     voxel_m = tables.bricks.voxel_m
     assert usual.tables["hq"].bricks.voxel_m == pytest.approx(voxel_m)
     assert usual.manifest.tiers["hq"].settings == SETTINGS
