@@ -79,7 +79,12 @@ def find_flips(motion: Motion) -> Bool[np.ndarray, "poses"]:
 
 
 def _without_joint_flips(motion: Motion) -> Float[np.ndarray, "poses 23 3"]:
-    """Joint rotations, those of flipped runs interpolated between the poses around them."""
+    """Joint rotations, those of flipped runs interpolated between the poses around them.
+
+    Poses that were tracked here are fitted to the whole film, fast steps included, and stay.
+    """
+    if motion.is_fitted:
+        return motion.joint_rotations
     joints, rows = motion.joint_rotations.copy(), np.flatnonzero(motion.valid)
     times_s = _times_s(motion)[rows]
     for joint in range(joints.shape[1]):

@@ -41,6 +41,9 @@ PERSON_MARGIN = 0.1
 """Margin around the person that is no background, person heights."""
 STILL_SHARE = 0.01
 """Most that the background shifts from place to place before a camera that stands, longer sides."""
+STILL_FRAME_SHARE = 0.001
+"""Most that the background shifts between the two frames of a place before a camera that stands:
+half a pixel of those that are looked at; a hand trembles more. Longer sides."""
 HELD_SHARE = 0.08
 """Most that the background shifts if the camera is held by someone who stands, longer sides."""
 MIN_PARALLAX_SHARE = 0.02
@@ -279,6 +282,8 @@ def camera_motion(
         return CameraMotion.STILL if shift < STILL_SHARE else CameraMotion.HELD, shift
     planes = [each.plane for each in followed if each.share > MIN_PARALLAX_SHARE]
     shift = max(each.share for each in followed)
+    if not stays and shift < STILL_FRAME_SHARE:  # too plain to be recognized from far
+        return CameraMotion.STILL, shift
     if not planes or WALKING_SHARE < np.median(planes) < TURNING_SHARE:
         return CameraMotion.MOVES, shift
     turns = np.median(planes) >= TURNING_SHARE

@@ -86,6 +86,20 @@ def test_a_camera_that_turns_on_the_spot_is_no_camera_that_stands(look, frames):
     assert "--cameras solve finds how it turns, and its focal" in list(seen.advice())[-1]
 
 
+def test_a_camera_before_a_plain_wall_stands_if_its_few_corners_do():
+    """Too few are left beside the person to recognize one place in the next."""
+    wall = np.full((480, 480, 3), 200, np.uint8)
+    for row in range(40, 480, 80):
+        wall[row : row + 20, 20:40] = 40
+    pairs = [(Frame(index=0, time_s=0.0, rgb=wall), Frame(index=1, time_s=0.2, rgb=wall))] * 6
+    hidden = [np.full((480, 480), 255, np.uint8) for _ in range(6)]
+    for k, mask in enumerate(hidden):
+        mask[160 * (k % 2) : 160 * (k % 2 + 1)] = 0
+    motion, shift = camera_motion(pairs, hidden)
+    assert motion is CameraMotion.STILL
+    assert shift < 1e-4
+
+
 def test_a_camera_that_is_carried_past_near_and_far_things_walks():
     noise = np.random.default_rng(0).integers(0, 256, (60, 240, 3), dtype=np.uint8)
     wall = cv2.resize(noise, (1920, 480), interpolation=cv2.INTER_CUBIC)

@@ -12,6 +12,7 @@ from preprocess.poses.plausibility import (
     plausibility_warnings,
     require_plausible,
 )
+from preprocess.tracking.keypoints import KeypointTrack
 
 WRIST = 19
 """Row of the left wrist among the joints without the root."""
@@ -166,6 +167,24 @@ def test_a_wrist_that_flips_is_interpolated_and_named():
     (sentence,) = plausibility_warnings(motion)
     assert "3 of 60 poses (the first is row 20)" in sentence
     assert "the left wrist" in sentence
+
+
+def test_poses_that_were_tracked_here_keep_their_fast_joints():
+    """They were fitted to the film: a runner's leg swings faster than other trackers are right."""
+    motion = turning(60, 0.03)
+    motion.joint_rotations[20:23, WRIST, 0] += 2.5
+    keypoints = KeypointTrack(
+        frames=np.arange(60),
+        image_px=np.zeros((60, 33, 2)),
+        world_m=np.zeros((60, 33, 3)),
+        visibility=np.ones((60, 33)),
+        presence=np.ones(60),
+        size_px=(64, 64),
+    )
+    motion = replace(motion, proportions=np.zeros(1), keypoints=keypoints)
+    kept = require_plausible(motion, "poses.npz").joint_rotations
+    np.testing.assert_array_equal(kept, motion.joint_rotations)
+    assert list(plausibility_warnings(motion)) == []
 
 
 def test_poses_that_are_far_apart_stay_as_they_are():
