@@ -24,8 +24,10 @@ from benchmarks.sample_training import (
     train_for_core_seconds,
     training_config,
 )
+from benchmarks.startup import measure_startup
 from benchmarks.step_timing import encode_marks, step_marks
 from benchmarks.stopwatch import limit_threads
+from benchmarks.thread_scaling import scaling_marks
 from benchmarks.training_quality import (
     measure_by_wall_time,
     measure_pose_refinement,
@@ -33,6 +35,7 @@ from benchmarks.training_quality import (
 from instant_avatar.cli.command_line import run_command
 
 SIZE_PX = 256
+PHONE_SIZE_PX = 304
 TEN_MINUTES = 600.0
 """What patience adds to a minute, at 540 px."""
 WARMUP_TRAINING_SECONDS = 15.0
@@ -44,7 +47,7 @@ class Training:
     """Measures the training core and prints one table."""
 
     quick: bool = False
-    """Only single operations, without quality."""
+    """Only single operations: neither quality nor start-up."""
     json: Path | None = None
     """File for the figures."""
     keep: Path | None = None
@@ -67,7 +70,8 @@ def run_benchmark(job: Training) -> int:
 def all_marks(job: Training, folder: Path) -> Iterator[Measurement]:
     """All rows."""
     small = film_sample(folder / f"sample{SIZE_PX}", SIZE_PX)
-    groups = [operation_marks(small)]
+    phone = film_sample(folder / "phone", PHONE_SIZE_PX, like_a_phone=True)
+    groups = [scaling_marks(phone), operation_marks(small)]
     if not job.quick:
         groups += [
             measure_by_wall_time(small, {"held out": ("33", "36"), "novel poses": ("31", "34")}),
@@ -93,6 +97,7 @@ def large_marks(folder: Path) -> Iterator[Measurement]:
     large = film_sample(folder / "sample540", 540, frames=300, turns=5.0)
     asked = {"held out": ("33", "37"), "novel poses": ("30.5", "34")}
     yield from measure_by_wall_time(large, asked)
+    yield from measure_startup(large)
     printed = dict.fromkeys(asked, ("", ""))
     yield from measure_by_wall_time(large, printed, seconds=TEN_MINUTES)
 
