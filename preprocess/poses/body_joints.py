@@ -28,7 +28,7 @@ from preprocess.poses.video_trackers import nearest_person
 BODIES = ("MHR", "MHR's key points", "SOMA", "Anny", "SMPL-H", "SMPL-X")
 """Bodies whose joints are known: the columns of the tables."""
 MIDDLE_JOINTS = {
-    "pelvis": (1, None, "Hips", "root", 0, 0), "spine1": (35, None, "Spine1", "spine04", 3, 3),
+    "pelvis": (1, None, "Hips", "spine05", 0, 0), "spine1": (35, None, "Spine1", "spine04", 3, 3),
     "spine2": (36, None, "Spine2", "spine03", 6, 6), "spine3": (37, None, "Chest", "spine02", 9, 9),
     "neck": (111, 69, "Neck2", "neck01", 12, 12), "head": (113, None, "Head", "head", 15, 15),
     "nose": (None, 0, None, None, None, None),
@@ -167,8 +167,12 @@ class JointTrack:
     lens: Any = None
     program: str | None = None
 
-    def fitted(self) -> Motion:
+    def fitted(self, *, upright: bool) -> Motion:
         """Our body's motion, and a note that says how near its joints are.
+
+        Args:
+            upright: Turn places in the world so that y is up, for a motion of its own; those of a
+                film stay in the world of its cameras.
 
         Raises:
             ValueError: If the joints are not those of a person.
@@ -176,9 +180,9 @@ class JointTrack:
         rows = rows_with_limbs(self.places)
         places, turns = self.places[rows], None if self.turns is None else self.turns[rows]
         places = places * _unit_m(places)
-        if self.space == "world":
-            upright = find_upright(places[:, :24])
-            places, turns = places @ upright.T, None if turns is None else upright @ turns
+        if upright and self.space == "world":
+            turn = find_upright(places[:, :24])
+            places, turns = places @ turn.T, None if turns is None else turn @ turns
         numbers = np.array(self.frames or range(len(self.places)))[rows]
         offsets_m = _offsets_m(self.body)
         found = fit_joints(places, numbers / (self.fps or 30.0), turns, offsets_m)
@@ -191,7 +195,11 @@ class JointTrack:
             f"{1000.0 * mean:.0f} mm from it on average, the {name} {1000.0 * apart[worst]:.0f} mm"
         )
         if mean > MAX_DISTANCE_M:
-            raise ValueError(f"its joints are not {self.body}'s: a person's are {said}")
+            raise ValueError(
+                f"its joints are not {self.body}'s: a person's are {said}. Joints whose names are "
+                "not SMPL's, SOMA's or Anny's are known by their number; other skeletons are read "
+                "as .bvh or .glb"
+            )
         rotations = axis_angles_from_matrices(found.poses.rotations)
         motion = build_motion(
             [rotations.reshape(len(rotations), 72)], found.poses.translations,
@@ -217,7 +225,7 @@ def parse_joints(content: Any, prefer_world: bool = False) -> MotionByPerson | N
     """
     track = _read_soma(content, prefer_world)
     if track is not None:
-        return {"0": track.fitted()}
+        return {"0": track.fitted(upright=prefer_world)}
     items = list(_find_people(content))
     if not items:
         return None
@@ -232,7 +240,7 @@ def parse_joints(content: Any, prefer_world: bool = False) -> MotionByPerson | N
             taken.add(name)
             last[name] = place
             people.setdefault(name, []).append(item)
-    return {name: _join(rows, fps).fitted() for name, rows in people.items()}
+    return {name: _join(rows, fps).fitted(upright=prefer_world) for name, rows in people.items()}
 
 
 def fit_mhr(
@@ -259,7 +267,7 @@ def fit_mhr(
     for point, number in columns.items():
         if number in nodes:
             found[:, POINT_NAMES.index(point)] = places[:, nodes[number]]
-    return JointTrack(body="MHR", places=found, fps=fps, program="SAM 3D Body").fitted()
+    return JointTrack(body="MHR", places=found, fps=fps, program="SAM 3D Body").fitted(upright=True)
 
 
 class _Item(NamedTuple):

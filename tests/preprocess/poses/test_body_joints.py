@@ -177,13 +177,22 @@ def test_joints_are_known_by_their_number_in_any_unit_and_axes(tmp_path, places,
 
 def test_annys_bones_are_known_by_their_names(tmp_path, places):
     names = columns("Anny")
-    heads = np.tile(np.eye(4), (FRAMES, len(names), 1, 1))
+    heads = np.tile(np.eye(4), (FRAMES, 1 + len(names), 1, 1))
     for number, point in enumerate(names):
         heads[:, number, :3, 3] = places[:, POINT_NAMES.index(point)][:, [0, 2, 1]] * Z_UP
-    np.savez(tmp_path / "anny.npz", bone_poses=heads, bone_labels=np.array(list(names.values())))
-    motion = read_poses(tmp_path / "anny.npz")
+    heads[:, -1, :3, 3] = heads[:, 0, :3, 3] + [0.0, 0.07, 0.0]  # as in MakeHuman's own rig
+    labels = [*(names | {"pelvis": "spine05"}).values(), "root"]
+    np.savez(tmp_path / "anny.npz", bone_poses=heads, bone_labels=np.array(labels))
+    motion = read_poses(tmp_path / "anny.npz", prefer_world=True)
     assert worst_m(motion, places * [1.0, -1.0, -1.0]) < 0.006
     assert "joints of Anny" in motion.note
+    farthest_mm = int(motion.note.rsplit(" mm", 1)[0].split()[-1])
+    assert farthest_mm < 20
+
+
+def test_joints_of_a_film_stay_in_the_world_of_its_cameras(tmp_path, places):
+    np.savez(tmp_path / "joints.npz", joints=arranged(places, "SMPL-X", 55))
+    assert worst_m(read_poses(tmp_path / "joints.npz"), places) < 0.006
 
 
 def test_gem_xs_rotations_move_its_skeleton(tmp_path, poses):
@@ -240,6 +249,13 @@ def test_gem_xs_rotations_move_its_skeleton(tmp_path, poses):
         (
             {"joints": np.random.default_rng(0).normal(size=(2, 24, 3))},
             "its joints are not SMPL-H's",
+        ),
+        (
+            {
+                "joints": np.random.default_rng(0).normal(size=(2, 52, 3)),
+                "joint_names": [f"mixamorig:{n}" for n in range(52)],
+            },
+            "known by their number; other skeletons are read as .bvh or .glb",
         ),
     ],
 )
