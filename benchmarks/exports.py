@@ -37,7 +37,7 @@ from capture.camera import Camera
 from export.gltf import SkeletonAnimation, encode_glb
 from export.package.package_file import AvatarPackage, read_package
 from export.player import Player, premultiply
-from export.skinned_mesh import extract_soft_mesh
+from export.skinned_mesh import extract_mesh
 from export.splats import build_splats, encode_ply, encode_spz
 from instant_avatar.animation.web_server import make_server
 from instant_avatar.cli.command_line import run_command
@@ -224,8 +224,9 @@ def mesh_file(package: AvatarPackage, views: Sequence[ComparedView], triangles: 
     manifest = package.manifest
     rows = tuple(range(len(poses)))
     animation = SkeletonAnimation.of(motion, rows, FRAME_RATE, manifest.rest_joints[0])
-    picture_by = Player(package).render_canonical
-    mesh = extract_soft_mesh(package.tables["hq"], picture_by, triangles=triangles)
+    mesh = extract_mesh(
+        package.tables["hq"], triangles=triangles, picture_by=Player(package).render_canonical
+    )
     return encode_glb(mesh, manifest, animation, name="avatar")
 
 

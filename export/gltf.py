@@ -12,7 +12,7 @@ from jaxtyping import Float, Float32, Shaped, UInt16
 from scipy.spatial.transform import Rotation
 
 from export.package.manifest import Manifest
-from export.skinned_mesh import RIM_OPACITY, SkinnedMesh
+from export.skinned_mesh import SkinnedMesh
 from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import JOINT_NAMES, body_from_rest
 
@@ -142,8 +142,6 @@ def _encode_scene(
     more: dict[str, Any],
 ) -> bytes:
     """Encode the mesh below its skeleton, and more entries of the file."""
-    primitives = [_primitive(draft, mesh, 0)]
-    primitives += [_primitive(draft, shell, 1) for shell in mesh.rim]
     content = {
         "asset": {
             "version": "2.0",
@@ -154,8 +152,8 @@ def _encode_scene(
         "scene": 0,
         "scenes": [{"nodes": [0, 1]}],
         "nodes": [{"name": name, "mesh": 0, "skin": 0}, *nodes],
-        "meshes": [{"name": name, "primitives": primitives}],
-        **_materials(draft, mesh),
+        "meshes": [{"name": name, "primitives": [_primitive(draft, mesh)]}],
+        **_material(draft, mesh),
         "skins": [skin],
         **more,
         **draft.describe(),
@@ -198,18 +196,13 @@ def _skeleton(
     return skin, [{"name": "floor", **floor, "children": [FIRST_JOINT]}, *nodes]
 
 
-def _materials(draft: "_GltfBuffer", mesh: SkinnedMesh) -> dict[str, Any]:
-    """Return the unlit materials of mesh and rim, and the texture if the mesh has one."""
+def _material(draft: "_GltfBuffer", mesh: SkinnedMesh) -> dict[str, Any]:
+    """Return the unlit material, with the texture if the mesh has one."""
     surface: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
     unlit = {"KHR_materials_unlit": {}}
     material = {"name": "as recorded", "pbrMetallicRoughness": surface, "extensions": unlit}
-    materials: list[dict[str, Any]] = [material]
-    if mesh.rim:
-        faint = {**surface, "baseColorFactor": [1.0, 1.0, 1.0, RIM_OPACITY]}
-        rim = {"name": "soft rim", "pbrMetallicRoughness": faint, "alphaMode": "BLEND"}
-        materials.append({**material, **rim})
     if mesh.texture is None:
-        return {"materials": materials}
+        return {"materials": [material]}
     surface["baseColorTexture"] = {"index": 0}
     options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
     options += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
@@ -218,14 +211,14 @@ def _materials(draft: "_GltfBuffer", mesh: SkinnedMesh) -> dict[str, Any]:
     wraps = dict.fromkeys(("wrapS", "wrapT"), CLAMP_TO_EDGE)
     sampler = {"magFilter": LINEAR_FILTER, "minFilter": MIPMAP_FILTER, **wraps}
     return {
-        "materials": materials,
+        "materials": [material],
         "textures": [{"source": 0, "sampler": 0}],
         "images": [{"bufferView": draft.add_bytes(code), "mimeType": "image/jpeg"}],
         "samplers": [sampler],
     }
 
 
-def _primitive(draft: "_GltfBuffer", mesh: SkinnedMesh, material: int) -> dict[str, Any]:
+def _primitive(draft: "_GltfBuffer", mesh: SkinnedMesh) -> dict[str, Any]:
     def vertices(array: Shaped[np.ndarray, "vertices _"], **more: Any) -> int:
         return draft.add(array, target=ARRAY_BUFFER, **more)
 
@@ -243,7 +236,7 @@ def _primitive(draft: "_GltfBuffer", mesh: SkinnedMesh, material: int) -> dict[s
             "WEIGHTS_0": vertices(mesh.weights, normalized=True),
         },
         "indices": draft.add(mesh.faces.astype(np.uint32).ravel(), target=ELEMENT_ARRAY_BUFFER),
-        "material": material,
+        "material": 0,
     }
 
 

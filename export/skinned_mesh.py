@@ -1,6 +1,6 @@
 """A package's avatar as a mesh: vertices, colors or a texture, and skinning weights."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, UInt8
@@ -28,13 +28,6 @@ VERTEX_SPACING_M = 0.005
 SURFACE_DENSITY = 20.0
 """Density of the surface, 1/m: the silhouette is then as wide as the renderer's (at 25 by 0.7 mm
 thinner, measured on three avatars)."""
-RIM_OPACITY = 0.4
-"""Opacity of the two translucent shells about a textured mesh, which make its outline soft."""
-LAYER_DENSITIES = tuple(SURFACE_DENSITY * np.log(1.0 - np.array([0.2, 0.52, 0.82])) / np.log(0.5))
-"""Densities of the shells, from outside, and of the opaque mesh, 1/m. One shell shows 0.4 of what
-is there, two show 0.64, and each outline lies where a ray beside the body has an alpha halfway
-between what is shown on both sides. At `SURFACE_DENSITY` that is one half, and the ray's optical
-depth is proportional to the density."""
 HAZE_DENSITY = 15.0
 """Density of the faint cover that closes regions which no camera saw, 1/m."""
 BORDER_VOXELS = 4
@@ -75,8 +68,6 @@ class SkinnedMesh:
         joints: Joints that move each vertex; 0 where the weight is 0.
         weights: Skinning weights × 255; each row sums to 255.
         texture: Finer colors than those of the vertices; None of a mesh of many triangles.
-        rim: Translucent shells about it, from the outermost. Their faces are turned round, so that
-            they are seen from within: behind the mesh, that is, and beyond its outline.
     """
 
     positions: Float32[np.ndarray, "vertices 3"]
@@ -86,7 +77,6 @@ class SkinnedMesh:
     joints: UInt8[np.ndarray, "vertices 4"]
     weights: UInt8[np.ndarray, "vertices 4"]
     texture: Texture | None = None
-    rim: "tuple[SkinnedMesh, ...]" = ()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -97,27 +87,17 @@ class LevelSet:
         codes: Colors and density codes of all bricks.
         heights: Positive inside of the surface.
         low: Position of the first node, metres.
-        voxel_m: Distance of two nodes, metres.
     """
 
     codes: UInt8[np.ndarray, "x y z 4"]
     heights: Float32[np.ndarray, "x y z"]
     low: Float32[np.ndarray, "3"]
-    voxel_m: float
 
     @classmethod
     def of(cls, bricks: BrickTable, density: float = SURFACE_DENSITY) -> "LevelSet":
         """The level set of baked bricks at a density (1/m)."""
         codes, low = _dense_grid(bricks)
-        heights = _level_function(codes[..., 3], density)
-        return cls(codes=codes, heights=heights, low=low, voxel_m=bricks.voxel_m)
-
-    def colors_at(
-        self, points: Float32[np.ndarray, "points 3"], directions: Float32[np.ndarray, "points 3"]
-    ) -> UInt8[np.ndarray, "points 3"]:
-        """Return the colors of points on the surface, from their normals."""
-        nodes = (points - self.low) / np.float32(self.voxel_m)
-        return _vertex_colors(self.codes, nodes, directions, self.voxel_m)
+        return cls(codes=codes, heights=_level_function(codes[..., 3], density), low=low)
 
 
 def extract_mesh(
@@ -126,54 +106,51 @@ def extract_mesh(
     *,
     spacing_m: float = VERTEX_SPACING_M,
     triangles: int | None = None,
+    picture_by: PictureBy | None = None,
 ) -> SkinnedMesh:
     """Extract the surface of baked bricks, a vertex about every `spacing_m`.
 
     It is simplified to `triangles` (quadric error metrics, Garland and Heckbert 1997; needs
-    fast-simplification) unless that is None. Give `level` if it is known.
+    fast-simplification) unless that is None. Give `level` if it is known. With `picture_by`, the
+    mesh has a texture, which shows what these pictures show.
     """
     level = level or LevelSet.of(tables.bricks)
-    voxel_m = tables.bricks.voxel_m
+    codes, low, voxel_m = level.codes, level.low, tables.bricks.voxel_m
     step = spacing_m / voxel_m
     nodes, faces = extract_isosurface(resample_grid(level.heights, step))
     nodes *= np.float32(step)
-    positions = (level.low + nodes * np.float32(voxel_m)).astype(np.float32)
+    positions = (low + nodes * np.float32(voxel_m)).astype(np.float32)
     normals = _smooth_normals(positions, faces)
     if triangles is not None and triangles < len(faces):
         positions, normals, faces = _simplify(positions, normals, faces, triangles)
+
+    def color_at(
+        points: Float32[np.ndarray, "points 3"], directions: Float32[np.ndarray, "points 3"]
+    ) -> UInt8[np.ndarray, "points 3"]:
+        return _vertex_colors(codes, (points - low) / np.float32(voxel_m), directions, voxel_m)
+
     joints, weights = _strongest_joints(skinning_weights(tables, positions))
-    return SkinnedMesh(
+    mesh = SkinnedMesh(
         positions=positions,
         normals=normals,
-        colors=level.colors_at(positions, normals),
+        colors=color_at(positions, normals),
         faces=faces,
         joints=joints,
         weights=weights,
     )
-
-
-def extract_soft_mesh(
-    tables: PlayerTables, picture_by: PictureBy, *, triangles: int
-) -> SkinnedMesh:
-    """Extract a textured surface that shows what pictures show, and the shells of a soft rim."""
-    *outer, inmost = (LevelSet.of(tables.bricks, density) for density in LAYER_DENSITIES)
-    count = triangles // len(LAYER_DENSITIES)
-    shells = [extract_mesh(tables, level, triangles=count) for level in outer]
-    mesh = extract_mesh(tables, inmost, triangles=triangles - len(outer) * count)
-    unwrapped = unwrap(mesh.positions, mesh.faces)
+    if picture_by is None:
+        return mesh
+    unwrapped = unwrap(positions, faces)
     rows = unwrapped.sources
-    positions, normals = mesh.positions[rows], mesh.normals[rows]
+    texture = draw_texture(unwrapped, positions[rows], normals[rows], color_at, picture_by)
     return SkinnedMesh(
-        positions=positions,
-        normals=normals,
+        positions=positions[rows],
+        normals=normals[rows],
         colors=mesh.colors[rows],
         faces=unwrapped.faces,
-        joints=mesh.joints[rows],
-        weights=mesh.weights[rows],
-        texture=draw_texture(unwrapped, positions, normals, inmost.colors_at, picture_by),
-        rim=tuple(
-            replace(shell, faces=shell.faces[:, ::-1], normals=-shell.normals) for shell in shells
-        ),
+        joints=joints[rows],
+        weights=weights[rows],
+        texture=texture,
     )
 
 

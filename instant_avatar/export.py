@@ -19,7 +19,7 @@ from export.gltf import SkeletonAnimation, encode_glb, encode_vrm, text_of_glb
 from export.package.manifest import Manifest
 from export.package.package_file import AvatarPackage, read_package
 from export.player import Player
-from export.skinned_mesh import SkinnedMesh, extract_mesh, extract_soft_mesh
+from export.skinned_mesh import SkinnedMesh, extract_mesh
 from export.splats import build_splats, encode_ply, encode_spz
 from instant_avatar.animation.driving_motion import (
     DISTANCE_HEIGHTS,
@@ -176,17 +176,16 @@ def _build_mesh(
 ) -> tuple[bytes, str]:
     """Return a file of a mesh, and its size in words."""
     name = arguments.out.stem
-    tables, triangles = package.tables["hq"], arguments.triangles
-    textured = arguments.to in ("glb", "vrm") and triangles is not None
+    textured = arguments.to in ("glb", "vrm") and arguments.triangles is not None
     if textured and find_spec("xatlas") is None:
         textured = False
         console.info("note: colors of vertices instead of a texture, which needs xatlas.")
     with console.status("extracting the surface"):
-        if textured and triangles is not None:
-            picture_by = Player(package).render_canonical
-            mesh = extract_soft_mesh(tables, picture_by, triangles=triangles)
-        else:
-            mesh = extract_mesh(tables, triangles=triangles)
+        mesh = extract_mesh(
+            package.tables["hq"],
+            triangles=arguments.triangles,
+            picture_by=Player(package).render_canonical if textured else None,
+        )
         if arguments.to == "glb":
             content = _encode_animated(mesh, package.manifest, motion, name)
             if arguments.out.suffix.lower() == ".gltf":
@@ -196,10 +195,7 @@ def _build_mesh(
             content = encode_vrm(mesh, package.manifest, name=name, author=author)
         else:
             content = _encode_static(mesh, arguments.to)
-    parts = [mesh, *mesh.rim]
-    vertices = sum(len(part.positions) for part in parts)
-    faces = sum(len(part.faces) for part in parts)
-    return content, f"{vertices:,} vertices, {faces:,} triangles."
+    return content, f"{len(mesh.positions):,} vertices, {len(mesh.faces):,} triangles."
 
 
 def _first_pose(motion: Motion) -> BodyPose:

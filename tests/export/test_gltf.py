@@ -16,15 +16,7 @@ from export.gltf import SkeletonAnimation, encode_glb, encode_vrm
 from export.mesh_texture import _draw_faces, _project
 from export.package.package_file import read_package
 from export.player import Player
-from export.skinned_mesh import (
-    LAYER_DENSITIES,
-    RIM_OPACITY,
-    SURFACE_DENSITY,
-    LevelSet,
-    _level_function,
-    extract_mesh,
-    extract_soft_mesh,
-)
+from export.skinned_mesh import SURFACE_DENSITY, _level_function, extract_mesh
 from export.splat_colors import cameras_around
 from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import body_from_rest, rotation_matrices, world_from_body
@@ -234,16 +226,9 @@ def test_a_still_pose_is_a_motion_too(mesh, package, motion):
 
 @pytest.fixture(scope="module")
 def simple(package):
-    """One of three thousand triangles with a texture, and as many in each shell about it."""
+    """The same of three thousand triangles, with a texture."""
     pytest.importorskip("xatlas")
-    return extract_soft_mesh(package.tables["hq"], show_nothing, triangles=9000)
-
-
-@pytest.fixture(scope="module")
-def inmost(package):
-    """Its surface, of many triangles."""
-    tables = package.tables["hq"]
-    return extract_mesh(tables, LevelSet.of(tables.bricks, LAYER_DENSITIES[-1]))
+    return extract_mesh(package.tables["hq"], triangles=3000, picture_by=show_nothing)
 
 
 def texels(mesh, shares, smaller=1):
@@ -260,8 +245,7 @@ def texels(mesh, shares, smaller=1):
     return np.stack(channels, axis=1)
 
 
-def test_few_triangles_keep_the_shape_and_its_colors(simple, inmost):
-    mesh = inmost
+def test_few_triangles_keep_the_shape_and_its_colors(simple, mesh):
     assert 2900 <= len(simple.faces) <= 3000
     assert len(simple.positions) < 1.3 * len(simple.faces)
     assert volume(simple.positions, simple.faces) == pytest.approx(
@@ -298,37 +282,6 @@ def test_its_outline_is_as_wide_as_the_avatars(mesh, package):
     assert abs(np.mean(wider)) < 0.8  # mm; 1.2 at a density of 25
 
 
-def test_shells_make_an_outline_as_soft_as_the_avatars(simple, mesh, package):
-    player, off = Player(package), []
-    for camera in cameras_around(mesh.positions, views=4, pixel_m=0.002):
-        soft = player.render_canonical(camera)[..., 3] / 255.0
-        covered = [
-            _draw_faces(_project(camera, each.positions)[0][each.faces], len(soft)) >= 0
-            for each in (*simple.rim, simple, mesh)
-        ]
-        *shells, inmost, hard = np.array(covered, dtype=float)
-        shown = 1.0 - (1.0 - inmost) * np.prod([1.0 - RIM_OPACITY * each for each in shells], 0)
-        off.append([np.square(each - soft).mean() for each in (shown, hard)])
-    layered, alone = np.mean(off, axis=0)
-    assert layered < 0.5 * alone
-
-
-def test_shells_are_seen_from_within_and_shown_after_the_mesh(simple, package, motion):
-    assert all(volume(shell.positions, shell.faces) < 0.0 for shell in simple.rim)
-    clip = SkeletonAnimation.of(motion, (0, 1), 25.0, package.manifest.rest_joints[0])
-    read = Read(encode_glb(simple, package.manifest, clip, name="x"))
-    first, *others = read.json["meshes"][0]["primitives"]
-    solid, rim = read.json["materials"]
-    assert first["material"] == 0
-    assert "alphaMode" not in solid
-    assert [each["material"] for each in others] == [1, 1]
-    assert rim["alphaMode"] == "BLEND"
-    assert rim["pbrMetallicRoughness"]["baseColorFactor"] == [1.0, 1.0, 1.0, RIM_OPACITY]
-    assert "baseColorTexture" not in rim["pbrMetallicRoughness"]
-    count = sum(len(read.array(each["indices"])) for each in (first, *others)) / 3
-    assert 8900 <= count <= 9000
-
-
 def test_a_texture_is_read_by_another_reader(simple, package, motion):
     clip = SkeletonAnimation.of(motion, (0, 1), 25.0, package.manifest.rest_joints[0])
     content = encode_glb(simple, package.manifest, clip, name="x")
@@ -336,7 +289,7 @@ def test_a_texture_is_read_by_another_reader(simple, package, motion):
     assert "COLOR_0" not in read.json["meshes"][0]["primitives"][0]["attributes"]
     np.testing.assert_array_equal(read.attribute("TEXCOORD_0"), simple.texture.coordinates)
     assert ((read.attribute("TEXCOORD_0") > 0.0) & (read.attribute("TEXCOORD_0") < 1.0)).all()
-    found = next(iter(trimesh.load(io.BytesIO(content), file_type="glb").geometry.values()))
+    (found,) = trimesh.load(io.BytesIO(content), file_type="glb").geometry.values()
     image = np.asarray(found.visual.material.baseColorTexture.convert("RGB"))
     assert image.shape == simple.texture.image.shape
     assert np.abs(image.astype(float) - simple.texture.image).mean() < 3.0  # a JPEG
