@@ -178,7 +178,8 @@ def plausibility_warnings(motion: Motion) -> Iterator[str]:
             f"{len(flips)} of {len(motion)} poses (the first is row {flips[0]}) face another way "
             "than those just before and after them: front was taken for back. They are left out."
         )
-    moved = (_without_joint_flips(motion) != motion.joint_rotations).any(axis=-1)
+    kept = invalidate_implausible_rows(motion)
+    moved = (kept.joint_rotations != motion.joint_rotations).any(axis=-1) & kept.valid[:, None]
     if moved.any():
         row, joint = np.argwhere(moved)[0]
         yield (

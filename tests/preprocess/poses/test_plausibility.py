@@ -169,6 +169,16 @@ def test_a_wrist_that_flips_is_interpolated_and_named():
     assert "the left wrist" in sentence
 
 
+def test_rows_without_a_pose_and_limbs_of_flipped_ones_are_no_flipped_joints():
+    """Files mark lost poses by NaN; who is turned round is left out with the arms."""
+    motion = take_front_for_back(turning(60, 0.03), [20, 21, 22])
+    motion.joint_rotations[20:23, WRIST, 0] += 2.5
+    motion.joint_rotations[40:43] = np.nan
+    motion.valid[40:43] = False
+    (sentence,) = plausibility_warnings(motion)
+    assert "front was taken for back" in sentence
+
+
 def test_poses_that_were_tracked_here_keep_their_fast_joints():
     """They were fitted to the film: a runner's leg swings faster than other trackers are right."""
     motion = turning(60, 0.03)
