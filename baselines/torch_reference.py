@@ -4,6 +4,7 @@ The oracle of the compiled kernels (`avatar.kernels.operations`): their constant
 as the papers have them. The paper's training step (`instant_avatar.autograd_steps`) is built on it.
 """
 
+import itertools
 import math
 
 import torch
@@ -110,10 +111,19 @@ def mean_normals(
     cells: CorrespondenceTables,
     volume: NormalVolume,
 ) -> Float32[Tensor, "rays 3"]:
-    """Mean normal of what each ray sees, Σ T_i α_i n_i; n is that of the skin, warped."""
+    """Mean normal of what each ray sees, Σ T_i α_i n_i; n is that of the skin, warped.
+
+    Between the centers of the volume's cells, normals are interpolated.
+    """
     last = torch.tensor(volume.normals.shape[:3]) - 1
-    cell = ((samples.points - volume.low) * volume.cells_per_m).long().clamp(min=0)
-    normals = volume.normals[torch.minimum(cell, last).unbind(dim=1)]
+    place = ((samples.points - volume.low) * volume.cells_per_m - 0.5).clamp(min=0.0)
+    place = torch.minimum(place, last)
+    cell = torch.minimum(place.long(), last - 1)
+    normals = torch.zeros_like(samples.points)
+    for corner in itertools.product((0, 1), repeat=3):
+        above = torch.tensor(corner)
+        share = (1.0 - (cell + above - place).abs()).prod(dim=1, keepdim=True)
+        normals += share * volume.normals[(cell + above).unbind(dim=1)]
     slot = torch.repeat_interleave(slots.long(), samples.counts.long())
     warp = cells.roots[slot, samples.root_rows.long(), 3:].unflatten(1, (3, 3))
     normals = torch.nn.functional.normalize((warp * normals[:, :, None]).sum(dim=1), dim=1)

@@ -11,12 +11,19 @@ from avatar.kernels.kernel_compiler import (
     NO_ALLOCATION,
     compile_kernel,
 )
-from avatar.kernels.numba_rendering import cell_index_at
 from avatar.kernels.operands import MAX_LOG_DENSITY
 
 F32, I32, U32 = np.float32, np.int32, np.uint32
 MIN_NORMAL_WEIGHT = 1e-3
 """Weight of a sample in its ray up to which its normal does not count."""
+
+
+@compile_kernel(**INLINED)
+def _cell_below(place, count):
+    """Index of the cell whose center is before a place, in cells, and how far beyond it that is."""
+    before = min(max(place - F32(0.5), F32(0)), F32(count - 1))
+    index = min(I32(before), I32(count - 2))
+    return index, before - F32(index)
 
 
 @compile_kernel(**NO_ALLOCATION)
@@ -33,11 +40,18 @@ def _mean_normal(
         through *= np.exp(-np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * sample_step_m)
         if before - through <= F32(MIN_NORMAL_WEIGHT):
             continue  # most samples, whose normals lie anywhere in memory
-        a = cell_index_at((points[i, 0] - low[0]) * cells_per_m[0], I32(nx))
-        b = cell_index_at((points[i, 1] - low[1]) * cells_per_m[1], I32(ny))
-        c = cell_index_at((points[i, 2] - low[2]) * cells_per_m[2], I32(nz))
         n = U32(rows[i])
-        p, q, r = normals[a, b, c, 0], normals[a, b, c, 1], normals[a, b, c, 2]
+        a, f = _cell_below((points[i, 0] - low[0]) * cells_per_m[0], nx)
+        b, g = _cell_below((points[i, 1] - low[1]) * cells_per_m[1], ny)
+        c, h = _cell_below((points[i, 2] - low[2]) * cells_per_m[2], nz)
+        p, q, r = F32(0), F32(0), F32(0)
+        for j in range(2):
+            for k in range(2):
+                side = (f if j else F32(1) - f) * (g if k else F32(1) - g)
+                one, other = normals[a + j, b + k, c], normals[a + j, b + k, c + 1]
+                p += side * (one[0] + h * (other[0] - one[0]))
+                q += side * (one[1] + h * (other[1] - one[1]))
+                r += side * (one[2] + h * (other[2] - one[2]))
         # in the body frame: Aᵀ normal, normalised
         u = cell_roots[slot, n, 3] * p + cell_roots[slot, n, 6] * q + cell_roots[slot, n, 9] * r
         v = (

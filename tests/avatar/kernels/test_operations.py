@@ -159,6 +159,26 @@ def test_compiled_normals_agree_with_their_meaning_and_lie_on_rays_that_see_some
     assert ours[0].any()
 
 
+def test_normals_turn_without_steps_from_cell_to_cell(generator):
+    """Light that changes at the borders of the volume's cells shows as patches on a hand."""
+    count = 2000
+    along = torch.linspace(0.0, 1.0, count)[:, None]
+    samples = packed([1] * count)._replace(
+        points=along * torch.tensor([1.0, 0.9, 0.8]),
+        root_rows=torch.zeros(count, dtype=torch.int32),
+    )
+    normals = torch.nn.functional.normalize(torch.rand(6, 5, 4, 3, generator=generator), dim=-1)
+    volume = NormalVolume(normals, torch.zeros(3), torch.tensor([6.0, 5.0, 4.0]))
+    warp = torch.cat([torch.zeros(3), torch.eye(3).flatten()])
+    cells = CorrespondenceTables(
+        torch.zeros(1, 1), warp[None, None], torch.zeros(1, 3), torch.zeros(1, 3), 0.03
+    )
+    opaque, slots = torch.full((count, 4), 9.0), torch.zeros(count, dtype=torch.int32)
+    found = operations.mean_normals(opaque, samples, 0.01, slots, cells, volume)
+    assert (found[0] - normals[0, 0, 0]).norm() < 1e-3
+    assert found.diff(dim=0).norm(dim=1).max() < 0.02  # from cell to cell it is up to 1.4
+
+
 def test_the_gradient_of_the_loss_is_exact_to_a_millionth_however_opaque_a_ray(generator):
     """Behind an opaque sample a gradient is nothing, not rounding times a large optical depth."""
     raw, samples, *rest = loss_case(generator, counts=(60, 90, 40, 1, 80))
