@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32, Int64
-from scipy.ndimage import binary_fill_holes, distance_transform_edt, maximum_filter, uniform_filter
+from scipy.ndimage import binary_fill_holes, distance_transform_edt, maximum_filter
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
@@ -86,8 +87,12 @@ class Rig:
     seed_normals: Float32[np.ndarray, "seeds 3"]
 
     @classmethod
+    @lru_cache(maxsize=1)
     def from_shaped_body(cls, shaped: ShapedBody) -> "Rig":
-        """The rig of a shaped body; its pose blend shapes are ignored, as in the paper's code."""
+        """The rig of a shaped body; its pose blend shapes are ignored, as in the paper's code.
+
+        The last one is kept: it takes a second, and kernels are loaded with it.
+        """
         rotations, body = canonical_rotations(), shaped.body
         transforms = body_from_rest(shaped.joints, body.parents, rotations)
         blended = np.einsum("vj,jab->vab", body.weights, transforms)
@@ -280,24 +285,30 @@ def skinning_weight_volume(
     far = np.ones(len(nodes), dtype=bool)
     weights = np.zeros((len(nodes), 24), dtype=np.float32)
     weights[:, 0] = 1.0
+    of_vertex = vertex_weights.astype(np.float32)
     for chunk in np.array_split(near, max(1, len(near) // 8192)):
         distance_m, index = tree.query(nodes[chunk], k=BLENDED_VERTICES, workers=-1)
         within, far[chunk] = distance_m[:, 0] < reach_m, distance_m[:, 0] > SMOOTHED_BEYOND_M
         share = 1.0 / np.maximum(distance_m[within], MIN_VERTEX_DISTANCE_M) ** 2
         share /= share.sum(axis=1, keepdims=True)
-        blended = np.einsum("nk,nkj->nj", share, vertex_weights[np.asarray(index)[within]])
-        weights[chunk[within]] = blended
+        mixed = share[:, None].astype(np.float32) @ of_vertex[np.asarray(index)[within]]
+        weights[chunk[within]] = mixed[:, 0]
     return _smooth_far_weights(weights.reshape(*shape, 24), far.reshape(*shape, 1))
 
 
 def _smooth_far_weights(
     weights: Float32[np.ndarray, "x y z 24"], far: Bool[np.ndarray, "x y z 1"]
 ) -> Float32[np.ndarray, "x y z 24"]:
+    mean = np.empty_like(weights)  # new memory costs more than the sums
+    rows = mean.reshape(len(mean), -1)
     for _ in range(SMOOTHING_PASSES):
-        mean = uniform_filter(weights, 3, axes=(0, 1, 2))
-        weights = np.where(far, mean, weights)
+        for part, smoothed in zip(weights, mean, strict=True):
+            cv2.blur(part, (3, 3), dst=smoothed, borderType=cv2.BORDER_REFLECT)
+        cv2.blur(rows, (1, 3), dst=rows, borderType=cv2.BORDER_REFLECT)
+        np.copyto(weights, mean, where=far)
     weights[weights < 1e-4] = 0.0
-    return np.ascontiguousarray(weights / weights.sum(axis=-1, keepdims=True), dtype=np.float32)
+    weights /= weights.sum(axis=-1, keepdims=True)
+    return weights
 
 
 def skin_distance_volume(
