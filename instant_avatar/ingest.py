@@ -3,6 +3,7 @@
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 from instant_avatar.cli.command_line import (
@@ -15,15 +16,17 @@ from instant_avatar.cli.command_line import (
     without_garbage_collection,
 )
 from instant_avatar.cli.console import Console
+from instant_avatar.cli.hardware import usable_cores
 from instant_avatar.cli.shared_options import open_recording
 from instant_avatar.run.ingest_arguments import PROGRAM, VIEW_PORT, IngestArguments
 from instant_avatar.run.run_folder import RunFolder
-from instant_avatar.run.start_up import preparing_to_train
-from preprocess.capture_inputs import InputKind
+from instant_avatar.run.start_up import can_fit_beside, fitting_beside, preparing_to_train
+from preprocess.capture_inputs import CaptureInputs, InputKind
 
 if TYPE_CHECKING:  # it imports torch
-    from capture.source import Frame
+    from capture.source import Frame, FrameSource
     from instant_avatar.run.session_events import EventReader
+    from preprocess.capture_session import Capture
     from preprocess.tracking.keypoints import PersonKeypoints
 
 
@@ -47,29 +50,37 @@ def ingest(
     require_packages("torch", "numba", "onnx", *solver)
     arguments.validate()
     inputs = arguments.capture_inputs()
-    if not inputs.is_live:
-        open_recording(inputs, console)  # before code is loaded that takes a second
-    with without_garbage_collection():
-        from instant_avatar.run.run_capture import open_observations, write_solved_cameras
-
+    if inputs.kind is InputKind.POSED:
+        inputs.find_paths()  # refuse a wrong one before code is loaded
+    source = None if inputs.is_live else open_recording(inputs, console)
     run, read = arguments.run_folder(), inputs.input_paths()
     run.check_usable(read, resume=arguments.resume, overwrite=arguments.overwrite)
     with (
         run.claim(console, resume=arguments.resume, overwrite=arguments.overwrite),
-        preparing_to_train(console) as wait,
+        ExitStack() as cleanup,
     ):
+        fit = None
+        if source is not None and _may_fit_beside(arguments, inputs, source):
+            fit = cleanup.enter_context(fitting_beside(inputs, arguments.longer_side_px(source)))
+        wait = cleanup.enter_context(preparing_to_train(console))
+        with without_garbage_collection():
+            from instant_avatar.run.run_capture import open_observations, write_solved_cameras
+
         command = arguments.as_json()
         threads = None
         if inputs.kind is InputKind.STREAMED:  # its frames come as soon as it is open
             threads = _load_trainer_code(arguments, run, console, wait)
 
-        def show_tracked(frame: "Frame", person: "PersonKeypoints | None") -> None:
-            from instant_avatar.run.session_events import Tracked
+        def prepare(capture: "Capture") -> None:
+            nonlocal threads
+            threads = _load_trainer_code(arguments, run, console, wait)
+            _load_kernels(capture, run, console)
 
-            for reader in readers:
-                reader(Tracked(frame=frame, person=person))
-
-        observations, before_fit = open_observations(arguments, inputs, run, console, show_tracked)
+        beside = {} if fit is None else {"fit": fit, "prepare": prepare}
+        observations, before_fit = open_observations(
+            arguments, inputs, run, console,
+            lambda frame, person: _show_tracked(frame, person, readers), **beside,
+        )  # fmt: skip
         threads = threads or _load_trainer_code(arguments, run, console, wait)
         from instant_avatar.report.report_writer import ReportWriter
         from instant_avatar.run.session_start import run_session
@@ -87,6 +98,15 @@ def ingest(
         return INTERRUPTED if is_interrupted else code
 
 
+def _may_fit_beside(
+    arguments: IngestArguments, inputs: CaptureInputs, source: "FrameSource"
+) -> bool:
+    """Whether to fit a recording in another process: on a second core, and not fitted before."""
+    cores = min(arguments.threads or usable_cores(), usable_cores())
+    is_new = arguments.refine_poses and not arguments.resume
+    return cores > 1 and is_new and can_fit_beside(inputs, source)
+
+
 def _load_trainer_code(
     arguments: IngestArguments, run: RunFolder, console: Console, wait: Callable[[], None]
 ) -> int:
@@ -98,6 +118,23 @@ def _load_trainer_code(
             from instant_avatar.run.session_start import set_threads
 
             return set_threads(arguments.threads)
+
+
+def _load_kernels(capture: "Capture", run: RunFolder, console: Console) -> None:
+    """Load the kernels, or compile them, while another process fits the capture."""
+    from instant_avatar.run.session_start import warm_up_for
+
+    with exit_on_interrupt(console, PROGRAM, run.release):
+        warm_up_for(capture, console)
+
+
+def _show_tracked(
+    frame: "Frame", person: "PersonKeypoints | None", readers: Sequence["EventReader"]
+) -> None:
+    from instant_avatar.run.session_events import Tracked
+
+    for reader in readers:
+        reader(Tracked(frame=frame, person=person))
 
 
 if __name__ == "__main__":

@@ -6,7 +6,12 @@ from functools import cached_property
 from pathlib import Path
 
 from capture.live_sources import IDLE_TIMEOUT_S, camera_address
-from preprocess.capture_paths import find_own_poses, find_parts
+from preprocess.capture_paths import (
+    CapturePaths,
+    find_capture_paths,
+    find_own_poses,
+    find_parts,
+)
 from preprocess.plugins import segmenter_name
 
 MIN_HEIGHT_CM, MAX_HEIGHT_CM = 40.0, 260.0
@@ -82,6 +87,11 @@ class CaptureInputs:
         if self.poses or find_own_poses(self.video) or not self.video.exists():
             return InputKind.POSED
         return InputKind.STREAMED if self.realtime else InputKind.UNTRACKED
+
+    def find_paths(self) -> CapturePaths:
+        """The parts of a recording with poses; an InputError if one is missing."""
+        named = self.masks if segmenter_name(self.masks) is None else None
+        return find_capture_paths(self.video, self.poses, named, self.cameras)
 
     def input_paths(self) -> list[Path]:
         """Paths that no output may touch: those that were named, and those that may be found."""

@@ -24,7 +24,6 @@ from preprocess.cameras.camera_file import (
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.capture_paths import (
     CapturePaths,
-    find_capture_paths,
     find_own_masks,
     find_own_poses,
     find_stream_cameras,
@@ -116,8 +115,7 @@ def read_capture(inputs: CaptureInputs) -> ImportedCapture:
     Raises:
         InputError: If a part is missing or unreadable.
     """
-    named_masks = inputs.masks if segmenter_name(inputs.masks) is None else None
-    paths = find_capture_paths(inputs.video, inputs.poses, named_masks, inputs.cameras)
+    paths = inputs.find_paths()
     source = open_source(paths.video, frames=inputs.frames, rotate=inputs.rotate)
     body = load_body_model(inputs.body)
     motion = read_poses(paths.poses, person=inputs.person)

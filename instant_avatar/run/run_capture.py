@@ -1,9 +1,9 @@
 """The capture of a run: read, tracked or streamed, aligned, in the world of its cameras, fitted."""
 
 import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 
 from capture.atomic_files import atomic_file
@@ -31,7 +31,7 @@ from preprocess.open_capture import (
 from preprocess.plugins import DEFAULT_TRACKER, make_tracker
 from preprocess.poses.pose_file import write_motion
 from preprocess.sfm.capture_solving import apply_camera_solution, solve_capture_cameras
-from preprocess.tracking.first_look import look_at
+from preprocess.tracking.first_look import FirstLook, look_at
 from preprocess.tracking.keypoints import PersonKeypoints
 
 
@@ -41,10 +41,16 @@ def open_observations(
     run: RunFolder,
     console: Console,
     on_tracked: Callable[[Frame, PersonKeypoints | None], object] = lambda *_: None,
+    *,
+    fit: Callable[[Capture], CaptureFit | None] = fit_capture,
+    prepare: Callable[[Capture], object] = lambda _: None,
 ) -> tuple[ObservationSource, Capture]:
     """Open what a run learns from, whatever the input is.
 
-    `on_tracked` receives each frame of a stream that was searched, and the person in it.
+    Args:
+        on_tracked: Receives each frame of a stream that was searched, and the person in it.
+        fit: Fits a recording with poses that no run has fitted before.
+        prepare: Called with it just before that; what it shows first is looked at meanwhile.
 
     Returns:
         The observations, and their capture before it was fitted to the masks.
@@ -59,35 +65,48 @@ def open_observations(
         imported = import_tracked(arguments, inputs, run, console)
     else:
         imported = read_capture(inputs)
-    fit = None
-    with ThreadPoolExecutor(1) as executor:  # the first look is taken beside opening
-        looks = inputs.kind is InputKind.POSED and not resumes
-        look = executor.submit(look_at, imported.source) if looks else None
-        try:
-            with console.status("opening video and poses"):
-                size_px = arguments.longer_side_px(imported.source)
+    earlier = None
+    with ThreadPoolExecutor(1) as executor, ExitStack() as cleanup:
+        if inputs.kind is InputKind.POSED and not resumes:  # what was tracked here has its grade
+            look = executor.submit(look_at, imported.source)
+            cleanup.callback(_print_look, look, inputs, console)  # also before a refusal
+        with console.status("opening video and poses"):
+            size_px = arguments.longer_side_px(imported.source)
+            with _hinting(imported):
                 if resumes:
-                    capture, fit = _align_as_trained(imported, run, size_px)
+                    capture, earlier = _align_as_trained(imported, run, size_px)
                 else:
                     capture = align_capture(imported, size_px=size_px)
-        except InputError as error:
-            hint = correction_hint(imported)
-            if not hint:
-                raise
-            raise InputError(f"{error} {hint}") from error
-        finally:
-            if look is not None:
-                with suppress(InputError, OSError, ValueError):  # damaged: reading names it
-                    print_first_look(look.result(), inputs, console, tracks=False)
-    _describe(capture, console)
-    if not resumes and inputs.kind is InputKind.POSED:  # what was tracked here has its grade
-        preflight_check(capture, imported.inputs, console, force=arguments.force)
+        _describe(capture, console)
+        if not resumes and inputs.kind is InputKind.POSED:
+            preflight_check(capture, imported.inputs, console, force=arguments.force)
+            prepare(capture)
     if inputs.cameras == "solve":
         capture = _solve_cameras(arguments, capture, console)
     fitted = capture
     if arguments.refine_poses and not capture.motion.is_fitted:
-        fitted = _fit_to_masks(capture, fit, inputs, console, fit_body=not resumes)
+        if earlier is None:
+            with console.status("fitting body and poses to the masks"):
+                earlier = fit_capture(capture, fit_body=False) if resumes else fit(capture)
+        fitted = _apply_fit(capture, earlier, inputs, console)
     return RecordedObservations(fitted, realtime=inputs.realtime), capture
+
+
+def _print_look(look: Future[FirstLook], inputs: CaptureInputs, console: Console) -> None:
+    with suppress(InputError, OSError, ValueError):  # damaged: reading names it
+        print_first_look(look.result(), inputs, console, tracks=False)
+
+
+@contextmanager
+def _hinting(imported: ImportedCapture) -> Iterator[None]:
+    """Let an error of alignment say what would correct it, if that is known."""
+    try:
+        yield
+    except InputError as error:
+        hint = correction_hint(imported)
+        if not hint:
+            raise
+        raise InputError(f"{error} {hint}") from error
 
 
 def open_as_trained(imported: ImportedCapture, run: RunFolder, size_px: int) -> Capture:
@@ -146,18 +165,10 @@ def _solve_cameras(arguments: IngestArguments, capture: Capture, console: Consol
     return placed
 
 
-def _fit_to_masks(
-    capture: Capture,
-    fit: CaptureFit | None,
-    inputs: CaptureInputs,
-    console: Console,
-    *,
-    fit_body: bool,
+def _apply_fit(
+    capture: Capture, fit: CaptureFit | None, inputs: CaptureInputs, console: Console
 ) -> Capture:
-    """Fit body, poses and focal length to the masks, or repeat a fit."""
-    if fit is None:
-        with console.status("fitting body and poses to the masks"):
-            fit = fit_capture(capture, fit_body=fit_body)
+    """Make the changes of a fit, if there is one, and describe them."""
     if fit is None:
         return capture
     fitted = apply_fit(capture, fit, height_m=inputs.height_m)

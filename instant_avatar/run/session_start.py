@@ -1,5 +1,6 @@
 """Start of a training session: threads, kernels, a new, resumed or extended trainer, the viewer."""
 
+import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
@@ -78,12 +79,27 @@ def prepare_trainer(
         if arguments.resume:
             console.info(f"No checkpoint in {run.path}; starting a new run.")
         prepared = _new_run(arguments, capture)
-    with console.status("compiling kernels (slow on the first run only)"):
-        train.warm_up(prepared.trainer)
-        proxy_surface.warm_up()
+    _warm_up(prepared.trainer, console)
     _announce_coverage(capture, console)
     _announce_duration(arguments, prepared.trainer, console)
     return prepared
+
+
+def warm_up_for(capture: Capture, console: Console) -> None:
+    """Load the kernels on one core, while another process fits the capture's person."""
+    threads = numba.get_num_threads()
+    numba.set_num_threads(1)
+    _warm_up(Trainer(Rig.from_shaped_body(capture.shaped), TrainConfig()), console)
+    numba.set_num_threads(threads)
+
+
+def _warm_up(trainer: Trainer, console: Console) -> None:
+    """Compile the kernels, or load them; a second time on one thread nothing is done or shown."""
+    if threading.get_ident() in train.WARM_THREADS:
+        return
+    with console.status("compiling kernels (slow on the first run only)"):
+        train.warm_up(trainer)
+        proxy_surface.warm_up()
 
 
 def run_session(

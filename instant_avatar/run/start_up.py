@@ -1,17 +1,34 @@
-"""Start-up: libraries are loaded on a thread, and a first run's kernels compiled in a process."""
+"""Start-up: what a training needs is prepared on a thread and in two other processes.
 
+Python runs the code of one process on one core at a time. So torch is loaded on a thread, which
+waits while files are read; a first run's kernels are compiled in a process of their own; and body
+and poses are fitted to given masks in another one, which opens the same recording again, and sends
+back the fit and what the masks' refinement has learnt from the frames.
+"""
+
+import pickle
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from capture.source import FrameSource
 from instant_avatar.cli.command_line import without_garbage_collection
 from instant_avatar.cli.console import Console
+from preprocess.capture_inputs import CaptureInputs, InputKind
+from preprocess.capture_paths import find_own_masks
+from preprocess.plugins import segmenter_name
+
+if TYPE_CHECKING:  # it imports scipy
+    from preprocess.capture_session import Capture
+    from preprocess.fitting.capture_fit import CaptureFit
 
 COMPILE = "from instant_avatar.run.start_up import warm_up; warm_up()"
 """Program of the process that compiles."""
+FIT = "from instant_avatar.run.start_up import fit_for_parent; fit_for_parent()"
+"""Program of the process that fits."""
 
 
 @contextmanager
@@ -70,3 +87,57 @@ def warm_up() -> None:
     rig = Rig.from_shaped_body(load_body_model(None).with_shape())
     train.warm_up(Trainer(rig, TrainConfig()))
     proxy_surface.warm_up()
+
+
+def can_fit_beside(inputs: CaptureInputs, source: FrameSource) -> bool:
+    """Whether a recording can be fitted without this process: its poses and masks are given."""
+    if inputs.kind is not InputKind.POSED or inputs.cameras == "solve":
+        return False
+    if inputs.masks is not None:
+        return segmenter_name(inputs.masks) is None
+    return source.has_alpha or find_own_masks(inputs.video, inputs.poses) is not None
+
+
+@contextmanager
+def fitting_beside(
+    inputs: CaptureInputs, size_px: int
+) -> Iterator[Callable[["Capture"], "CaptureFit | None"]]:
+    """Fit a recording in another process, which ends with this block at the latest.
+
+    `size_px` is the longer side of the training images. Yields a function that waits for the fit,
+    and lets the masks of an equal capture know what those of the other process have learnt.
+    """
+    command, pipe = [sys.executable, "-c", FIT], subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL) as process:
+        there, back = process.stdin, process.stdout
+        assert there is not None
+        assert back is not None
+
+        def wait(capture: "Capture") -> "CaptureFit | None":
+            from preprocess.fitting.capture_fitting import fit_capture
+            from preprocess.masks.mask_sources import GivenMasks
+
+            sent = back.read()
+            if process.wait() or not isinstance(capture.masks, GivenMasks):
+                return fit_capture(capture)  # which says what is wrong
+            fit, capture.masks.refine = pickle.loads(sent)
+            return fit
+
+        try:
+            with suppress(OSError), there:  # it may have ended
+                there.write(pickle.dumps((inputs, size_px)))
+            yield wait
+        finally:
+            process.kill()
+
+
+def fit_for_parent() -> None:
+    """Fit the recording that standard input describes, and write the fit to standard output."""
+    inputs, size_px = pickle.load(sys.stdin.buffer)
+    from preprocess.fitting.capture_fitting import fit_capture
+    from preprocess.masks.mask_sources import GivenMasks
+    from preprocess.open_capture import open_capture
+
+    capture = open_capture(inputs, size_px=size_px)
+    assert isinstance(capture.masks, GivenMasks)
+    sys.stdout.buffer.write(pickle.dumps((fit_capture(capture), capture.masks.refine)))

@@ -72,34 +72,38 @@ class MaskSource:
 
 
 class GivenMasks(MaskSource):
-    """Masks that are read, and refined where the images show that they need it."""
+    """Masks that are read, and refined where the images show that they need it.
+
+    Attributes:
+        refine: Refines them, by what it has learnt from the frames that were seen.
+    """
 
     is_given = True
 
     def __init__(self, origin: str, refine: GivenMaskRefiner) -> None:
         """Read nothing yet."""
-        self.origin, self._refine = origin, refine
+        self.origin, self.refine = origin, refine
 
     @property
     def needs_all_frames(self) -> bool:
         """Return whether they may be refined."""
-        return not self._refine.keeps_given_masks
+        return not self.refine.keeps_given_masks
 
     @property
     def is_refined(self) -> bool:
         """Return whether they are refined, by the frames that were seen."""
-        return self._refine.is_needed
+        return self.refine.is_needed
 
     def alpha(self, frame: Frame, scaled: Frame, pose: BodyPose, camera: Camera) -> AlphaMask:
         """Read the mask of a frame, and refine it if that is needed."""
-        if self._refine.keeps_given_masks:
+        if self.refine.keeps_given_masks:
             return self._of_frame(frame, scaled.size_px)
-        return self._refine(frame.rgb, self._of_frame(frame, frame.size_px), scaled.size_px)
+        return self.refine(frame.rgb, self._of_frame(frame, frame.size_px), scaled.size_px)
 
     def notes(self) -> Iterator[str]:
         """Say that they were refined."""
-        if self._refine.note is not None:
-            yield self._refine.note
+        if self.refine.note is not None:
+            yield self.refine.note
 
     def _of_frame(self, frame: Frame, size_px: tuple[int, int]) -> AlphaMask:
         return self.read(frame.index, size_px)
@@ -138,7 +142,7 @@ class StoredMasks(GivenMasks):
 
     def in_order_at_worst(self) -> "StoredMasks":
         """These masks, taken in order if there are more or fewer of them than frames."""
-        masks = StoredMasks(self.files, self._source, self._refine)
+        masks = StoredMasks(self.files, self._source, self.refine)
         try:
             masks.check()
         except InputError:

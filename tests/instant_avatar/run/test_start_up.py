@@ -1,17 +1,26 @@
-"""What is prepared beside the opening of a capture: torch is loaded, missing kernels compiled."""
+"""What is prepared beside the opening of a capture: torch, missing kernels, the fit to masks."""
 
 import subprocess
 import sys
 import time
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
+from capture.source_opening import open_source
 from export.bake import proxy_surface
 from instant_avatar.cli.console import Console
 from instant_avatar.run import start_up
+from instant_avatar.run.start_up import can_fit_beside, fitting_beside
+from preprocess.capture_inputs import CaptureInputs
+from preprocess.fitting.capture_fitting import fit_capture
+from preprocess.open_capture import open_capture
 
 RUNS_LONG = "import time; time.sleep(600)"
+SIZE_PX = 64
 
 
 @pytest.fixture
@@ -57,3 +66,52 @@ def test_waiting_ends_once_the_kernels_are_compiled(started, monkeypatch):
     with start_up.preparing_to_train(Console()) as wait:
         wait()
         assert [process.poll() for process in started] == [0]
+
+
+@pytest.fixture
+def inputs(film):
+    return CaptureInputs(video=film)
+
+
+def equal_captures(inputs):
+    return [open_capture(inputs, size_px=SIZE_PX) for _ in range(2)]
+
+
+def assert_same_fit(one, other):
+    for name, value in vars(one).items():
+        np.testing.assert_array_equal(value, getattr(other, name))
+
+
+def test_another_process_fits_and_remembers_what_this_one_would(inputs):
+    here, there = equal_captures(inputs)
+    with fitting_beside(inputs, SIZE_PX) as wait:
+        found = wait(there)
+    assert_same_fit(found, fit_capture(here))
+    assert not there.masks.needs_all_frames  # it has compared borders, as the other one
+    assert there.masks.refine._ratios == here.masks.refine._ratios
+
+
+def test_a_process_that_fails_is_done_without(inputs, monkeypatch):
+    monkeypatch.setattr(start_up, "FIT", "raise SystemExit(1)")
+    here, there = equal_captures(inputs)
+    with fitting_beside(inputs, SIZE_PX) as wait:
+        assert_same_fit(wait(there), fit_capture(here))
+
+
+def test_the_process_ends_with_the_block(inputs, started, monkeypatch):
+    monkeypatch.setattr(start_up, "FIT", RUNS_LONG)
+    with fitting_beside(inputs, SIZE_PX):
+        assert started[0].poll() is None
+    assert started[0].poll() is not None
+
+
+def test_only_given_poses_and_masks_are_fitted_elsewhere(film, inputs, tmp_path):
+    source = open_source(film)
+    assert can_fit_beside(inputs, source)
+    (tmp_path / "alone.mp4").write_bytes((film / "video.mp4").read_bytes())
+    alone = CaptureInputs(video=tmp_path / "alone.mp4")
+    assert not can_fit_beside(alone, source)
+    assert not can_fit_beside(replace(alone, poses=film / "truth" / "poses.npz"), source)
+    assert can_fit_beside(replace(alone, poses=film / "poses.npz"), source)  # masks lie there
+    assert not can_fit_beside(replace(inputs, masks=Path("segmenter:blazepose")), source)
+    assert not can_fit_beside(replace(inputs, cameras="solve"), source)
