@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import NamedTuple
 
 import cv2
@@ -87,11 +87,10 @@ class Rig:
     seed_normals: Float32[np.ndarray, "seeds 3"]
 
     @classmethod
-    @lru_cache(maxsize=1)
-    def from_shaped_body(cls, shaped: ShapedBody) -> "Rig":
+    def from_shaped_body(cls, shaped: ShapedBody, *, coarseness: float = 1.0) -> "Rig":
         """The rig of a shaped body; its pose blend shapes are ignored, as in the paper's code.
 
-        The last one is kept: it takes a second, and kernels are loaded with it.
+        Its cells are `coarseness` times as wide as those that are trained with.
         """
         rotations, body = canonical_rotations(), shaped.body
         transforms = body_from_rest(shaped.joints, body.parents, rotations)
@@ -104,7 +103,7 @@ class Rig:
         vertices, normals, weights = vertices[outer], normals[outer], body.weights[outer]
         seeds = _seed_vertices(vertices, weights)
         distance, inside = skin_distance_volume(
-            vertices, normals, low, high, DISTANCE_CELL_M, BOX_MARGIN_M + 0.02
+            vertices, normals, low, high, coarseness * DISTANCE_CELL_M, BOX_MARGIN_M + 0.02
         )
         return cls(
             rest_joints=shaped.joints,
@@ -113,7 +112,7 @@ class Rig:
             box_low=low,
             box_high=high,
             weights=skinning_weight_volume(
-                vertices, weights, low, high, SKINNING_CELL_M, BOX_MARGIN_M + 0.05
+                vertices, weights, low, high, coarseness * SKINNING_CELL_M, BOX_MARGIN_M + 0.05
             ),
             skin_distance=distance,
             inside_skin=inside,

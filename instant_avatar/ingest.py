@@ -3,6 +3,7 @@
 import sys
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
@@ -20,7 +21,12 @@ from instant_avatar.cli.hardware import usable_cores
 from instant_avatar.cli.shared_options import open_recording
 from instant_avatar.run.ingest_arguments import PROGRAM, VIEW_PORT, IngestArguments
 from instant_avatar.run.run_folder import RunFolder
-from instant_avatar.run.start_up import can_fit_beside, fitting_beside, preparing_to_train
+from instant_avatar.run.start_up import (
+    FitProcess,
+    can_fit_beside,
+    fitting_beside,
+    preparing_to_train,
+)
 from preprocess.capture_inputs import CaptureInputs, InputKind
 
 if TYPE_CHECKING:  # it imports torch
@@ -59,9 +65,7 @@ def ingest(
         run.claim(console, resume=arguments.resume, overwrite=arguments.overwrite),
         ExitStack() as cleanup,
     ):
-        fit = None
-        if source is not None and _may_fit_beside(arguments, inputs, source):
-            fit = cleanup.enter_context(fitting_beside(inputs, arguments.longer_side_px(source)))
+        fitting = _fit_beside(arguments, inputs, source, cleanup)
         wait = cleanup.enter_context(preparing_to_train(console))
         with without_garbage_collection():
             from instant_avatar.run.run_capture import open_observations, write_solved_cameras
@@ -76,10 +80,11 @@ def ingest(
             threads = _load_trainer_code(arguments, run, console, wait)
             _load_kernels(capture, run, console)
 
-        beside = {} if fit is None else {"fit": fit, "prepare": prepare}
+        beside = {} if fitting is None else {"fit": fitting.fit, "prepare": prepare}
         observations, before_fit = open_observations(
             arguments, inputs, run, console,
-            lambda frame, person: _show_tracked(frame, person, readers), **beside,
+            lambda frame, person: _show_tracked(frame, person, readers),
+            background=cleanup.enter_context(ThreadPoolExecutor(1)), **beside,
         )  # fmt: skip
         threads = threads or _load_trainer_code(arguments, run, console, wait)
         from instant_avatar.report.report_writer import ReportWriter
@@ -93,18 +98,25 @@ def ingest(
         is_interrupted = run_session(
             arguments, observations, run, console, [*readers, report],  # its page takes seconds
             on_start=lambda: write_solved_cameras(before_fit, run, console),
+            rig=None if fitting is None else fitting.rig,
         )  # fmt: skip
         code = report.exit_code()
         return INTERRUPTED if is_interrupted else code
 
 
-def _may_fit_beside(
-    arguments: IngestArguments, inputs: CaptureInputs, source: "FrameSource"
-) -> bool:
-    """Whether to fit a recording in another process: on a second core, and not fitted before."""
+def _fit_beside(
+    arguments: IngestArguments,
+    inputs: CaptureInputs,
+    source: "FrameSource | None",
+    cleanup: ExitStack,
+) -> FitProcess | None:
+    """Begin to fit a recording in another process, if there is a second core and nothing kept."""
     cores = min(arguments.threads or usable_cores(), usable_cores())
-    is_new = arguments.refine_poses and not arguments.resume
-    return cores > 1 and is_new and can_fit_beside(inputs, source)
+    if cores < 2 or arguments.resume or not arguments.refine_poses:
+        return None
+    if source is None or not can_fit_beside(inputs, source):
+        return None
+    return cleanup.enter_context(fitting_beside(inputs, arguments.longer_side_px(source)))
 
 
 def _load_trainer_code(

@@ -38,10 +38,11 @@ def one_actor_and_rig_per_body():
     """The same actor in every shoot and the same rig for equal bodies: each takes a second."""
     make_rig, rigs = Rig.from_shaped_body, {}
 
-    def rig_of(shaped: ShapedBody) -> Rig:
-        key = shaped.vertices.tobytes(), shaped.joints.tobytes(), shaped.body.weights.tobytes()
+    def rig_of(shaped: ShapedBody, *, coarseness: float = 1.0) -> Rig:
+        arrays = shaped.vertices, shaped.joints, shaped.body.weights
+        key = coarseness, *(array.tobytes() for array in arrays)
         if key not in rigs:
-            rigs[key] = make_rig(shaped)
+            rigs[key] = make_rig(shaped, coarseness=coarseness)
         return rigs[key]
 
     with pytest.MonkeyPatch.context() as patch:

@@ -2,13 +2,13 @@
 
 import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from concurrent.futures import Executor
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 
 from capture.atomic_files import atomic_file
 from capture.input_error import InputError
-from capture.source import Frame
+from capture.source import Frame, FrameSource
 from instant_avatar.capture_validation import correction_hint, preflight_check
 from instant_avatar.cli.console import Console
 from instant_avatar.run.ingest_arguments import IngestArguments
@@ -31,7 +31,7 @@ from preprocess.open_capture import (
 from preprocess.plugins import DEFAULT_TRACKER, make_tracker
 from preprocess.poses.pose_file import write_motion
 from preprocess.sfm.capture_solving import apply_camera_solution, solve_capture_cameras
-from preprocess.tracking.first_look import FirstLook, look_at
+from preprocess.tracking.first_look import look_at
 from preprocess.tracking.keypoints import PersonKeypoints
 
 
@@ -44,13 +44,16 @@ def open_observations(
     *,
     fit: Callable[[Capture], CaptureFit | None] = fit_capture,
     prepare: Callable[[Capture], object] = lambda _: None,
+    background: Executor | None = None,
 ) -> tuple[ObservationSource, Capture]:
     """Open what a run learns from, whatever the input is.
 
     Args:
         on_tracked: Receives each frame of a stream that was searched, and the person in it.
         fit: Fits a recording with poses that no run has fitted before.
-        prepare: Called with it just before that; what it shows first is looked at meanwhile.
+        prepare: Called with it just before that.
+        background: Where a first look at a recording with poses is taken, and printed; without it
+            none is.
 
     Returns:
         The observations, and their capture before it was fitted to the masks.
@@ -66,21 +69,19 @@ def open_observations(
     else:
         imported = read_capture(inputs)
     earlier = None
-    with ThreadPoolExecutor(1) as executor, ExitStack() as cleanup:
-        if inputs.kind is InputKind.POSED and not resumes:  # what was tracked here has its grade
-            look = executor.submit(look_at, imported.source)
-            cleanup.callback(_print_look, look, inputs, console)  # also before a refusal
-        with console.status("opening video and poses"):
-            size_px = arguments.longer_side_px(imported.source)
-            with _hinting(imported):
-                if resumes:
-                    capture, earlier = _align_as_trained(imported, run, size_px)
-                else:
-                    capture = align_capture(imported, size_px=size_px)
-        _describe(capture, console)
-        if not resumes and inputs.kind is InputKind.POSED:
-            preflight_check(capture, imported.inputs, console, force=arguments.force)
-            prepare(capture)
+    is_new = inputs.kind is InputKind.POSED and not resumes  # what was tracked here has its grade
+    if is_new and background is not None:
+        background.submit(_take_first_look, imported.source, inputs, console)
+    with console.status("opening video and poses"), _hinting(imported):
+        size_px = arguments.longer_side_px(imported.source)
+        if resumes:
+            capture, earlier = _align_as_trained(imported, run, size_px)
+        else:
+            capture = align_capture(imported, size_px=size_px)
+    _describe(capture, console)
+    if is_new:
+        preflight_check(capture, imported.inputs, console, force=arguments.force)
+        prepare(capture)
     if inputs.cameras == "solve":
         capture = _solve_cameras(arguments, capture, console)
     fitted = capture
@@ -92,9 +93,9 @@ def open_observations(
     return RecordedObservations(fitted, realtime=inputs.realtime), capture
 
 
-def _print_look(look: Future[FirstLook], inputs: CaptureInputs, console: Console) -> None:
+def _take_first_look(source: FrameSource, inputs: CaptureInputs, console: Console) -> None:
     with suppress(InputError, OSError, ValueError):  # damaged: reading names it
-        print_first_look(look.result(), inputs, console, tracks=False)
+        print_first_look(look_at(source), inputs, console, tracks=False)
 
 
 @contextmanager

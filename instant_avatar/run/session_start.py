@@ -51,6 +51,8 @@ if TYPE_CHECKING:  # viser is an optional extra
 
 EXPECTED_POSES = 60
 """Poses, evenly spread, that tell what a film will show of the person."""
+WARM_UP_COARSENESS = 3.0
+"""Width of the cells of the rig that kernels are loaded for, in those of one for training."""
 JOINT_TOLERANCE_M = 1e-3
 """Largest difference of rest joints within one body, meters; more is another body."""
 
@@ -70,15 +72,22 @@ class PreparedTrainer:
 
 
 def prepare_trainer(
-    arguments: IngestArguments, capture: Capture, run: RunFolder, console: Console
+    arguments: IngestArguments,
+    capture: Capture,
+    run: RunFolder,
+    console: Console,
+    rig: Rig | None = None,
 ) -> PreparedTrainer:
-    """Build a new trainer, or load the run's checkpoint to resume it or to add a video."""
+    """Build a new trainer, or load the run's checkpoint to resume it or to add a video.
+
+    `rig` is that of the capture's person, if it is there.
+    """
     if arguments.resume and run.has_checkpoint():
         prepared = _load_trainer(arguments, capture, run, console)
     else:
         if arguments.resume:
             console.info(f"No checkpoint in {run.path}; starting a new run.")
-        prepared = _new_run(arguments, capture)
+        prepared = _new_run(arguments, capture, rig)
     _warm_up(prepared.trainer, console)
     _announce_coverage(capture, console)
     _announce_duration(arguments, prepared.trainer, console)
@@ -89,7 +98,8 @@ def warm_up_for(capture: Capture, console: Console) -> None:
     """Load the kernels on one core, while another process fits the capture's person."""
     threads = numba.get_num_threads()
     numba.set_num_threads(1)
-    _warm_up(Trainer(Rig.from_shaped_body(capture.shaped), TrainConfig()), console)
+    rig = Rig.from_shaped_body(capture.shaped, coarseness=WARM_UP_COARSENESS)
+    _warm_up(Trainer(rig, TrainConfig()), console)
     numba.set_num_threads(threads)
 
 
@@ -110,15 +120,17 @@ def run_session(
     readers: Sequence[EventReader],
     *,
     on_start: Callable[[], object] = lambda: None,
+    rig: Rig | None = None,
 ) -> bool:
     """Prepare trainer and viewer, and run a session to its end; console and `readers` read it.
 
-    `on_start` is called once an older run has been removed. Ctrl-C asks the session to stop. A
-    viewer stays open until Ctrl-C. Returns whether Ctrl-C was pressed, even as the page was drawn.
+    `rig` is that of the capture's person, if it is there. `on_start` is called once an older run
+    has been removed. Ctrl-C asks the session to stop. A viewer stays open until Ctrl-C. Returns
+    whether Ctrl-C was pressed, even as the page was drawn.
     """
     capture = observations.capture
     with exit_on_interrupt(console, PROGRAM, run.release):
-        start = prepare_trainer(arguments, capture, run, console)
+        start = prepare_trainer(arguments, capture, run, console, rig)
         viewer = _open_viewer(arguments, capture, run, console)
     run.start_run(resume=arguments.resume)
     if capture.figures("tracking") is None and not arguments.resume:
@@ -177,6 +189,7 @@ def new_trainer(
     seed: int,
     refine_poses: bool,
     hold_every: int = HELD_OUT_STRIDE,
+    rig: Rig | None = None,
 ) -> Trainer:
     """Build an untrained trainer for the person, the training budget and the image size."""
     config = TrainConfig.for_budget(
@@ -189,10 +202,10 @@ def new_trainer(
         seed=seed,
     )
     config = replace(config, refine_poses=refine_poses)
-    return Trainer(Rig.from_shaped_body(capture.shaped), config)
+    return Trainer(rig or Rig.from_shaped_body(capture.shaped), config)
 
 
-def _new_run(arguments: IngestArguments, capture: Capture) -> PreparedTrainer:
+def _new_run(arguments: IngestArguments, capture: Capture, rig: Rig | None) -> PreparedTrainer:
     trainer = new_trainer(
         capture,
         seconds=arguments.training_seconds(capture.source),
@@ -200,6 +213,7 @@ def _new_run(arguments: IngestArguments, capture: Capture) -> PreparedTrainer:
         seed=arguments.seed,
         refine_poses=arguments.refine_poses,
         hold_every=arguments.hold_out,
+        rig=rig,
     )
     notes = {
         "video": capture.identity,

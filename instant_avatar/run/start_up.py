@@ -3,25 +3,26 @@
 Python runs the code of one process on one core at a time. So torch is loaded on a thread, which
 waits while files are read; a first run's kernels are compiled in a process of their own; and body
 and poses are fitted to given masks in another one, which opens the same recording again, and sends
-back the fit and what the masks' refinement has learnt from the frames.
+back the fit, the person's rig, and what the masks' refinement has learnt from the frames.
 """
 
+import gc
 import pickle
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, final
 
 from capture.source import FrameSource
-from instant_avatar.cli.command_line import without_garbage_collection
-from instant_avatar.cli.console import Console
 from preprocess.capture_inputs import CaptureInputs, InputKind
 from preprocess.capture_paths import find_own_masks
 from preprocess.plugins import segmenter_name
 
-if TYPE_CHECKING:  # it imports scipy
+if TYPE_CHECKING:  # the process that fits needs no console, and scipy only once it has begun
+    from avatar.rig import Rig
+    from instant_avatar.cli.console import Console
     from preprocess.capture_session import Capture
     from preprocess.fitting.capture_fit import CaptureFit
 
@@ -32,12 +33,14 @@ FIT = "from instant_avatar.run.start_up import fit_for_parent; fit_for_parent()"
 
 
 @contextmanager
-def preparing_to_train(console: Console) -> Iterator[Callable[[], None]]:
+def preparing_to_train(console: "Console") -> Iterator[Callable[[], None]]:
     """Load torch and numba and compile kernels beside this block; yield a function that waits.
 
     numba compiles in one thread, and holds the interpreter: another process compiles while the
     capture is opened, tracked and fitted. It ends with this block.
     """
+    from instant_avatar.cli.command_line import without_garbage_collection
+
     compilers: list[subprocess.Popen[bytes]] = []
     has_ended = threading.Event()
 
@@ -98,46 +101,61 @@ def can_fit_beside(inputs: CaptureInputs, source: FrameSource) -> bool:
     return source.has_alpha or find_own_masks(inputs.video, inputs.poses) is not None
 
 
+@final
+class FitProcess:
+    """A process that fits a recording.
+
+    Attributes:
+        rig: The fitted person's, if the process has made it.
+    """
+
+    def __init__(self, process: "subprocess.Popen[bytes]") -> None:
+        """Wait for nothing yet."""
+        self._process = process
+        self.rig: Rig | None = None
+
+    def fit(self, capture: "Capture") -> "CaptureFit | None":
+        """Wait for the fit, and let the masks know what those of the other process have learnt."""
+        from preprocess.fitting.capture_fitting import fit_capture
+        from preprocess.masks.mask_sources import GivenMasks
+
+        assert self._process.stdout is not None
+        sent = self._process.stdout.read()
+        if self._process.wait() or not isinstance(capture.masks, GivenMasks):
+            return fit_capture(capture)  # which says what is wrong
+        fit, capture.masks.refine, self.rig = pickle.loads(sent)
+        return fit
+
+
 @contextmanager
-def fitting_beside(
-    inputs: CaptureInputs, size_px: int
-) -> Iterator[Callable[["Capture"], "CaptureFit | None"]]:
+def fitting_beside(inputs: CaptureInputs, size_px: int) -> Iterator[FitProcess]:
     """Fit a recording in another process, which ends with this block at the latest.
 
-    `size_px` is the longer side of the training images. Yields a function that waits for the fit,
-    and lets the masks of an equal capture know what those of the other process have learnt.
+    `size_px` is the longer side of the training images.
     """
     command, pipe = [sys.executable, "-c", FIT], subprocess.PIPE
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL) as process:
-        there, back = process.stdin, process.stdout
-        assert there is not None
-        assert back is not None
-
-        def wait(capture: "Capture") -> "CaptureFit | None":
-            from preprocess.fitting.capture_fitting import fit_capture
-            from preprocess.masks.mask_sources import GivenMasks
-
-            sent = back.read()
-            if process.wait() or not isinstance(capture.masks, GivenMasks):
-                return fit_capture(capture)  # which says what is wrong
-            fit, capture.masks.refine = pickle.loads(sent)
-            return fit
-
         try:
-            with suppress(OSError), there:  # it may have ended
+            assert process.stdin is not None
+            with suppress(OSError), process.stdin as there:  # it may have ended
                 there.write(pickle.dumps((inputs, size_px)))
-            yield wait
+            yield FitProcess(process)
         finally:
             process.kill()
 
 
 def fit_for_parent() -> None:
-    """Fit the recording that standard input describes, and write the fit to standard output."""
+    """Fit the recording that standard input describes; write fit and rig to standard output."""
+    gc.disable()  # the process is short
     inputs, size_px = pickle.load(sys.stdin.buffer)
-    from preprocess.fitting.capture_fitting import fit_capture
+    from avatar.rig import Rig
+    from preprocess.fitting.capture_fitting import apply_fit, fit_capture
     from preprocess.masks.mask_sources import GivenMasks
     from preprocess.open_capture import open_capture
 
     capture = open_capture(inputs, size_px=size_px)
     assert isinstance(capture.masks, GivenMasks)
-    sys.stdout.buffer.write(pickle.dumps((fit_capture(capture), capture.masks.refine)))
+    fit = fit_capture(capture)
+    fitted = capture if fit is None else apply_fit(capture, fit, height_m=inputs.height_m)
+    found = fit, capture.masks.refine, Rig.from_shaped_body(fitted.shaped)
+    sys.stdout.buffer.write(pickle.dumps(found))

@@ -10,13 +10,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from avatar.rig import Rig
 from capture.source_opening import open_source
 from export.bake import proxy_surface
 from instant_avatar.cli.console import Console
 from instant_avatar.run import start_up
 from instant_avatar.run.start_up import can_fit_beside, fitting_beside
 from preprocess.capture_inputs import CaptureInputs
-from preprocess.fitting.capture_fitting import fit_capture
+from preprocess.fitting.capture_fitting import apply_fit, fit_capture
 from preprocess.open_capture import open_capture
 
 RUNS_LONG = "import time; time.sleep(600)"
@@ -84,9 +85,12 @@ def assert_same_fit(one, other):
 
 def test_another_process_fits_and_remembers_what_this_one_would(inputs):
     here, there = equal_captures(inputs)
-    with fitting_beside(inputs, SIZE_PX) as wait:
-        found = wait(there)
+    with fitting_beside(inputs, SIZE_PX) as fitting:
+        found = fitting.fit(there)
     assert_same_fit(found, fit_capture(here))
+    rig = Rig.from_shaped_body(apply_fit(here, found).shaped)
+    for name, value in vars(fitting.rig).items():
+        np.testing.assert_array_equal(value, getattr(rig, name))
     assert not there.masks.needs_all_frames  # it has compared borders, as the other one
     assert there.masks.refine._ratios == here.masks.refine._ratios
 
@@ -94,8 +98,9 @@ def test_another_process_fits_and_remembers_what_this_one_would(inputs):
 def test_a_process_that_fails_is_done_without(inputs, monkeypatch):
     monkeypatch.setattr(start_up, "FIT", "raise SystemExit(1)")
     here, there = equal_captures(inputs)
-    with fitting_beside(inputs, SIZE_PX) as wait:
-        assert_same_fit(wait(there), fit_capture(here))
+    with fitting_beside(inputs, SIZE_PX) as fitting:
+        assert_same_fit(fitting.fit(there), fit_capture(here))
+    assert fitting.rig is None
 
 
 def test_the_process_ends_with_the_block(inputs, started, monkeypatch):
