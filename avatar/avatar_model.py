@@ -23,6 +23,7 @@ from avatar.kernels.operands import (
     MAX_LOG_DENSITY,
     CorrespondenceTables,
     DensityGrid,
+    LitSkin,
     NormalVolume,
     PremultipliedPixels,
     RawOutputs,
@@ -88,12 +89,16 @@ class OrientationShading:
     ) -> Float32[Tensor, "rays 3"]:
         """Mean normal of what each ray sees, in the body frame; shorter than 1 where it is thin.
 
-        Normals of the skin's distance volume, through the warp, composited like colors. All are
-        zero in steps that need none.
+        Normals of the skin's distance volume, through the warp, composited like colors.
         """
-        if self.is_neutral and self._steps % OBSERVATION_INTERVAL:
-            return torch.zeros(len(rays.slots), 3)
         return operations.mean_normals(raw, samples, step_m, rays.slots, cells, self._normals)
+
+    def lit_skin(self) -> LitSkin:
+        """Normals and light of a step; in steps that need no normals all of them are zero."""
+        needed = not self.is_neutral or self._steps % OBSERVATION_INTERVAL == 0
+        return LitSkin(
+            self._normals, self.coefficients, MIN_NORMAL_LENGTH, (MIN_FACTOR, MAX_FACTOR), needed
+        )
 
     def factors(self, normals: Float32[Tensor, "rays 3"]) -> PremultipliedPixels:
         """Factors of color, and of alpha (1), at world normals; 1 where there is no surface."""

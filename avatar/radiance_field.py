@@ -1,24 +1,25 @@
-"""The canonical radiance field, and its priors: empty off the body, solid inside, smooth.
+"""The canonical radiance field, and draws of the pairs of points at which its priors hold.
 
-A hash grid and a small network, with a hand-written gradient. The priors count where rays do not
-determine the field. Most terms penalise the opacity of one centimetre, α = 1 - exp(-σ · 1 cm), as
-in the paper's code, where s is the log density and dα/ds = σ · 1 cm · (1 - α). Each function
-returns the gradient of a mean over points with respect to the raw outputs.
+A hash grid and a small network, with a hand-written gradient.
 """
 
 import copy
 import math
-from collections.abc import Callable
 from typing import NamedTuple, final
 
-import numpy as np
 import torch
 from jaxtyping import Float32, Int64
 from torch import Tensor
 
 from avatar.config import TrainConfig
 from avatar.kernels import numba_priors, operations
-from avatar.kernels.operands import FEATURES_PER_LEVEL, HIDDEN_WIDTH, HashLevels, NetworkLayers
+from avatar.kernels.operands import (
+    FEATURES_PER_LEVEL,
+    HIDDEN_WIDTH,
+    HashLevels,
+    LearntRays,
+    NetworkLayers,
+)
 
 RawPoints = Float32[Tensor, "points 4"]
 """Log density and color of points, before their activations."""
@@ -132,6 +133,16 @@ class RadianceField:
         return grad_features
 
     @torch.no_grad()
+    def add_gradients(self, learnt: LearntRays) -> None:
+        """Takes the gradients of a pass: writes the network's, adds the table's; none if frozen."""
+        if learnt.network is None:
+            return
+        for parameter, grad in zip(self.layers, learnt.network, strict=True):
+            assert parameter.grad is not None, "a gradient is overwritten, never taken away"
+            parameter.grad.copy_(grad)
+        operations.add_table_gradient(learnt, self.levels, self.table_grad)
+
+    @torch.no_grad()
     def raw_outputs_at(self, points: Float32[Tensor, "points 3"]) -> RawPoints:
         """Raw outputs at any number of canonical points, in chunks."""
         chunks = [self.forward(chunk).raw for chunk in points.split(POINTS_PER_CHUNK)]
@@ -140,46 +151,8 @@ class RadianceField:
 
 TV_PAIR_SIGMA_M = 0.01
 """Standard deviation of the offset within a total-variation pair, metres per axis."""
-MIN_OPACITY = 1e-6
-"""Opacity below which the interior loss's logarithm is clamped."""
 SMOOTHNESS_PAIR_SIGMA_CELLS = 0.5
 """Standard deviation of the offset within a smoothness pair, in finest cells per axis."""
-MAX_USEFUL_LOG_DENSITY = 6.0
-"""Log density above which density is excess (400 per metre: opacity 0.5 in two millimetres)."""
-EXCESS_DENSITY_FACTOR = 0.4
-"""Weight of excess density relative to the slope penalty."""
-SOURCE_STEEPNESS = 3.0
-"""Factor of a source's opacity about one half."""
-VISIBLE_LOG_DENSITY = 2.0
-"""Log density from which one point of a pair makes the pair's colors visible."""
-
-
-def _gradient(
-    add: Callable[..., None], raw: RawPoints, *arguments: Float32[np.ndarray, "..."] | float
-) -> RawPoints:
-    """What a kernel of `numba_priors` adds to zeros."""
-    grad = torch.zeros_like(raw)
-    add(raw.numpy(), *(np.float32(argument) for argument in arguments), grad.numpy())
-    return grad
-
-
-def empty_space_gradient(raw: RawPoints, weight: float) -> RawPoints:
-    """Gradient of the mean α in space that should be empty (the paper's §3.4)."""
-    return _gradient(numba_priors.empty_space, raw, weight)
-
-
-def interior_gradient(raw: RawPoints, weight: float) -> RawPoints:
-    """Gradient of the mean -log α in the interior; cross-entropy acts at zero opacity as well."""
-    return _gradient(numba_priors.interior, raw, weight, MIN_OPACITY)
-
-
-def log_density_l1_gradient(raw: RawPoints, weight: float) -> RawPoints:
-    """Gradient of the mean log density where it is above 0.
-
-    Density that a ray needs withstands the small gradient; under Adam, density that no ray needs
-    vanishes however small the gradient is.
-    """
-    return _gradient(numba_priors.log_density_l1, raw, weight)
 
 
 def sample_tv_pairs(
@@ -207,56 +180,3 @@ def _sample_pairs(
     pairs = torch.empty(2 * count, 3)
     numba_priors.draw_pairs(chances.numpy(), apart.numpy(), points.numpy(), pairs.numpy())
     return pairs
-
-
-def density_tv_gradient(raw: RawPoints, weight: float) -> RawPoints:
-    """Gradient of the mean |α - α'| over pairs of points.
-
-    The total variation of a solid is its surface area (Rudin, Osher and Fatemi 1992); of all
-    surfaces that explain the images it prefers the smallest, which is the smoothest. It does not
-    penalise sharp edges, but it does not penalise thick, half-transparent layers either. `raw` has
-    the first points of the pairs, then the second.
-    """
-    return _gradient(numba_priors.density_tv, raw, weight)
-
-
-def double_well_gradient(raw: RawPoints, weight: float) -> RawPoints:
-    """Gradient of the mean α (1 - α), which vanishes where space is opaque or empty.
-
-    Together with the total variation it minimises fog and surface area, as between two phases of a
-    fluid (Modica and Mortola 1977).
-    """
-    return _gradient(numba_priors.double_well, raw, weight)
-
-
-def density_slope_gradient(
-    raw: RawPoints, points: Float32[Tensor, "points 3"], max_slope_per_m: float, weight: float
-) -> RawPoints:
-    """Gradient of the mean of max(0, |s - s'| - k · |x - x'|), and of density in excess.
-
-    A few images in slightly wrong poses are explained as well by a razor-sharp surface that is
-    rough between pixels. Neither the renderer's samples nor the player's voxels can represent it: a
-    shift of the samples by half a step changed the image by 38 dB. Density above
-    `MAX_USEFUL_LOG_DENSITY` is penalised too, since it only steepens the edge. Pairs are as in
-    `density_tv_gradient`; k is `max_slope_per_m`.
-    """
-    return _gradient(
-        numba_priors.density_slope, raw, points.numpy(), max_slope_per_m, MAX_USEFUL_LOG_DENSITY,
-        EXCESS_DENSITY_FACTOR, weight,
-    )  # fmt: skip
-
-
-def color_tv_gradient(raw: RawPoints, weight: float) -> RawPoints:
-    """Gradient of the mean |c - c'| of visible pairs, as in `density_tv_gradient`."""
-    return _gradient(numba_priors.color_tv, raw, VISIBLE_LOG_DENSITY, weight)
-
-
-def source_gradient(raw: RawPoints, weights: Float32[Tensor, "pairs"], weight: float) -> RawPoints:
-    """Gradient of the cross-entropy of points to their sources, in opacity and in color.
-
-    Cross-entropy acts where a point is empty and its source is not, too. The sources stand still.
-    Their opacity is steepened about one half, so that the copy of a soft surface is firm; their
-    color counts as far as they are opaque. `raw` has the points, then their sources; `weights` are
-    the pairs' own, in [0, 1].
-    """
-    return _gradient(numba_priors.toward_sources, raw, weights.numpy(), weight, SOURCE_STEEPNESS)

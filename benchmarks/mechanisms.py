@@ -80,7 +80,7 @@ MECHANISMS = [
         name="occupancy-based term",
         off={"empty_space_weight": 0.0},
         code=(
-            "avatar.radiance_field.empty_space_gradient",
+            "avatar.kernels.numba_priors.empty_space",
             "avatar.occupancy_grid.OccupancyGrid.sample_empty",
             "avatar.occupancy_grid.OccupancyGrid._empty_cells",
         ),
@@ -88,7 +88,7 @@ MECHANISMS = [
     Mechanism(
         name="total variation",
         off={"density_tv_weight": 0.0},
-        code=("avatar.radiance_field.density_tv_gradient", "avatar.radiance_field.sample_tv_pairs"),
+        code=("avatar.kernels.numba_priors.density_tv", "avatar.radiance_field.sample_tv_pairs"),
     ),
     Mechanism(
         name="occupancy-based term and total variation",
@@ -97,7 +97,7 @@ MECHANISMS = [
     Mechanism(
         name="faint gradients by chance",
         off={"faint_gradient_share": 0.0},
-        code=("avatar.training.training_step.draw_by_strength",),
+        code=("avatar.kernels.numba_training_step._draw_strong",),
     ),
     Mechanism(
         name="coarse samples at first",
@@ -163,13 +163,13 @@ MECHANISMS = [
     Mechanism(
         name="double well",
         off={"double_well_weight": 0.0},
-        code=("avatar.radiance_field.double_well_gradient",),
+        code=("avatar.kernels.numba_priors.double_well",),
     ),
     Mechanism(
         name="interior",
         off={"interior_weight": 0.0, "head_interior_weight": 0.0},
         code=(
-            "avatar.radiance_field.interior_gradient",
+            "avatar.kernels.numba_priors.interior",
             "avatar.occupancy_grid.OccupancyGrid.sample_interior",
         ),
     ),
@@ -177,8 +177,8 @@ MECHANISMS = [
         name="density slope and color variation",
         off={"density_slope_weight": 0.0, "color_tv_weight": 0.0},
         code=(
-            "avatar.radiance_field.density_slope_gradient",
-            "avatar.radiance_field.color_tv_gradient",
+            "avatar.kernels.numba_priors.density_slope",
+            "avatar.kernels.numba_priors.color_tv",
             "avatar.radiance_field.sample_smoothness_pairs",
         ),
     ),
@@ -187,7 +187,7 @@ MECHANISMS = [
         name="density off the skin",
         off={"off_skin_weight": 0.0},
         code=(
-            "avatar.radiance_field.log_density_l1_gradient",
+            "avatar.kernels.numba_priors.log_density_l1",
             "avatar.occupancy_grid.OccupancyGrid.sample_off_skin",
         ),
     ),
@@ -195,7 +195,7 @@ MECHANISMS = [
         name="unseen skin",
         off={"unseen_weight": 0.0},
         code=(
-            "avatar.radiance_field.source_gradient",
+            "avatar.kernels.numba_priors.toward_sources",
             "avatar.training.unseen_skin",
             "avatar.training.skin_evidence",
         ),

@@ -1,15 +1,11 @@
-"""Random draws of a training step, compiled for the CPU: rays, and gradients to propagate.
+"""Random draws of a training step's rays, compiled for the CPU.
 
-In torch and numpy the rays are fifty operations on small arrays, 1.5 core-ms a step.
+In torch and numpy they are fifty operations on small arrays, 1.5 core-ms a step.
 """
 
 import numpy as np
 
-from avatar.kernels.kernel_compiler import (
-    FAST_MATH,
-    INLINED,
-    compile_kernel,
-)
+from avatar.kernels.kernel_compiler import INLINED, compile_kernel
 
 F32, I32 = np.float32, np.int32
 SIGHT_SPACING_PX = 8
@@ -120,24 +116,3 @@ def draw_rays(
                     camera[i, 0] * turn[k, 0] + camera[i, 1] * turn[k, 1]
                     + camera[i, 2] * turn[k, 2]
                 )  # fmt: skip
-
-
-@compile_kernel(**FAST_MATH)
-def draw_strong_gradients(grads, faint_share, chances, points, drawn):
-    """Draws points by the strength of their gradients; returns how many.
-
-    Gradients below the share `faint_share` of the mean strength are drawn by chance. `points` and
-    their gradients, divided by the chance of each, are written from the front.
-    """
-    mean, count = 0.0, 0
-    for n in range(grads.shape[0]):
-        mean += abs(grads[n, 0]) + abs(grads[n, 1]) + abs(grads[n, 2]) + abs(grads[n, 3])
-    faint = F32(faint_share * mean / grads.shape[0] + 1e-30)
-    for n in range(grads.shape[0]):
-        strength = abs(grads[n, 0]) + abs(grads[n, 1]) + abs(grads[n, 2]) + abs(grads[n, 3])
-        if chances[n] * faint < strength:
-            points[count] = n
-            for q in range(4):
-                drawn[count, q] = grads[n, q] * max(faint / strength, F32(1))
-            count += 1
-    return count

@@ -84,7 +84,7 @@ def _write_outputs(hidden, number, weights, bias, raw, first):
 
 
 @compile_kernel(**FAST_MATH)
-def _forward_block(
+def forward_block(
     block, points, low, cells_per_m, counts, dense, offsets, table, weights, bias, output_weights,
     output_bias, features, raw,
 ):  # fmt: skip
@@ -114,7 +114,7 @@ def forward(
             next multiple of four.
     """
     for block in prange((points.shape[0] + POINTS_PER_BLOCK - 1) // POINTS_PER_BLOCK):
-        _forward_block(
+        forward_block(
             np.int64(block), points, low, cells_per_m, counts, dense, offsets, table, weights,
             bias, output_weights, output_bias, features, raw,
         )  # fmt: skip
@@ -232,28 +232,29 @@ def _add_output_gradients(hidden, grad_hidden, g, number, total, bias_total):
 
 
 @compile_kernel(**FAST_MATH)
-def _backward_of_thread(
-    thread, features, rows, grad_raw, weights, bias, output_weights, transposed, grad_features,
-    weight_sums, output_sums, bias_sums,
+def backward_passes(
+    first_pass, passes_apart, features, rows, grad_raw, weights, bias, output_weights, transposed,
+    grad_features, weight_sum, output_sum, bias_sum,
 ):  # fmt: skip
-    """Adds up the gradients of one thread."""
-    threads, width = weight_sums.shape[0], features.shape[1]
+    """Writes the gradients of every `passes_apart`-th pass over `rows`, and adds them up.
+
+    The arguments are those of `backward`, with the sums of one thread.
+    """
+    width = features.shape[1]
     f, g = np.empty((POINTS_PER_PASS, width), F32), np.empty((POINTS_PER_PASS, OUTPUTS), F32)
     hidden = np.empty((POINTS_PER_PASS, HIDDEN_WIDTH), F32)
     grad_hidden = np.empty((POINTS_PER_PASS, HIDDEN_WIDTH), F32)
     grad_f = np.empty((POINTS_PER_PASS, transposed.shape[1]), F32)
-    weight_sum, output_sum = weight_sums[thread], output_sums[thread]
-    bias_sum = bias_sums[thread]
-    step = threads * POINTS_PER_PASS
-    for first in range(thread * POINTS_PER_PASS, rows.shape[0], step):
+    step = passes_apart * POINTS_PER_PASS
+    for first in range(first_pass * POINTS_PER_PASS, rows.shape[0], step):
         number = min(rows.shape[0] - first, POINTS_PER_PASS)
         padded = (number + 7) // 8 * 8
         _gather(features, rows, grad_raw, first, number, f, g)
         _hidden_units(f, 0, padded, weights, bias, hidden)
         _hidden_gradients(hidden, g, padded, output_weights, grad_hidden)
         _feature_gradients(grad_hidden, padded, transposed, grad_f)
-        _add_weight_gradients(f, grad_hidden, padded, weight_sum)
         if output_sum.shape[0] > 0:
+            _add_weight_gradients(f, grad_hidden, padded, weight_sum)
             _add_output_gradients(hidden, grad_hidden, g, padded, output_sum, bias_sum)
         for p in range(number):
             for k in range(0, width, 4):
@@ -278,8 +279,10 @@ def backward(
             4, hidden) and, of b₁ and of b₂, (threads, 2, hidden); zero before. Without rows, the
             gradients of a frozen network are left out.
     """
-    for thread in prange(weight_sums.shape[0]):
-        _backward_of_thread(
-            np.int64(thread), features, rows, grad_raw, weights, bias, output_weights, transposed,
-            grad_features, weight_sums, output_sums, bias_sums,
+    threads = weight_sums.shape[0]
+    for thread in prange(threads):
+        backward_passes(
+            np.int64(thread), threads, features, rows, grad_raw, weights, bias, output_weights,
+            transposed, grad_features, weight_sums[thread], output_sums[thread],
+            bias_sums[thread],
         )  # fmt: skip

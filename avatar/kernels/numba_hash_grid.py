@@ -7,7 +7,7 @@ write to one place: no atomics, and the same sums for any number of threads.
 """
 
 import numpy as np
-from numba import get_num_threads, prange
+from numba import prange
 
 from avatar.kernels.kernel_compiler import (
     FAST_MATH,
@@ -125,8 +125,8 @@ def encode(points, low, cells_per_m, counts, dense, offsets, table, features):
 
 @compile_kernel(**FAST_MATH)
 def _add_level_gradients(
-    thread, points, rows, low, cells_per_m, counts, dense, offsets, grad_features, grad_table,
-    threads,
+    thread, points, rows, runs, low, cells_per_m, counts, dense, offsets, grad_features,
+    grad_table, threads,
 ):  # fmt: skip
     """Adds the gradients of the levels of one thread."""
     places, within = np.empty((3, POINTS_PER_BLOCK), F32), np.empty((3, POINTS_PER_BLOCK), F32)
@@ -135,41 +135,40 @@ def _add_level_gradients(
         np.empty((8, POINTS_PER_BLOCK), I32),
         np.empty((8, POINTS_PER_BLOCK), F32),
     )
-    for start in range(0, rows.shape[0], POINTS_PER_BLOCK):
-        number = min(rows.shape[0] - start, POINTS_PER_BLOCK)
-        _box_coordinates_of_rows(points, rows, start, start + number, low, places)
-        for level in range(thread, cells_per_m.shape[0], threads):
-            first, size = offsets[level], offsets[level + 1] - offsets[level]
-            _locate_cells(places, number, cells_per_m[level], counts[level], cells, within)
-            _corner_entries(cells, number, counts[level], dense[level], first, size, entries)
-            _trilinear_weights(within, number, weights)
-            for i in range(number):
-                grad = load4(grad_features, start + i, level * FEATURES_PER_LEVEL)
-                for corner in range(8):
-                    entry = entries[corner, i]
-                    added = scale4(weights[corner, i], grad)
-                    store4(grad_table, entry, 0, add4(load4(grad_table, entry, 0), added))
+    for run in range(runs.shape[0]):
+        stop = runs[run, 0] + runs[run, 1]
+        for start in range(runs[run, 0], stop, POINTS_PER_BLOCK):
+            number = min(stop - start, POINTS_PER_BLOCK)
+            _box_coordinates_of_rows(points, rows, start, start + number, low, places)
+            for level in range(thread, cells_per_m.shape[0], threads):
+                first, size = offsets[level], offsets[level + 1] - offsets[level]
+                _locate_cells(places, number, cells_per_m[level], counts[level], cells, within)
+                _corner_entries(cells, number, counts[level], dense[level], first, size, entries)
+                _trilinear_weights(within, number, weights)
+                for i in range(number):
+                    grad = load4(grad_features, start + i, level * FEATURES_PER_LEVEL)
+                    for corner in range(8):
+                        entry = entries[corner, i]
+                        added = scale4(weights[corner, i], grad)
+                        store4(grad_table, entry, 0, add4(load4(grad_table, entry, 0), added))
 
 
 @compile_kernel(parallel=True, **FAST_MATH)
-def _encode_backward(
-    points, rows, low, cells_per_m, counts, dense, offsets, grad_features, grad_table, threads
+def encode_backward(
+    points, rows, runs, low, cells_per_m, counts, dense, offsets, grad_features, grad_table, threads
 ):
+    """Adds the gradient of `encode`, by its table, to `grad_table`, each thread on its levels.
+
+    Args:
+        points: All points.
+        rows, grad_features: Those with a gradient, and the gradients of their features.
+        runs: First place in these lists and length of each run that counts (runs, 2).
+    """
     for thread in prange(threads):
         _add_level_gradients(
-            np.int64(thread), points, rows, low, cells_per_m, counts, dense, offsets,
+            np.int64(thread), points, rows, runs, low, cells_per_m, counts, dense, offsets,
             grad_features, grad_table, threads,
         )  # fmt: skip
-
-
-def encode_backward(
-    points, rows, low, cells_per_m, counts, dense, offsets, grad_features, grad_table
-) -> None:
-    """Adds the gradient of `encode` at the points in `rows`, by its table, to `grad_table`."""
-    _encode_backward(
-        points, rows, low, cells_per_m, counts, dense, offsets, grad_features, grad_table,
-        get_num_threads(),
-    )  # fmt: skip
 
 
 @compile_kernel(**INLINED)
@@ -203,33 +202,6 @@ def _add_point_gradient(within, corner_gradients, number, scale, total):
 
 
 @compile_kernel(**FAST_MATH)
-def _point_gradients_of_block(
-    block, points, rows, low, cells_per_m, counts, dense, offsets, table, grad_features, factor,
-    grad_points,
-):  # fmt: skip
-    """Writes the gradients of one block of points."""
-    start = block * POINTS_PER_BLOCK
-    number = min(rows.shape[0] - start, POINTS_PER_BLOCK)
-    places, within = np.empty((3, POINTS_PER_BLOCK), F32), np.empty((3, POINTS_PER_BLOCK), F32)
-    cells, entries = np.empty((3, POINTS_PER_BLOCK), I32), np.empty((8, POINTS_PER_BLOCK), I32)
-    pulls, total = np.empty((8, POINTS_PER_BLOCK), F32), np.zeros((3, POINTS_PER_BLOCK), F32)
-    _box_coordinates_of_rows(points, rows, start, start + number, low, places)
-    for level in range(cells_per_m.shape[0]):
-        first, size = offsets[level], offsets[level + 1] - offsets[level]
-        _locate_cells(places, number, cells_per_m[level], counts[level], cells, within)
-        _corner_entries(cells, number, counts[level], dense[level], first, size, entries)
-        for i in range(number):
-            grad = load4(grad_features, start + i, level * FEATURES_PER_LEVEL)
-            for corner in range(8):
-                pulls[corner, i] = dot4(load4(table, entries[corner, i], 0), grad)
-        _add_point_gradient(within, pulls, number, cells_per_m[level], total)
-    for i in range(number):
-        row = rows[start + i]
-        for axis in range(3):
-            grad_points[row, axis] = factor * total[axis, i]
-
-
-@compile_kernel(parallel=True, **FAST_MATH)
 def encode_points_backward(
     points, rows, low, cells_per_m, counts, dense, offsets, table, grad_features, factor,
     grad_points,
@@ -238,11 +210,26 @@ def encode_points_backward(
 
     `grad_features` has the features of these points, and may have more levels than `cells_per_m`.
     """
-    for block in prange((rows.shape[0] + POINTS_PER_BLOCK - 1) // POINTS_PER_BLOCK):
-        _point_gradients_of_block(
-            np.int64(block), points, rows, low, cells_per_m, counts, dense, offsets, table,
-            grad_features, factor, grad_points,
-        )  # fmt: skip
+    places, within = np.empty((3, POINTS_PER_BLOCK), F32), np.empty((3, POINTS_PER_BLOCK), F32)
+    cells, entries = np.empty((3, POINTS_PER_BLOCK), I32), np.empty((8, POINTS_PER_BLOCK), I32)
+    pulls, total = np.empty((8, POINTS_PER_BLOCK), F32), np.empty((3, POINTS_PER_BLOCK), F32)
+    for start in range(0, rows.shape[0], POINTS_PER_BLOCK):
+        number = min(rows.shape[0] - start, POINTS_PER_BLOCK)
+        total[:] = F32(0)
+        _box_coordinates_of_rows(points, rows, start, start + number, low, places)
+        for level in range(cells_per_m.shape[0]):
+            first, size = offsets[level], offsets[level + 1] - offsets[level]
+            _locate_cells(places, number, cells_per_m[level], counts[level], cells, within)
+            _corner_entries(cells, number, counts[level], dense[level], first, size, entries)
+            for i in range(number):
+                grad = load4(grad_features, start + i, level * FEATURES_PER_LEVEL)
+                for corner in range(8):
+                    pulls[corner, i] = dot4(load4(table, entries[corner, i], 0), grad)
+            _add_point_gradient(within, pulls, number, cells_per_m[level], total)
+        for i in range(number):
+            row = rows[start + i]
+            for axis in range(3):
+                grad_points[row, axis] = factor * total[axis, i]
 
 
 @compile_kernel(**INLINED)

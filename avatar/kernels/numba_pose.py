@@ -35,8 +35,6 @@ MIN_PULL_SHARE = 1e-3
 """Pull on a sample, as a share of its ray's strongest, up to which it is left out."""
 PADDED = 80
 """Length of a row of 75 numbers that is a multiple of a register's; the last five are zero."""
-RAYS_PER_BLOCK = 16
-"""Rays that one call works on."""
 JOINTS = 24
 MIN_RIDGE = 1e-6
 """Least stiffness, as a share of the largest curvature. Below, where one ray outweighs all others,
@@ -73,15 +71,27 @@ def _weights_at(weights, shape, low, nodes_per_m, x, y, z, out):
 
 
 @compile_kernel(**FAST_MATH)
-def _wrenches_of_block(
-    block, points, grad_points, rows, first, count, slots, cell_roots, weights, shape, low,
-    nodes_per_m, bones, out,
+def write_wrenches(
+    first_ray, last_ray, points, grad_points, rows, first, count, slots, cell_roots, weights,
+    shape, low, nodes_per_m, bones, out,
 ):  # fmt: skip
-    """Adds up what the rays of one block exert."""
-    share, first_ray = np.empty((1, 24), F32), block * RAYS_PER_BLOCK
-    for ray in range(first_ray, min(first_ray + RAYS_PER_BLOCK, first.shape[0])):
-        slot = slots[ray]
-        strongest = F32(0)
+    """Writes what the samples of some rays exert on the bones that move them.
+
+    Args:
+        first_ray, last_ray: The rays, without the last.
+        points, grad_points: Canonical samples and what pulls them.
+        rows: Root of `cell_roots[slot]` that each sample was warped with.
+        first, count, slots: Each ray's samples and its frame's slot.
+        cell_roots: Roots and inverse Jacobians (slots, roots, 12).
+        bones: Body-from-canonical matrices (slots, 24, 12).
+        out: (rays, 24, 6): force then moment about the body frame's origin.
+    """
+    share = np.empty((1, 24), F32)
+    for ray in range(first_ray, last_ray):
+        slot, strongest = slots[ray], F32(0)
+        for joint in range(24):
+            for q in range(6):
+                out[ray, joint, q] = F32(0)
         for i in range(first[ray], first[ray] + count[ray]):
             a, b, c = grad_points[i, 0], grad_points[i, 1], grad_points[i, 2]
             strongest = max(strongest, a * a + b * b + c * c)
@@ -116,28 +126,6 @@ def _wrenches_of_block(
                 out[ray, joint, 3] += w * (py * fz - pz * fy)
                 out[ray, joint, 4] += w * (pz * fx - px * fz)
                 out[ray, joint, 5] += w * (px * fy - py * fx)
-
-
-@compile_kernel(parallel=True, **FAST_MATH)
-def bone_wrenches(
-    points, grad_points, rows, first, count, slots, cell_roots,
-    weights, shape, low, nodes_per_m, bones, out,
-):  # fmt: skip
-    """Adds up what each ray's samples exert on the bones that move them.
-
-    Args:
-        points, grad_points: Canonical samples and what pulls them.
-        rows: Root of `cell_roots[slot]` that each sample was warped with.
-        first, count, slots: Each ray's samples and its frame's slot.
-        cell_roots: Roots and inverse Jacobians (slots, roots, 12).
-        bones: Body-from-canonical matrices (slots, 24, 12).
-        out: (rays, 24, 6), zero before: force then moment about the body frame's origin.
-    """
-    for block in prange((first.shape[0] + RAYS_PER_BLOCK - 1) // RAYS_PER_BLOCK):
-        _wrenches_of_block(
-            np.int64(block), points, grad_points, rows, first, count, slots, cell_roots, weights,
-            shape, low, nodes_per_m, bones, out,
-        )  # fmt: skip
 
 
 @compile_kernel(**INLINED)

@@ -1,7 +1,10 @@
 """Gradients of the field's priors and draws of the points they hold at, compiled for the CPU.
 
-In torch these are a hundred operations on a few hundred numbers each: 3 core-ms a step, which a
-second thread cannot share.
+The priors count where rays do not determine the field: empty off the body, solid inside, smooth.
+Most terms penalise the opacity of one centimetre, α = 1 - exp(-σ · 1 cm), as in the paper's code,
+where s is the log density and dα/ds = σ · 1 cm · (1 - α). Each kernel adds the gradient of a mean
+over points, times a weight, with respect to the raw outputs. Pairs are stored as all first points,
+then all second ones.
 """
 
 import numpy as np
@@ -16,6 +19,16 @@ from avatar.kernels.operands import MAX_LOG_DENSITY
 F32 = np.float32
 OPACITY_LENGTH_M = 0.01
 """Length over which opacity is measured, metres."""
+MIN_OPACITY = 1e-6
+"""Opacity below which the interior loss's logarithm is clamped."""
+MAX_USEFUL_LOG_DENSITY = 6.0
+"""Log density above which density is excess (400 per metre: opacity 0.5 in two millimetres)."""
+EXCESS_DENSITY_FACTOR = 0.4
+"""Weight of excess density relative to the slope penalty."""
+SOURCE_STEEPNESS = 3.0
+"""Factor of a source's opacity about one half."""
+VISIBLE_LOG_DENSITY = 2.0
+"""Log density from which one point of a pair makes the pair's colors visible."""
 
 
 @compile_kernel(**INLINED)
@@ -45,24 +58,28 @@ def opacities(raw, value, slope):
 
 @compile_kernel(**FAST_MATH)
 def empty_space(raw, weight, grad):
-    """Adds the gradient of the mean α times a weight."""
+    """Adds the gradient of the mean α in space that should be empty (the paper's §3.4)."""
     share = weight / F32(max(raw.shape[0], 1))
     for i in range(raw.shape[0]):
         grad[i, 3] += share * _opacity(raw[i, 3])[1]
 
 
 @compile_kernel(**FAST_MATH)
-def interior(raw, weight, min_opacity, grad):
-    """Adds the gradient of the mean -log α times a weight."""
+def interior(raw, weight, grad):
+    """Adds the gradient of the mean -log α in the interior; it acts at zero opacity as well."""
     share = weight / F32(max(raw.shape[0], 1))
     for i in range(raw.shape[0]):
         value, slope = _opacity(raw[i, 3])
-        grad[i, 3] -= share * slope / max(value, min_opacity)
+        grad[i, 3] -= share * slope / max(value, F32(MIN_OPACITY))
 
 
 @compile_kernel(**FAST_MATH)
 def log_density_l1(raw, weight, grad):
-    """Adds the gradient of the mean log density where it is above 0, times a weight."""
+    """Adds the gradient of the mean log density where it is above 0.
+
+    Density that a ray needs withstands the small gradient; under Adam, density that no ray needs
+    vanishes however small the gradient is.
+    """
     share = weight / F32(max(raw.shape[0], 1))
     for i in range(raw.shape[0]):
         if raw[i, 3] > F32(0):
@@ -71,7 +88,12 @@ def log_density_l1(raw, weight, grad):
 
 @compile_kernel(**FAST_MATH)
 def density_tv(raw, weight, grad):
-    """Adds the gradient of the mean |α - α'| of pairs, times a weight; the second points follow."""
+    """Adds the gradient of the mean |α - α'| over pairs of points.
+
+    The total variation of a solid is its surface area (Rudin, Osher and Fatemi 1992); of all
+    surfaces that explain the images it prefers the smallest, which is the smoothest. It does not
+    penalise sharp edges, but it does not penalise thick, half-transparent layers either.
+    """
     count = raw.shape[0] // 2
     share = weight / F32(max(count, 1))
     for i in range(count):
@@ -84,7 +106,11 @@ def density_tv(raw, weight, grad):
 
 @compile_kernel(**FAST_MATH)
 def double_well(raw, weight, grad):
-    """Adds the gradient of the mean α (1 - α), times a weight."""
+    """Adds the gradient of the mean α (1 - α), which vanishes where space is opaque or empty.
+
+    Together with the total variation it minimises fog and surface area, as between two phases of a
+    fluid (Modica and Mortola 1977).
+    """
     share = weight / F32(max(raw.shape[0], 1))
     for i in range(raw.shape[0]):
         value, slope = _opacity(raw[i, 3])
@@ -92,10 +118,18 @@ def double_well(raw, weight, grad):
 
 
 @compile_kernel(**FAST_MATH)
-def density_slope(raw, points, max_slope_per_m, max_log_density, excess_factor, weight, grad):
-    """Adds the gradient of the mean of max(0, |s - s'| - k |x - x'|) and of excess density."""
+def density_slope(raw, points, max_slope_per_m, weight, grad):
+    """Adds the gradient of the mean of max(0, |s - s'| - k |x - x'|), and of density in excess.
+
+    A few images in slightly wrong poses are explained as well by a razor-sharp surface that is
+    rough between pixels. Neither the renderer's samples nor the player's voxels can represent it: a
+    shift of the samples by half a step changed the image by 38 dB. Density above
+    `MAX_USEFUL_LOG_DENSITY` is penalised too, since it only steepens the edge. k is
+    `max_slope_per_m`.
+    """
     count = raw.shape[0] // 2
-    share, excess = weight / F32(max(count, 1)), weight * excess_factor / F32(max(2 * count, 1))
+    share = weight / F32(max(count, 1))
+    excess = weight * F32(EXCESS_DENSITY_FACTOR) / F32(max(2 * count, 1))
     for i in range(count):
         one, other, square = raw[i, 3], raw[count + i, 3], F32(0)
         for axis in range(3):
@@ -106,17 +140,17 @@ def density_slope(raw, points, max_slope_per_m, max_log_density, excess_factor, 
             pull = share * _sign(change)
             grad[i, 3] += pull
             grad[count + i, 3] -= pull
-        grad[i, 3] += excess * F32(one > max_log_density)
-        grad[count + i, 3] += excess * F32(other > max_log_density)
+        grad[i, 3] += excess * F32(one > F32(MAX_USEFUL_LOG_DENSITY))
+        grad[count + i, 3] += excess * F32(other > F32(MAX_USEFUL_LOG_DENSITY))
 
 
 @compile_kernel(**FAST_MATH)
-def color_tv(raw, visible_log_density, weight, grad):
-    """Adds the gradient of the mean |c - c'| of visible pairs, times a weight."""
+def color_tv(raw, weight, grad):
+    """Adds the gradient of the mean |c - c'| of visible pairs, as in `density_tv`."""
     count = raw.shape[0] // 2
     share = weight / F32(max(count, 1))
     for i in range(count):
-        if max(raw[i, 3], raw[count + i, 3]) <= visible_log_density:
+        if max(raw[i, 3], raw[count + i, 3]) <= F32(VISIBLE_LOG_DENSITY):
             continue
         for q in range(3):
             one, other = _sigmoid(raw[i, q]), _sigmoid(raw[count + i, q])
@@ -126,13 +160,18 @@ def color_tv(raw, visible_log_density, weight, grad):
 
 
 @compile_kernel(**FAST_MATH)
-def toward_sources(raw, weights, weight, steepness, grad):
-    """Adds the gradient of the cross-entropy of points to their sources, which follow them."""
+def toward_sources(raw, weights, weight, grad):
+    """Adds the gradient of the cross-entropy of points to their sources, in opacity and in color.
+
+    Cross-entropy acts where a point is empty and its source is not, too. The sources stand still.
+    Their opacity is steepened about one half, so that the copy of a soft surface is firm; their
+    color counts as far as they are opaque. `weights` are the pairs' own, in [0, 1].
+    """
     count = weights.shape[0]
     for i in range(count):
         scale = weight * weights[i]
         opacity, source = _opacity(raw[i, 3])[0], _opacity(raw[count + i, 3])[0]
-        firm = min(max(F32(0.5) + steepness * (source - F32(0.5)), F32(0)), F32(1))
+        firm = min(max(F32(0.5) + F32(SOURCE_STEEPNESS) * (source - F32(0.5)), F32(0)), F32(1))
         for q in range(3):
             apart = _sigmoid(raw[i, q]) - _sigmoid(raw[count + i, q])
             grad[i, q] += scale * source * apart

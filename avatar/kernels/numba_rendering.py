@@ -258,10 +258,10 @@ def prefix_sum(counts, first):
     return total
 
 
-@compile_kernel(parallel=True, nogil=True)
+@compile_kernel(**NO_ALLOCATION)
 def pack_samples(padded, padded_rows, first, counts, points, rows):
     """Copies each ray's samples from its own line to one list without gaps."""
-    for ray in prange(counts.shape[0]):
+    for ray in range(counts.shape[0]):
         for n in range(counts[ray]):
             rows[first[ray] + n] = padded_rows[ray, n]
             for axis in range(3):
@@ -330,11 +330,17 @@ def _mean_huber(error, excess_alpha):
 
 
 @compile_kernel(**NO_ALLOCATION)
-def _composite_ray_loss(
+def composite_ray_loss(
     ray, raw, offsets, counts, sample_step_m, target, alpha_weight, hard_surface_weight, rendered,
     loss, grad_raw,
 ):  # fmt: skip
-    """One ray's composite, loss and gradient."""
+    """One ray's composite and loss, and the gradient of the mean loss with respect to `raw`.
+
+    A density's gradient needs the sum over the samples behind it, so a second pass runs from back
+    to front. (Totals less the sum of what is in front would need no such order, but behind an
+    opaque sample nothing would be left of them but rounding, times an optical depth of up to 81.)
+    In between, `grad_raw` holds each sample's color and the transmittance behind it.
+    """
     share = F32(1) / F32(offsets.shape[0])
     start, stop = offsets[ray], offsets[ray] + counts[ray]
     through = F32(1)
@@ -386,22 +392,3 @@ def _composite_ray_loss(
         inside = raw[i, 3] < F32(MAX_LOG_DENSITY)
         grad_raw[i, 3] = optical * (through * value - behind) if inside else F32(0)
         behind += weight * value
-
-
-@compile_kernel(parallel=True, **FAST_MATH)
-def composite_loss(
-    raw, offsets, counts, sample_step_m, target, alpha_weight, hard_surface_weight,
-    rendered, loss, grad_raw,
-):  # fmt: skip
-    """Composite, loss of every ray, and the gradient of the mean loss with respect to `raw`.
-
-    A density's gradient needs the sum over the samples behind it, so a second pass runs from back
-    to front. (Totals less the sum of what is in front would need no such order, but behind an
-    opaque sample nothing would be left of them but rounding, times an optical depth of up to 81.)
-    In between, `grad_raw` holds each sample's color and the transmittance behind it.
-    """
-    for ray in prange(offsets.shape[0]):
-        _composite_ray_loss(
-            np.int64(ray), raw, offsets, counts, sample_step_m, target, alpha_weight,
-            hard_surface_weight, rendered, loss, grad_raw,
-        )  # fmt: skip

@@ -27,7 +27,7 @@ def _cell_below(place, count):
 
 
 @compile_kernel(**NO_ALLOCATION)
-def _mean_normal(
+def mean_normal(
     ray, raw, points, offsets, counts, rows, slots, cell_roots, sample_step_m, normals, low,
     cells_per_m, mean,
 ):  # fmt: skip
@@ -74,14 +74,14 @@ def mean_normals(
 ):  # fmt: skip
     """Normals at each ray's samples, in the body frame, composited front to back."""
     for ray in prange(offsets.shape[0]):
-        _mean_normal(
+        mean_normal(
             np.int64(ray), raw, points, offsets, counts, rows, slots, cell_roots, sample_step_m,
             normals, low, cells_per_m, mean,
         )  # fmt: skip
 
 
 @compile_kernel(**INLINED)
-def _factor(normals, ray, coefficients, min_length, bounds):
+def light_factor(normals, ray, coefficients, min_length, bounds):
     """Factor of the color of what a ray sees, and the length of its normal."""
     x, y, z = normals[ray, 0], normals[ray, 1], normals[ray, 2]
     length = np.sqrt(x * x + y * y + z * z)
@@ -97,7 +97,7 @@ def _factor(normals, ray, coefficients, min_length, bounds):
 def light_factors(normals, coefficients, min_length, bounds, factors):
     """Factors of the premultiplied colors and of alpha, which stays, of rays (rays, 4)."""
     for ray in range(normals.shape[0]):
-        factor, _ = _factor(normals, ray, coefficients, min_length, bounds)
+        factor, _ = light_factor(normals, ray, coefficients, min_length, bounds)
         for q in range(3):
             factors[ray, q] = factor
         factors[ray, 3] = F32(1)
@@ -120,7 +120,7 @@ def add_light(
     """
     added, row, rays = np.zeros((5, 5)), np.empty(5), 0
     for ray in range(normals.shape[0]):
-        factor, length = _factor(normals, ray, coefficients, min_length, bounds)
+        factor, length = light_factor(normals, ray, coefficients, min_length, bounds)
         if min(target[ray, 3], rendered[ray, 3]) <= min_alpha or length <= min_length:
             continue
         rays += 1

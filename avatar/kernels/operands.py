@@ -15,6 +15,9 @@ PRIMES = (1, 2654435761, 805459861)
 MAX_LOG_DENSITY = 9.0
 """Log density (log 1/m) at which the activation is clamped."""
 
+EMPTY_SPACE, TV_PAIRS, INTERIOR, CLOSE_PAIRS, OFF_SKIN, HEAD_INTERIOR, SOURCE_PAIRS = range(7)
+"""Kinds of points at which priors hold, in the order of `PriorPoints`."""
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class HashLevels:
@@ -207,3 +210,94 @@ class AdamSettings(NamedTuple):
         """Factors of the mean and of the squares' root, which correct that both started at 0."""
         first, second = self.betas
         return self.rate / (1.0 - first**self.steps), (1.0 - second**self.steps) ** -0.5
+
+
+class PriorPoints(NamedTuple):
+    """Points at which priors hold, in lists of one kind each, and the weights of their terms.
+
+    Attributes:
+        lists: Points of each kind; of pairs first all ones, then all others.
+        pair_weights: Weight of each pair of `SOURCE_PAIRS`.
+        weights: Weights of each kind's terms; a kind with one term has zero in the second place.
+        max_slope_per_m: Change of log density over distance up to which pairs are not penalised.
+    """
+
+    lists: list[Points]
+    pair_weights: Float32[Tensor, "pairs"]
+    weights: Float32[np.ndarray, "kinds 2"]
+    max_slope_per_m: float
+
+
+class LitSkin(NamedTuple):
+    """The skin's normals, and the light that falls on it.
+
+    Attributes:
+        light: Coefficients of the factor by which the light changes neutral colors.
+        min_length: Length of a ray's mean normal below which the factor is 1.
+        bounds: Least and largest factor.
+        is_needed: Whether normals are computed; they are zero otherwise.
+    """
+
+    volume: NormalVolume
+    light: Float32[Tensor, "harmonics"]
+    min_length: float
+    bounds: tuple[float, float]
+    is_needed: bool
+
+
+class PosedBones(NamedTuple):
+    """Skinning, the bones of all slots' poses, and the number of hash levels that pull at them."""
+
+    skinning: SkinningVolume
+    bones: Float32[Tensor, "slots 24 12"]
+    levels: int
+
+
+class LossSettings(NamedTuple):
+    """Weights of a step's losses, and how its gradients are drawn.
+
+    Attributes:
+        faint: Strength of a point's gradient below which it is propagated by chance.
+    """
+
+    sample_step_m: float
+    alpha_weight: float
+    hard_surface_weight: float
+    faint: float
+
+
+class FeatureGradients(NamedTuple):
+    """Gradients of points' features, block by block.
+
+    `rows` are the points that have one. `runs` are the first place in these lists, and the number,
+    of those of each block; what lies between is undefined.
+    """
+
+    rows: Int64[np.ndarray, "points"]
+    gradients: Float32[np.ndarray, "points width"]
+    runs: Int64[np.ndarray, "blocks 2"]
+
+
+class LearntRays(NamedTuple):
+    """A forward and backward pass over rays and priors.
+
+    Attributes:
+        points: Samples of the rays, then the priors' points.
+        log_density: Of the rays' samples.
+        rendered: Shaded rendering of each ray.
+        normals: World normal of what each ray sees; shorter than 1 where it is thin.
+        wrenches: Force and moment that each ray's samples exert on every bone; of no rays if no
+            poses were given.
+        network: Gradients of the network's layers; None if it is frozen.
+        strength: Mean strength of the points' gradients.
+    """
+
+    points: Points
+    log_density: Float32[Tensor, "samples"]
+    rendered: PremultipliedPixels
+    loss: Float32[Tensor, "rays"]
+    normals: Float32[Tensor, "rays 3"]
+    wrenches: Float32[Tensor, "wrenched 24 6"]
+    network: NetworkLayers | None
+    features: FeatureGradients
+    strength: float

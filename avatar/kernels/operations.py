@@ -21,19 +21,27 @@ from avatar.kernels import (
     numba_pose,
     numba_rendering,
     numba_shading,
+    numba_training_step,
 )
 from avatar.kernels.operands import (
+    HIDDEN_WIDTH,
     AdamSettings,
     CorrespondenceTables,
     DensityGrid,
+    FeatureGradients,
     Features,
     HashLevels,
     HashTable,
+    LearntRays,
+    LitSkin,
+    LossSettings,
     MarchSettings,
     NetworkLayers,
     NormalVolume,
     Points,
+    PosedBones,
     PremultipliedPixels,
+    PriorPoints,
     RawOutputs,
     RayBatch,
     RaySamples,
@@ -64,30 +72,9 @@ def encode_backward(
 ) -> None:
     """Adds the table's gradient to `grad_table`; `grad_features` are of the points in `rows`."""
     numba_hash_grid.encode_backward(
-        points.numpy(), rows.numpy(), *_level_arrays(levels), grad_features.numpy(),
-        grad_table.numpy(),
+        points.numpy(), rows.numpy(), np.array([[0, len(rows)]]), *_level_arrays(levels),
+        grad_features.numpy(), grad_table.numpy(), numba.get_num_threads(),
     )  # fmt: skip
-
-
-def encode_points_backward(
-    points: Points,
-    rows: Int64[Tensor, "some"],
-    grad_features: Float32[Tensor, "some width"],
-    table: HashTable,
-    levels: HashLevels,
-    factor: float = 1.0,
-) -> Points:
-    """Gradient of the features with respect to the points, times a factor; zero but in `rows`.
-
-    `grad_features` are of these points, and may have finer levels than `levels`, which do not
-    count.
-    """
-    grad = torch.zeros_like(points)
-    numba_hash_grid.encode_points_backward(
-        points.numpy(), rows.numpy(), *_level_arrays(levels), table.detach().numpy(),
-        grad_features.numpy(), np.float32(factor), grad.numpy(),
-    )  # fmt: skip
-    return grad
 
 
 def field_forward(
@@ -96,12 +83,107 @@ def field_forward(
     """Hash-grid features and raw outputs."""
     rows = -(-len(points) // 4) * 4
     features, raw = torch.empty(rows, levels.feature_width), torch.empty(len(points), 4)
-    first, bias, second, second_bias = (part.detach().numpy() for part in network)
+    *layers, _ = _network_arrays(network)
     numba_field.forward(
-        points.numpy(), *_level_arrays(levels), table.detach().numpy(), first, bias[None],
-        np.ascontiguousarray(second.T), second_bias, features.numpy(), raw.numpy(),
+        points.numpy(), *_level_arrays(levels), table.detach().numpy(), *layers,
+        features.numpy(), raw.numpy(),
     )  # fmt: skip
     return features[: len(points)], raw
+
+
+def learn(
+    rays: RayBatch,
+    target: PremultipliedPixels,
+    world_from_body: Float32[Tensor, "rays 3 3"],
+    samples: RaySamples,
+    cells: CorrespondenceTables,
+    priors: PriorPoints,
+    skin: LitSkin,
+    poses: PosedBones | None,
+    chances: Float32[Tensor, "points"],
+    table: HashTable,
+    levels: HashLevels,
+    network: NetworkLayers,
+    how: LossSettings,
+    *,
+    is_frozen: bool = False,
+) -> LearntRays:
+    """Renders rays, and propagates the gradients of their mean loss and of the priors.
+
+    The losses are InstantAvatar's (§3.4): Huber on color, L1 on alpha, hard surface.
+
+    Args:
+        target, world_from_body: Pixels and rotations of the rays.
+        priors: Points at which priors hold, and their weights.
+        poses: Poses for which wrenches are computed; none if None.
+        chances: Random numbers in [0, 1) of the samples and the priors' points, for their draw.
+        is_frozen: Leaves the gradients of the network out.
+    """
+    points = torch.cat([samples.points, *priors.lists])
+    ends = np.cumsum([len(part) for part in (samples.points, *priors.lists)])
+    count, total, width, threads = len(rays.slots), len(points), levels.feature_width, _threads()
+    blocks = len(priors.lists) - (-count // numba_training_step.RAYS_PER_BLOCK)
+    raw, grad_raw = np.empty((2, total, 4), dtype=np.float32)
+    rendered, loss = np.empty((count, 4), np.float32), np.empty(count, np.float32)
+    normals = np.empty((count, 3), np.float32)
+    wrenches = np.empty((count if poses else 0, 24, 6), np.float32)
+    rows, grad_features = np.empty(total, np.int64), np.empty((total, width), np.float32)
+    runs, strengths = np.empty((blocks, 2), np.int64), np.empty(blocks, np.float32)
+    sums = _network_sums(threads, width, is_frozen=is_frozen)
+    numba_training_step.learn(
+        threads,
+        (
+            np.float32(how.sample_step_m), np.float32(how.alpha_weight),
+            np.float32(how.hard_surface_weight), np.float32(how.faint), skin.is_needed,
+        ),
+        (
+            points.numpy(), samples.offsets.numpy(), samples.counts.numpy(),
+            samples.root_rows.numpy(), chances.numpy(),
+        ),
+        (rays.slots.numpy(), target.numpy(), world_from_body.numpy(), cells.roots.numpy()),
+        (
+            *(part.numpy() for part in skin.volume), skin.light.numpy(),
+            *map(np.float32, (skin.min_length, *skin.bounds)),
+        ),
+        (ends, priors.pair_weights.numpy(), priors.weights, np.float32(priors.max_slope_per_m)),
+        (table.detach().numpy(), *_network_arrays(network)),
+        _level_arrays(levels),
+        poses.levels if poses else 0,
+        _pose_arrays(poses),
+        (raw, grad_raw, rendered, loss, normals, wrenches),
+        (rows, grad_features, runs),
+        (*sums, strengths),
+    )  # fmt: skip
+    return LearntRays(
+        points=points,
+        log_density=torch.from_numpy(raw[: len(samples.points), 3]),
+        rendered=torch.from_numpy(rendered),
+        loss=torch.from_numpy(loss),
+        normals=torch.from_numpy(normals),
+        wrenches=torch.from_numpy(wrenches),
+        network=None if is_frozen else _network_gradients(sums),
+        features=FeatureGradients(rows, grad_features, runs),
+        strength=float(strengths.sum()) / max(total, 1),
+    )
+
+
+def _pose_arrays(poses: PosedBones | None) -> tuple[np.ndarray, ...]:
+    """Weights, shape, corner and resolution of the skinning, and the bones; empty if None."""
+    if poses is None:
+        weights, low, nodes_per_m, bones = (
+            np.zeros(size, np.float32) for size in ((0, 24), (3,), (3,), (0, 24, 12))
+        )
+        return weights, np.zeros(3, np.int32), low, nodes_per_m, bones
+    return *_skinning_arrays(poses.skinning), poses.bones.numpy()
+
+
+def add_table_gradient(learnt: LearntRays, levels: HashLevels, grad_table: HashTable) -> None:
+    """Adds the table's gradient of rays that were learnt to `grad_table`."""
+    rows, grad_features, runs = learnt.features
+    numba_hash_grid.encode_backward(
+        learnt.points.numpy(), rows, runs, *_level_arrays(levels), grad_features,
+        grad_table.numpy(), _threads(),
+    )  # fmt: skip
 
 
 def network_backward(
@@ -113,21 +195,49 @@ def network_backward(
     is_frozen: bool = False,
 ) -> tuple[Float32[Tensor, "some width"], NetworkLayers | None]:
     """Gradients of the features of the points in `rows`, and of the layers unless frozen."""
-    first, bias, second, _ = (part.detach().numpy() for part in network)
-    (width, hidden), threads = first.shape, numba.get_num_threads()
+    grad_features = torch.empty(len(rows), features.shape[1])
+    sums = _network_sums(_threads(), features.shape[1], is_frozen=is_frozen)
+    first, bias, second, _, transposed = _network_arrays(network)
+    numba_field.backward(
+        features.numpy(), rows.numpy(), grad_raw.numpy(), first, bias, second, transposed,
+        grad_features.numpy(), *sums,
+    )  # fmt: skip
+    return grad_features, None if is_frozen else _network_gradients(sums)
+
+
+def _threads() -> int:
+    return numba.get_num_threads()
+
+
+def _network_arrays(
+    network: NetworkLayers,
+) -> tuple[
+    Float32[np.ndarray, "width hidden"],
+    Float32[np.ndarray, "1 hidden"],
+    Float32[np.ndarray, "4 hidden"],
+    Float32[np.ndarray, "4"],
+    Float32[np.ndarray, "hidden padded"],
+]:
+    """W₁, b₁, W₂ᵀ, b₂, and W₁ᵀ with its width padded to a multiple of eight."""
+    first, bias, second, second_bias = (part.detach().numpy() for part in network)
+    width, hidden = first.shape
     transposed = np.zeros((hidden, -(-width // 8) * 8), dtype=np.float32)
     transposed[:, :width] = first.T
-    grad_features = torch.empty(len(rows), width)
+    return first, bias[None], np.ascontiguousarray(second.T), second_bias, transposed
+
+
+def _network_sums(
+    threads: int, width: int, *, is_frozen: bool
+) -> list[Float32[np.ndarray, "threads rows hidden"]]:
+    """Each thread's sums of the gradients of W₁, W₂ᵀ and both biases; no rows if frozen."""
     sizes = (0, 0, 0) if is_frozen else (width, 4, 2)
-    sums = [np.zeros((threads, size, hidden), dtype=np.float32) for size in sizes]
-    numba_field.backward(
-        features.numpy(), rows.numpy(), grad_raw.numpy(), first, bias[None],
-        np.ascontiguousarray(second.T), transposed, grad_features.numpy(), *sums,
-    )  # fmt: skip
-    if is_frozen:
-        return grad_features, None
+    return [np.zeros((threads, size, HIDDEN_WIDTH), dtype=np.float32) for size in sizes]
+
+
+def _network_gradients(sums: list[Float32[np.ndarray, "threads rows hidden"]]) -> NetworkLayers:
+    """The gradients of both layers, added up in the order of the threads."""
     grad_first, grad_second, grad_biases = (torch.from_numpy(part.sum(axis=0)) for part in sums)
-    return grad_features, (grad_first, grad_biases[0], grad_second.T, grad_biases[1, :4])
+    return grad_first, grad_biases[0], grad_second.T, grad_biases[1, :4]
 
 
 def _level_arrays(
@@ -231,28 +341,6 @@ def composite(raw: RawOutputs, samples: RaySamples, step_m: float) -> Premultipl
     return rendered
 
 
-def composite_loss(
-    raw: RawOutputs,
-    samples: RaySamples,
-    step_m: float,
-    target: PremultipliedPixels,
-    alpha_weight: float,
-    hard_weight: float,
-) -> tuple[PremultipliedPixels, Float32[Tensor, "rays"], RawOutputs]:
-    """Rendering and loss of each ray, and the mean loss's gradient with respect to `raw`.
-
-    The losses are InstantAvatar's (§3.4): Huber on color, L1 on alpha, hard surface.
-    """
-    rendered, loss = torch.empty(len(samples.counts), 4), torch.empty(len(samples.counts))
-    grad = torch.empty_like(raw)
-    numba_rendering.composite_loss(
-        raw.numpy(), samples.offsets.numpy(), samples.counts.numpy(), np.float32(step_m),
-        target.numpy(), np.float32(alpha_weight), np.float32(hard_weight),
-        rendered.numpy(), loss.numpy(), grad.numpy(),
-    )  # fmt: skip
-    return rendered, loss, grad
-
-
 def mean_normals(
     raw: RawOutputs,
     samples: RaySamples,
@@ -281,24 +369,6 @@ def scatter_max_density(
     )  # fmt: skip
 
 
-def bone_wrenches(
-    samples: RaySamples,
-    grad_points: Float32[Tensor, "samples 3"],
-    slots: Int32[Tensor, "rays"],
-    cells: CorrespondenceTables,
-    skin: SkinningVolume,
-    bones: Float32[Tensor, "slots 24 12"],
-) -> Float32[Tensor, "rays 24 6"]:
-    """Force and moment that each ray's samples exert on every bone, given their gradients."""
-    out = torch.zeros(len(slots), 24, 6)
-    numba_pose.bone_wrenches(
-        samples.points.numpy(), grad_points.numpy(), samples.root_rows.numpy(),
-        samples.offsets.numpy(), samples.counts.numpy(), slots.numpy(), cells.roots.numpy(),
-        *_skinning_arrays(skin), bones.numpy(), out.numpy(),
-    )  # fmt: skip
-    return out
-
-
 def update_roots(
     cells: CorrespondenceTables, slot: int, skin: SkinningVolume, bones: Float32[Tensor, "24 12"]
 ) -> None:
@@ -314,9 +384,14 @@ def _skinning_arrays(
     skin: SkinningVolume,
 ) -> tuple[
     Float32[np.ndarray, "nodes 24"],
-    tuple[int, ...],
+    Int32[np.ndarray, "3"],
     Float32[np.ndarray, "3"],
     Float32[np.ndarray, "3"],
 ]:
     nodes = skin.weights.numpy().reshape(-1, skin.weights.shape[3])
-    return nodes, tuple(skin.weights.shape[:3]), skin.low.numpy(), skin.nodes_per_m.numpy()
+    return (
+        nodes,
+        np.array(skin.weights.shape[:3], dtype=np.int32),
+        skin.low.numpy(),
+        skin.nodes_per_m.numpy(),
+    )

@@ -4,23 +4,31 @@ from typing import NamedTuple, Protocol, final, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Int32, Int64
+from jaxtyping import Float32
 from torch import Tensor
 
 from avatar import radiance_field
 from avatar.avatar_model import Avatar
 from avatar.config import TrainConfig
 from avatar.kernels import operations
-from avatar.kernels.numba_drawing import draw_strong_gradients
 from avatar.kernels.operands import (
+    CLOSE_PAIRS,
+    EMPTY_SPACE,
+    HEAD_INTERIOR,
+    INTERIOR,
+    OFF_SKIN,
+    SOURCE_PAIRS,
+    TV_PAIRS,
     CorrespondenceTables,
+    LossSettings,
     MarchSettings,
+    PosedBones,
     PremultipliedPixels,
+    PriorPoints,
     RayBatch,
     RaySamples,
 )
 from avatar.occupancy_grid import OccupancyGrid
-from avatar.radiance_field import RadianceField
 from avatar.training.pose_optimizer import PoseOptimizer
 from avatar.training.replay_buffer import TrainingBatch
 from avatar.training.unseen_skin import SourcePairs, UnseenSkin
@@ -85,12 +93,13 @@ class OccupancySampler:
 
 
 class StepResult(NamedTuple):
-    """Loss, shaded rendering and world normal of each ray, and the number of all their samples."""
+    """Loss, rendering and world normal of each ray; samples, and their gradients' mean strength."""
 
     loss: Float32[Tensor, "rays"]
     rendered: PremultipliedPixels
     normals: Float32[Tensor, "rays 3"]
     sample_count: int
+    mean_strength: float
 
 
 @torch.no_grad()
@@ -105,9 +114,14 @@ def compute_gradients(
     surface_share: float = 0.0,
     caches_density: bool = False,
     poses: PoseOptimizer | None = None,
+    mean_strength: float = 0.0,
     generator: torch.Generator,
 ) -> StepResult:
     """Renders a batch and adds the gradient of its mean loss to the field's parameters.
+
+    Half of the samples have a negligible gradient. Leaving these out biases the sum, and Adam
+    enlarges small gradients; a few of them, divided by their chance, keep the expected sum
+    ("Russian roulette").
 
     Args:
         hard_surface_share: Share of the hard-surface loss's weight, in [0, 1]; it grows in, because
@@ -115,51 +129,52 @@ def compute_gradients(
         surface_share: Progress from smooth densities to firm surfaces, in [0, 1].
         caches_density: Whether the samples raise the occupancy's cached densities.
         poses: Accumulates the samples' wrenches, if poses are refined.
+        mean_strength: Mean strength of the gradients of the step before; those below a share of it
+            (`faint_gradient_share`) are propagated by chance.
     """
     field = learner.field
     samples = sampler.sample_rays(batch.rays, correspondences)
-    asked = _regularization_points(sampler, learner.occupancy, samples.points, config, generator)
-    pairs = sampler.sample_source_pairs(config.unseen_points, generator)
-    asked.append(pairs.points)
-    seen = field.forward(torch.cat([samples.points, *asked]))
-    raw, *raw_asked = seen.raw.split([len(points) for points in (samples.points, *asked)])
-    count = len(raw)
-    normals = learner.shading.body_normals(
-        batch.rays, samples, raw, correspondences, config.sample_step_m
+    priors = _prior_points(
+        sampler, learner.occupancy, samples.points, config, surface_share, generator
     )
-    normals = (batch.world_from_body @ normals[..., None])[..., 0]
-    lit = learner.shading.factors(normals)
-    rendered, loss, grad = operations.composite_loss(
-        raw, samples, config.sample_step_m, batch.target / lit,
-        config.alpha_weight, config.hard_surface_weight * hard_surface_share,
-    )  # fmt: skip
-    grads = [grad, *_regularization_gradients(raw_asked, asked, config, surface_share)]
-    weight = config.unseen_weight / config.unseen_points
-    grads += [radiance_field.source_gradient(raw_asked[-1], pairs.weights, weight)]
-    drawn, drawn_grads = draw_by_strength(torch.cat(grads), config.faint_gradient_share, generator)
-    grad_features = field.backward(seen, drawn_grads, drawn)
+    count = len(samples.points)
+    chances = torch.rand(count + sum(map(len, priors.lists)), generator=generator)
+    bones = None
     if poses is not None and count:
-        drawn = drawn[drawn < count]
-        _accumulate_pose_gradients(
-            poses, field, samples, drawn, grad_features, batch.rays.slots, correspondences, loss
-        )
+        levels = field.levels.coarser_than(poses.min_gradient_cell_m)
+        bones = PosedBones(poses.skinning, poses.bones, len(levels.cells_per_m))
+    learnt = operations.learn(
+        batch.rays, batch.target, batch.world_from_body, samples, correspondences, priors,
+        learner.shading.lit_skin(), bones, chances, field.table, field.levels, field.network,
+        LossSettings(
+            config.sample_step_m, config.alpha_weight,
+            config.hard_surface_weight * hard_surface_share,
+            config.faint_gradient_share * mean_strength,
+        ),
+        is_frozen=field.is_frozen,
+    )  # fmt: skip
+    field.add_gradients(learnt)
+    if poses is not None and bones is not None:
+        poses.accumulate(batch.rays.slots.long(), learnt.wrenches, learnt.loss)
     if caches_density:
-        log_density = raw[:, 3].contiguous()
-        grid = learner.occupancy.density_grid
-        operations.scatter_max_density(seen.points[:count], log_density, grid)
-    return StepResult(loss, rendered * lit, normals, count)
+        operations.scatter_max_density(
+            samples.points, learnt.log_density.contiguous(), learner.occupancy.density_grid
+        )
+    return StepResult(learnt.loss, learnt.rendered, learnt.normals, count, learnt.strength)
 
 
-def _regularization_points(
+def _prior_points(
     sampler: RaySampler,
     occupancy: OccupancyGrid,
     points: Float32[Tensor, "samples 3"],
     config: TrainConfig,
+    surface_share: float,
     generator: torch.Generator,
-) -> list[Float32[Tensor, "_ 3"]]:
-    """Points of the regularizers: empty, TV pairs, interior, smoothness pairs, off skin, head."""
+) -> PriorPoints:
+    """Draws the points at which priors hold, and weighs the priors' terms."""
     none = points[:0]
-    return [
+    pairs = sampler.sample_source_pairs(config.unseen_points, generator)
+    lists = [
         sampler.sample_empty(config.empty_space_points, generator)
         if config.empty_space_weight
         else none,
@@ -174,87 +189,17 @@ def _regularization_points(
         occupancy.sample_interior(config.head_interior_points, generator, of_head=True)
         if config.head_interior_weight
         else none,
+        pairs.points,
     ]
-
-
-def _regularization_gradients(
-    raw: list[Float32[Tensor, "_ 4"]],
-    points: list[Float32[Tensor, "_ 3"]],
-    config: TrainConfig,
-    surface_share: float,
-) -> list[Float32[Tensor, "_ 4"]]:
-    """Gradients of the raw outputs at the points of `_regularization_points`, in their order."""
-    empty, pairs, solid, close, away, head, *_ = raw
-    grad_pairs = radiance_field.density_tv_gradient(pairs, config.density_tv_weight)
-    if config.double_well_weight:
-        grad_pairs += radiance_field.double_well_gradient(
-            pairs, config.double_well_weight * surface_share
-        )
-    grad_close = torch.zeros_like(close)
-    if len(close):
-        grad_close += radiance_field.density_slope_gradient(
-            close,
-            points[3],
-            config.max_log_density_slope_per_m,
-            config.density_slope_weight * surface_share,
-        )
-        grad_close += radiance_field.color_tv_gradient(
-            close, config.color_tv_weight * surface_share
-        )
-    return [
-        radiance_field.empty_space_gradient(empty, config.empty_space_weight),
-        grad_pairs,
-        radiance_field.interior_gradient(solid, config.interior_weight) if len(solid) else solid,
-        grad_close,
-        radiance_field.log_density_l1_gradient(away, config.off_skin_weight) if len(away) else away,
-        radiance_field.interior_gradient(
-            head, config.head_interior_weight * (1.0 - surface_share) ** 2
-        )
-        if len(head)
-        else head,
-    ]
-
-
-def draw_by_strength(
-    grads: Float32[Tensor, "points 4"], faint_share: float, generator: torch.Generator
-) -> tuple[Int64[Tensor, "drawn"], Float32[Tensor, "drawn 4"]]:
-    """Draws the points whose gradients are propagated, faint ones by chance ("Russian roulette").
-
-    Half of the samples have a negligible gradient. Leaving these out biases the sum, and Adam
-    enlarges small gradients; a few of them, divided by their chance, keep the expected sum. A
-    gradient is faint below `faint_share` of the mean strength. Returns points and divided
-    gradients.
-    """
-    if not faint_share:
-        return torch.arange(len(grads)), grads
-    chances = torch.rand(len(grads), generator=generator)
-    points, drawn = np.empty(len(grads), dtype=np.int64), np.empty(grads.shape, dtype=np.float32)
-    count = draw_strong_gradients(grads.numpy(), faint_share, chances.numpy(), points, drawn)
-    return torch.from_numpy(points[:count]), torch.from_numpy(drawn[:count])
-
-
-def _accumulate_pose_gradients(
-    poses: PoseOptimizer,
-    field: RadianceField,
-    samples: RaySamples,
-    drawn: Int64[Tensor, "drawn"],
-    grad_features: Float32[Tensor, "points width"],
-    slots: Int32[Tensor, "rays"],
-    cells: CorrespondenceTables,
-    loss: Float32[Tensor, "rays"],
-) -> None:
-    """Adds the wrenches that the samples exert on the bones of their frames' poses."""
-    levels = field.levels.coarser_than(poses.min_gradient_cell_m)
-    # undo the mean over rays: a pose is judged by the loss of each of its rays
-    grad_points = operations.encode_points_backward(
-        samples.points,
-        drawn,
-        grad_features[: len(drawn)],
-        field.table,
-        levels,
-        factor=float(len(loss)),
+    weights = np.zeros((len(lists), 2), dtype=np.float32)
+    weights[EMPTY_SPACE, 0] = config.empty_space_weight
+    weights[TV_PAIRS] = config.density_tv_weight, config.double_well_weight * surface_share
+    weights[INTERIOR, 0] = config.interior_weight
+    weights[CLOSE_PAIRS] = (
+        config.density_slope_weight * surface_share,
+        config.color_tv_weight * surface_share,
     )
-    wrenches = operations.bone_wrenches(
-        samples, grad_points, slots, cells, poses.skinning, poses.bones
-    )
-    poses.accumulate(slots.long(), wrenches, loss)
+    weights[OFF_SKIN, 0] = config.off_skin_weight
+    weights[HEAD_INTERIOR, 0] = config.head_interior_weight * (1.0 - surface_share) ** 2
+    weights[SOURCE_PAIRS, 0] = config.unseen_weight / config.unseen_points
+    return PriorPoints(lists, pairs.weights, weights, config.max_log_density_slope_per_m)

@@ -1,16 +1,22 @@
 """Whatever does not sum over points is bit-equal for any number of threads."""
 
 import numba
+import numpy as np
 import pytest
 import torch
 
 from avatar.kernels import operations
-from avatar.kernels.operands import AdamSettings, MarchSettings
+from avatar.kernels.operands import (
+    AdamSettings,
+    LossSettings,
+    MarchSettings,
+    PosedBones,
+    PriorPoints,
+)
 
 OPERATIONS = (
-    "encode", "field_forward", "encode_backward", "encode_points_backward", "march", "composite",
-    "composite_loss", "scatter_max_density", "bone_wrenches", "update_roots", "mean_normals",
-    "adam_step",
+    "encode", "field_forward", "encode_backward", "march", "composite", "learn",
+    "scatter_max_density", "update_roots", "mean_normals", "adam_step",
 )  # fmt: skip
 
 
@@ -28,14 +34,15 @@ def results_of(learnt) -> dict[str, list[torch.Tensor]]:
     grad_table = torch.zeros_like(field.table)
     rows = torch.arange(0, count, 2)
     operations.encode_backward(points, rows, slope[rows], field.levels, grad_table)
-    grad_points = operations.encode_points_backward(
-        points, rows, slope[rows], field.table, field.levels
-    )
     features, outputs = operations.field_forward(points, field.table, field.levels, field.network)
     operations.scatter_max_density(points, raw[:, 3].contiguous(), grid)
-    wrenches = operations.bone_wrenches(
-        samples, grad_points, batch.rays.slots, cells, poses.skinning, poses.bones
-    )
+    learnt = operations.learn(
+        batch.rays, batch.target, batch.world_from_body, samples, cells,
+        PriorPoints([points[:300]] + [points[:0]] * 6, points[0, :0], np.ones((7, 2), "f4"), 1.0),
+        trainer.learner.shading.lit_skin(), PosedBones(poses.skinning, poses.bones, 4),
+        torch.rand(count + 300, generator=generator), field.table, field.levels, field.network,
+        LossSettings(0.01, 0.1, 0.1, 1e-5),
+    )  # fmt: skip
     moved = cells._replace(roots=cells.roots.clone())
     operations.update_roots(moved, 0, poses.skinning, poses.bones[0])
     volume = trainer.learner.shading._normals
@@ -48,14 +55,10 @@ def results_of(learnt) -> dict[str, list[torch.Tensor]]:
         "encode": [operations.encode(points, field.table, field.levels)],
         "field_forward": [features, outputs],
         "encode_backward": [grad_table],
-        "encode_points_backward": [grad_points],
         "march": list(samples),
         "composite": [operations.composite(raw, samples, 0.01)],
-        "composite_loss": list(
-            operations.composite_loss(raw, samples, 0.01, batch.target, 0.1, 0.1)
-        ),
+        "learn": [learnt.log_density, learnt.rendered, learnt.loss, learnt.wrenches],
         "scatter_max_density": [grid.density],
-        "bone_wrenches": [wrenches],
         "update_roots": [moved.roots[0, : int((cells.packed_cells[0] >> 3).max())]],
     }
 

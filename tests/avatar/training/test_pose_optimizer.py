@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from avatar.config import COARSEST_M, TrainConfig
 from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
-from avatar.kernels import operations
+from avatar.kernels import numba_hash_grid, numba_pose, operations
 from avatar.kernels.operands import (
     FEATURES_PER_LEVEL,
     CorrespondenceTables,
@@ -75,6 +75,17 @@ def jacobians(table, points, slot):
     return torch.linalg.inv(torch.stack(rows, dim=1))
 
 
+def wrenches_of(samples, pull, slots, cells, skin, bones):
+    """Wrenches by the compiled kernel."""
+    out = np.empty((len(slots), 24, 6), dtype=np.float32)
+    numba_pose.write_wrenches(
+        0, len(slots), samples.points.numpy(), pull.numpy(), samples.root_rows.numpy(),
+        samples.offsets.numpy(), samples.counts.numpy(), slots.numpy(), cells.roots.numpy(),
+        *operations._skinning_arrays(skin), bones.numpy(), out,
+    )  # fmt: skip
+    return torch.from_numpy(out)
+
+
 def test_the_features_gradient_for_the_points_is_that_of_autograd(levels, generator):
     table = torch.randn(levels.entries, FEATURES_PER_LEVEL, generator=generator)
     extent = torch.from_numpy((levels.vertex_counts[0] - 1) / levels.cells_per_m[0]).float()
@@ -84,7 +95,12 @@ def test_the_features_gradient_for_the_points_is_that_of_autograd(levels, genera
     features = torch_reference.encode(leaf, table, levels)
     (expected,) = torch.autograd.grad(features, leaf, slope)
     rows = torch.randperm(500, generator=generator)[:300].sort().values
-    found = operations.encode_points_backward(points, rows, slope[rows], table, levels, factor=3.0)
+    found = torch.zeros_like(points)
+    numba_hash_grid.encode_points_backward(
+        points.numpy(), rows.numpy(), levels.low, levels.cells_per_m, levels.vertex_counts,
+        levels.is_dense, levels.offsets, table.numpy(), slope[rows].numpy(), np.float32(3.0),
+        found.numpy(),
+    )  # fmt: skip
     torch.testing.assert_close(found[rows], 3.0 * expected[rows], atol=3e-2, rtol=1e-4)
     assert int((found != 0.0).any(dim=1).sum()) == len(rows)
 
@@ -101,10 +117,8 @@ def test_compiled_wrenches_agree_with_their_meaning(rig, table, generator):
         offsets=torch.tensor([0, 150, 150]), counts=torch.tensor([150, 0, 250], dtype=torch.int32)
     )
     slots = torch.ones(3, dtype=torch.int32)
-    results = [
-        module.bone_wrenches(samples, pull, slots, cells, table.skinning, table.bones)
-        for module in (operations, torch_correspondence)
-    ]
+    operands = samples, pull, slots, cells, table.skinning, table.bones
+    results = wrenches_of(*operands), torch_correspondence.bone_wrenches(*operands)
     assert float(results[0][1].abs().max()) == 0.0
     torch.testing.assert_close(*results, atol=2e-2, rtol=1e-3)
 
@@ -156,7 +170,7 @@ def test_the_poses_gradient_is_what_the_roots_do_when_the_pose_moves(rig, table,
         torch.zeros(2, 1), roots, torch.zeros(2, 3), torch.zeros(2, 3), 0.03
     )
     slots = torch.ones(1, dtype=torch.int32)
-    wrenches = operations.bone_wrenches(samples, pull, slots, cells, table.skinning, table.bones)
+    wrenches = wrenches_of(samples, pull, slots, cells, table.skinning, table.bones)
     table.accumulate(slots.long(), wrenches, torch.ones(1))
     gradient = table.pose_gradient(1)
     given = (

@@ -3,12 +3,13 @@
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 import torch
 
 from avatar import radiance_field
 from avatar.config import MAX_SAMPLE_STEP_M, TrainConfig
-from avatar.kernels import operations
+from avatar.kernels import numba_training_step, operations
 from avatar.kernels.numba_priors import OPACITY_LENGTH_M
 from avatar.kernels.operands import MarchSettings, RaySamples
 from avatar.training.frame_stream import prepare_frame
@@ -17,7 +18,6 @@ from avatar.training.trainer import Trainer, cosine_decay
 from avatar.training.training_step import (
     OccupancySampler,
     compute_gradients,
-    draw_by_strength,
 )
 from baselines import torch_reference
 
@@ -140,34 +140,39 @@ def test_faint_gradients_that_are_drawn_by_chance_have_the_same_mean():
     generator = torch.Generator().manual_seed(0)
     grads = torch.randn(400, 4, generator=generator) * torch.logspace(-5, 0, 400)[:, None]
     grads[7] = 0.0
-    mean, kept = torch.zeros_like(grads), 0
-    for _ in range(400):
-        drawn, drawn_grads = draw_by_strength(grads, 0.3, generator)
-        mean.index_add_(0, drawn, drawn_grads / 400)
-        kept += len(drawn) / len(grads) / 400
     strength = grads.abs().sum(dim=1)
-    firm = strength >= 0.3 * strength.mean()
+    faint, mean, share = np.float32(0.3 * strength.mean()), torch.zeros_like(grads), 0.0
+    rows, drawn = np.empty(400, dtype=np.int64), torch.empty_like(grads)
+    for _ in range(400):
+        chances = torch.rand(400, generator=generator).numpy()
+        kept, total = numba_training_step._draw_strong(
+            grads.numpy(), chances, faint, rows, drawn.numpy()
+        )
+        mean.index_add_(0, torch.from_numpy(rows[:kept]), drawn[:kept] / 400)
+        share += kept / len(grads) / 400
+    assert float(total) == pytest.approx(float(strength.sum()), rel=1e-5)
+    firm = strength >= float(faint)
     torch.testing.assert_close(mean[firm], grads[firm], atol=1e-5, rtol=1e-4)
     assert not mean[7].any()
     assert float(mean[~firm].sum()) == pytest.approx(float(grads[~firm].sum()), abs=0.3)
-    assert 0.3 < kept < 0.6
-    assert torch.equal(draw_by_strength(grads, 0.0, generator)[1], grads)
+    assert 0.3 < share < 0.6
 
 
 def test_half_of_the_samples_give_nearly_the_steps_whole_gradient(trainer):
     """The table's gradient, and that of the poses, of one draw against those of all samples."""
-    found = []
+    found, strength = [], 0.0
     for share in (0.0, 0.2):
         poses = PoseOptimizer(trainer.avatar.rig, trainer.replay.capacity)
         for slot in range(4):
             poses.set_pose(slot, trainer.poses.pose(slot))
         trainer.field.table_grad.zero_()
-        compute_gradients(
+        result = compute_gradients(
             trainer.learner, trainer.sampler, trainer.replay.correspondences,
             trainer.replay.sample_rays(CONFIG.rays, torch.Generator().manual_seed(3)),
             dataclasses.replace(CONFIG, faint_gradient_share=share), hard_surface_share=1.0,
-            poses=poses, generator=torch.Generator().manual_seed(4),
+            poses=poses, mean_strength=strength, generator=torch.Generator().manual_seed(4),
         )  # fmt: skip
+        strength = result.mean_strength
         pulls = torch.cat([torch.from_numpy(poses.pose_gradient(slot)) for slot in range(4)])
         found.append((trainer.field.table_grad.clone(), pulls))
     for whole, drawn in zip(*found, strict=True):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from avatar import radiance_field
 from avatar.config import TrainConfig
+from avatar.kernels import numba_priors
 from avatar.kernels.numba_priors import OPACITY_LENGTH_M
 from avatar.training import checkpoint
 from avatar.training.frame_stream import prepare_frame
@@ -200,10 +200,11 @@ def test_the_gradient_is_that_of_cross_entropy_to_a_source_that_stands_still(gen
     raw = torch.randn(12, 4, generator=generator)
     raw[:, 3] += 4.0
     weights = torch.rand(6, generator=generator)
-    found = radiance_field.source_gradient(raw, weights, 0.7)
+    found = torch.zeros_like(raw)
+    numba_priors.toward_sources(raw.numpy(), weights.numpy(), np.float32(0.7), found.numpy())
     free = raw[:6].clone().requires_grad_()
     opacity = 1.0 - torch.exp(-torch.exp(raw[6:, 3]) * OPACITY_LENGTH_M)
-    target = (0.5 + radiance_field.SOURCE_STEEPNESS * (opacity - 0.5)).clamp(0.0, 1.0)
+    target = (0.5 + numba_priors.SOURCE_STEEPNESS * (opacity - 0.5)).clamp(0.0, 1.0)
     color = torch.nn.functional.binary_cross_entropy_with_logits(
         free[:, :3], torch.sigmoid(raw[6:, :3]), reduction="none"
     ).sum(dim=1)
