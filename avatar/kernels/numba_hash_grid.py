@@ -233,7 +233,8 @@ def encode_points_backward(
 
 
 @compile_kernel(**INLINED)
-def _adam_block(g, m, v, p, rate, new_share, new_square_share, scale, eps):
+def _adam_block(g, m, v, p, rates):
+    rate, new_share, new_square_share, scale, eps = rates
     for i in range(p.shape[0]):
         here = g[i]
         m[i] += (here - m[i]) * new_share
@@ -243,20 +244,20 @@ def _adam_block(g, m, v, p, rate, new_share, new_square_share, scale, eps):
 
 
 @compile_kernel(parallel=True, **FAST_MATH)
-def adam_step(grad, mean, square, parameter, rate, new_share, new_square_share, scale, eps):
+def adam_step(grad, mean, square, parameter, rates):
     """Adam's step on flat arrays; the gradient is zeroed in the same pass over the memory.
 
-    Blocks are slices, because LLVM vectorises only loops that begin at 0.
+    Blocks are slices, because LLVM vectorises only loops that begin at 0. `rates` are the learning
+    rate, the shares of the new gradient and of its square in their means, the scale of the squares'
+    root, and epsilon.
     """
     for block in prange((parameter.shape[0] + ENTRIES_PER_BLOCK - 1) // ENTRIES_PER_BLOCK):
         part = slice(block * ENTRIES_PER_BLOCK, (block + 1) * ENTRIES_PER_BLOCK)
-        _adam_block(
-            grad[part], mean[part], square[part], parameter[part],
-            rate, new_share, new_square_share, scale, eps,
-        )  # fmt: skip
+        _adam_block(grad[part], mean[part], square[part], parameter[part], rates)
 
 
 @compile_kernel(**FAST_MATH)
-def adam_block_step(grad, mean, square, parameter, rate, new_share, new_square_share, scale, eps):
-    """`adam_step` on one block, for which threads are not worth waking."""
-    _adam_block(grad, mean, square, parameter, rate, new_share, new_square_share, scale, eps)
+def adam_steps_of_blocks(parameters, rates):
+    """`adam_step` on parameters of a block each, for which threads are not worth waking."""
+    for grad, mean, square, parameter in parameters:
+        _adam_block(grad, mean, square, parameter, rates)

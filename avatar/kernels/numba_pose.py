@@ -293,6 +293,71 @@ def add_rays(
 
 
 @compile_kernel(**FAST_MATH)
+def gauss_newton(
+    curvature, gradient, stiffness, correction, mean, precision, sigmas, share, max_step, change,
+    alone,
+):  # fmt: skip
+    """Step of a pose correction, and the correction that its rays alone would make.
+
+        (C + s p) Δ = -(g + s p (correction - mean)), in prior sigmas
+
+    Args:
+        curvature, gradient: C (75, 75 or more) and g of the rays, in prior sigmas.
+        stiffness: s, the curvature of a mean ray.
+        correction, mean: Correction and the prior's mean, radians, and metres in the last row
+            (25, 3).
+        precision: p, relative to that of a tracker's pose.
+        sigmas: Prior standard deviation of each row (25).
+        share: Factor of the step.
+        max_step: Largest change of a number.
+        change, alone: The step, and what the rays alone converge to, in sigmas; written.
+    """
+    back, factor = np.empty(75), np.empty((75, 75))
+    found, largest = np.empty(75), max_step
+    for i in range(75):
+        back[i] = (correction[i // 3, i % 3] - mean[i // 3, i % 3]) / sigmas[i // 3]
+    solve_with_prior(curvature, gradient, precision * stiffness, back, factor, found)
+    for i in range(75):
+        change[i // 3, i % 3] = -share * sigmas[i // 3] * found[i]
+        largest = max(largest, abs(change[i // 3, i % 3]))
+        back[i] = correction[i // 3, i % 3] / sigmas[i // 3]
+    solve_with_prior(curvature, gradient, stiffness, back, factor, found)
+    for i in range(75):
+        change[i // 3, i % 3] *= max_step / largest
+        alone[i // 3, i % 3] = back[i] - found[i]
+
+
+@compile_kernel(**FAST_MATH)
+def fade(curvature, gradient, moments, moved, sigmas, decay):
+    """Weighs the sums of earlier rays, linearized where the correction has moved to by `moved`.
+
+    g ← decay (g + C moved), C ← decay C, in prior sigmas
+    """
+    for i in range(75):
+        total = F32(0)
+        for k in range(75):
+            total += curvature[i, k] * F32(moved[k // 3, k % 3] / sigmas[k // 3])
+        gradient[i] = decay * (gradient[i] + total)
+        for k in range(PADDED):
+            curvature[i, k] *= decay
+        if moments.shape[0] > 0:
+            for k in range(PADDED):
+                moments[i, k] *= decay
+
+
+@compile_kernel(**FAST_MATH)
+def largest_distance(one, other):
+    """Largest distance between points of two lists (points, 3)."""
+    largest = 0.0
+    for i in range(one.shape[0]):
+        square = 0.0
+        for a in range(3):
+            square += (one[i, a] - other[i, a]) ** 2
+        largest = max(largest, square)
+    return math.sqrt(largest)
+
+
+@compile_kernel(**FAST_MATH)
 def solve_with_prior(curvature, gradient, stiffness, back, factor, found):
     """Solves (curvature + stiffness) found = gradient + stiffness back by Cholesky's method.
 

@@ -148,10 +148,12 @@ def _fetch_cells(
 def _march_block(
     block, origins, directions, slots, jitter, sample_step_m,
     cell_index, cell_roots, cell_low, cell_shape, cell_m,
-    occupied, density, low, cells_per_m, opaque_margin_steps, points, rows, counts, next_steps,
+    occupied, density, low, cells_per_m, opaque_margin_steps, most_samples, points, rows, counts,
+    next_steps,
 ):  # fmt: skip
-    """Marches the rays of a block."""
-    most = U32(points.shape[1])
+    """Marches the rays of a block, whose samples lie one after the other from its place on."""
+    place = np.int64(block) * RAYS_PER_BLOCK * most_samples
+    most = U32(most_samples)
     ends = opaque_margin_steps < UNLIMITED_STEPS
     steps_a_m = F32(1) / sample_step_m
     first = block * RAYS_PER_BLOCK
@@ -211,10 +213,11 @@ def _march_block(
                         best, chosen, px, py, pz = here, row, x, y, z
                     row = U32(row + (U32(3) if bent else U32(1)))
                 if best >= F32(0):
-                    points[ray, kept, 0] = px
-                    points[ray, kept, 1] = py
-                    points[ray, kept, 2] = pz
-                    rows[ray, kept] = chosen
+                    points[place, 0] = px
+                    points[place, 1] = py
+                    points[place, 2] = pz
+                    rows[place] = chosen
+                    place += 1
                     kept += U32(1)
                     optical += best * sample_step_m
                     left -= optical > F32(OPAQUE_DEPTH)
@@ -230,20 +233,23 @@ def _march_block(
 def march(
     origins, directions, slots, jitter, sample_step_m,
     cell_index, cell_roots, cell_low, cell_shape, cell_m,
-    occupied, density, low, cells_per_m, opaque_margin_steps, points, rows, counts, next_steps,
+    occupied, density, low, cells_per_m, opaque_margin_steps, most_samples, points, rows, counts,
+    next_steps,
 ):  # fmt: skip
     """Canonical samples along body-frame rays, and the root row that each was warped with.
 
     Samples lie on the lattice `t = entry + (k + jitter) sample_step_m`. A sample is kept if its
     cell has a root whose canonical cell is occupied; of several roots the one of highest cached
     density is used. A ray ends `opaque_margin_steps` samples after its cached optical depth passes
-    `OPAQUE_DEPTH`, or when `points` is full; `next_steps` is the lattice step that continues it.
+    `OPAQUE_DEPTH`, or after `most_samples` samples; `next_steps` is the lattice step that
+    continues it. `points` and `rows` have room for as many samples of each ray; those of a block of
+    rays lie together.
     """
     for block in prange((origins.shape[0] + RAYS_PER_BLOCK - 1) // RAYS_PER_BLOCK):
         _march_block(
             np.int64(block), origins, directions, slots, jitter, sample_step_m,
             cell_index, cell_roots, cell_low, cell_shape, cell_m,
-            occupied, density, low, cells_per_m, opaque_margin_steps,
+            occupied, density, low, cells_per_m, opaque_margin_steps, most_samples,
             points, rows, counts, next_steps,
         )  # fmt: skip
 
@@ -259,13 +265,18 @@ def prefix_sum(counts, first):
 
 
 @compile_kernel(**NO_ALLOCATION)
-def pack_samples(padded, padded_rows, first, counts, points, rows):
-    """Copies each ray's samples from its own line to one list without gaps."""
+def pack_samples(padded, padded_rows, most_samples, counts, points, rows):
+    """Copies the samples of each block of rays, as `march` wrote them, to one list without gaps."""
+    place, packed = 0, 0
     for ray in range(counts.shape[0]):
-        for n in range(counts[ray]):
-            rows[first[ray] + n] = padded_rows[ray, n]
+        if ray % RAYS_PER_BLOCK == 0:
+            place = ray * most_samples
+        for _ in range(counts[ray]):
+            rows[packed] = padded_rows[place]
             for axis in range(3):
-                points[first[ray] + n, axis] = padded[ray, n, axis]
+                points[packed, axis] = padded[place, axis]
+            place += 1
+            packed += 1
 
 
 @compile_kernel(nogil=True, fastmath=True)

@@ -14,7 +14,7 @@ import numpy as np
 from numba import prange
 
 from avatar.kernels import numba_priors
-from avatar.kernels.kernel_compiler import FAST_MATH, compile_kernel
+from avatar.kernels.kernel_compiler import FAST_MATH, INLINED, compile_kernel
 from avatar.kernels.numba_field import backward_passes, forward_block
 from avatar.kernels.numba_hash_grid import POINTS_PER_BLOCK, encode_points_backward
 from avatar.kernels.numba_pose import write_wrenches
@@ -30,7 +30,7 @@ from avatar.kernels.operands import (
     TV_PAIRS,
 )
 
-F32, I32 = np.float32, np.int32
+F32, U32 = np.float32, np.uint32
 RAYS_PER_BLOCK = 32
 """Rays that pass through the step together: about 200 samples, whose features fit a core's cache
 beside the network."""
@@ -58,18 +58,31 @@ def _add_prior_gradients(kind, raw, points, pair_weights, weights, max_slope_per
         numba_priors.toward_sources(raw, pair_weights, weight, grad)
 
 
+@compile_kernel(**INLINED)
+def _chance(seed, number):
+    """A random number in [0, 1): a hash of its number (Wellons' lowbias32) that depends on a seed.
+
+    As good as any for a draw, the same for any number of threads, and nothing to be filled before.
+    """
+    x = U32(U32(number) ^ U32(seed))
+    x = U32(U32(x ^ (x >> U32(16))) * U32(0x7FEB352D))
+    x = U32(U32(x ^ (x >> U32(15))) * U32(0x846CA68B))
+    return F32(U32(x ^ (x >> U32(16))) >> U32(8)) * F32(2.0**-24)
+
+
 @compile_kernel(**FAST_MATH)
-def _draw_strong(grads, chances, faint, rows, drawn):
+def _draw_strong(grads, seed, first, faint, rows, drawn):
     """Draws points by the strength of their gradients; returns their number, and all strength.
 
-    Gradients weaker than `faint` are drawn by chance. Rows and gradients, divided by the chance of
-    each, are written from the front.
+    Gradients weaker than `faint` are drawn by chance, which depends on the seed and on the number
+    of the point, counted from `first`. Rows and gradients, divided by the chance of each, are
+    written from the front.
     """
     count, total = 0, F32(0)
     for n in range(grads.shape[0]):
         strength = abs(grads[n, 0]) + abs(grads[n, 1]) + abs(grads[n, 2]) + abs(grads[n, 3])
         total += strength
-        if chances[n] * faint < strength:
+        if _chance(seed, first + n) * faint < strength:
             rows[count] = n
             for q in range(4):
                 drawn[count, q] = grads[n, q] * max(faint / strength, F32(1))
@@ -109,7 +122,7 @@ def _learn_share(
     outputs, backward, sums,
 ):  # fmt: skip
     """Takes one thread's blocks through the step."""
-    points, sample_offsets, sample_counts, root_rows, chances = samples
+    points, sample_offsets, sample_counts, root_rows = samples
     slots, target, world_from_body, roots = rays
     skin, skin_low, skin_cells_per_m, light, min_length, least, most = surface
     ends, pair_weights, weights, max_slope_per_m = priors
@@ -119,7 +132,7 @@ def _learn_share(
     raw, grad_raw, rendered, loss, normals, wrenches = outputs
     rows, grad_features, runs = backward
     weight_sums, output_sums, bias_sums, strengths = sums
-    sample_step_m, alpha_weight, hard_weight, faint, needs_normals = settings
+    sample_step_m, alpha_weight, hard_weight, faint, seed, needs_normals = settings
 
     ray_count, kind_count = slots.shape[0], weights.shape[0]
     ray_blocks = (ray_count + RAYS_PER_BLOCK - 1) // RAYS_PER_BLOCK
@@ -167,7 +180,7 @@ def _learn_share(
                 for q in range(3):
                     rendered[r, q] *= lit[r]
         row_part, feature_part = rows[start:stop], grad_features[start:stop]
-        kept, strength = _draw_strong(grad_part, chances[start:stop], faint, row_part, drawn)
+        kept, strength = _draw_strong(grad_part, seed, start, faint, row_part, drawn)
         strengths[block], runs[block, 0], runs[block, 1] = strength, start, kept
         row_part, feature_part = row_part[:kept], feature_part[:kept]
         backward_passes(
@@ -219,9 +232,10 @@ def learn(
     Args:
         threads: Number of threads.
         settings: Distance between samples, metres; weights of the losses of alpha and of the hard
-            surface; strength below which a gradient is drawn by chance; whether normals are needed.
+            surface; strength below which a gradient is drawn by chance, and a seed of the draw;
+            whether normals are needed.
         samples: Canonical points, those of the rays and then those of the priors (points, 3); of
-            the rays' samples offsets, counts and root rows; random numbers in [0, 1) (points).
+            the rays' samples offsets, counts and root rows.
         rays: Slots, pixels (rays, 4), world-from-body rotations (rays, 3, 3), and the roots of all
             slots (slots, rows, 12).
         surface: Normals of the skin's volume, its corner and resolution; coefficients of the light;

@@ -1,6 +1,6 @@
 """The operands of the kernels (`avatar.kernels.operations`): what they read and write."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -70,16 +70,9 @@ class HashLevels:
             offsets=np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
         )
 
-    def coarser_than(self, cell_m: float) -> "HashLevels":
-        """The levels whose cells are at least `cell_m` metres wide; the coarsest in any case."""
-        kept = max(int((1.0 / self.cells_per_m >= cell_m).sum()), 1)
-        return replace(
-            self,
-            cells_per_m=self.cells_per_m[:kept],
-            vertex_counts=self.vertex_counts[:kept],
-            is_dense=self.is_dense[:kept],
-            offsets=self.offsets[: kept + 1],
-        )
+    def count_from(self, cell_m: float) -> int:
+        """Number of the levels whose cells are at least `cell_m` metres wide; at least one."""
+        return max(int((self.cells_per_m * cell_m <= 1.0).sum()), 1)
 
     @property
     def entries(self) -> int:

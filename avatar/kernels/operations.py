@@ -100,7 +100,7 @@ def learn(
     priors: PriorPoints,
     skin: LitSkin,
     poses: PosedBones | None,
-    chances: Float32[Tensor, "points"],
+    seed: int,
     table: HashTable,
     levels: HashLevels,
     network: NetworkLayers,
@@ -116,7 +116,7 @@ def learn(
         target, world_from_body: Pixels and rotations of the rays.
         priors: Points at which priors hold, and their weights.
         poses: Poses for which wrenches are computed; none if None.
-        chances: Random numbers in [0, 1) of the samples and the priors' points, for their draw.
+        seed: Of the draw of the gradients that are propagated, below 2³².
         is_frozen: Leaves the gradients of the network out.
     """
     points = torch.cat([samples.points, *priors.lists])
@@ -134,11 +134,12 @@ def learn(
         threads,
         (
             np.float32(how.sample_step_m), np.float32(how.alpha_weight),
-            np.float32(how.hard_surface_weight), np.float32(how.faint), skin.is_needed,
+            np.float32(how.hard_surface_weight), np.float32(how.faint), np.uint32(seed),
+            skin.is_needed,
         ),
         (
             points.numpy(), samples.offsets.numpy(), samples.counts.numpy(),
-            samples.root_rows.numpy(), chances.numpy(),
+            samples.root_rows.numpy(),
         ),
         (rays.slots.numpy(), target.numpy(), world_from_body.numpy(), cells.roots.numpy()),
         (
@@ -252,20 +253,23 @@ def _level_arrays(
     return levels.low, levels.cells_per_m, levels.vertex_counts, levels.is_dense, levels.offsets
 
 
-def adam_step(
-    how: AdamSettings, grad: Tensor, mean: Tensor, square: Tensor, parameter: Tensor
-) -> None:
-    """Takes Adam's step on contiguous tensors, in place, and zeroes the gradient.
+def adam_step(how: AdamSettings, parameters: list[tuple[Tensor, Tensor, Tensor, Tensor]]) -> None:
+    """Takes Adam's step on contiguous tensors, in place, and zeroes the gradients.
 
-    `mean` and `square` are the running means of the gradient and of its square.
+    Each parameter has its gradient, the running means of the gradient and of its square, and the
+    numbers themselves.
     """
     (first, second), (rate, scale) = how.betas, how.scales
-    is_small = parameter.numel() <= numba_hash_grid.ENTRIES_PER_BLOCK
-    step = numba_hash_grid.adam_block_step if is_small else numba_hash_grid.adam_step
-    step(
-        *(part.detach().view(-1).numpy() for part in (grad, mean, square, parameter)),
-        *map(np.float32, (rate, 1.0 - first, 1.0 - second, scale, how.eps)),
-    )
+    rates = tuple(map(np.float32, (rate, 1.0 - first, 1.0 - second, scale, how.eps)))
+    small = []
+    for parts in parameters:
+        arrays = tuple(part.detach().view(-1).numpy() for part in parts)
+        if len(arrays[0]) > numba_hash_grid.ENTRIES_PER_BLOCK:
+            numba_hash_grid.adam_step(*arrays, rates)
+        else:
+            small.append(arrays)
+    if small:
+        numba_hash_grid.adam_steps_of_blocks(tuple(small), rates)
 
 
 def solve_correspondences(
@@ -293,41 +297,34 @@ def march_resumable(
     rays: RayBatch, cells: CorrespondenceTables, grid: DensityGrid, how: MarchSettings
 ) -> tuple[RaySamples, Float32[Tensor, "rays"]]:
     """Marches, and returns the jitter at which rays with `max_samples` samples continue."""
-    padded, padded_rows = _scratch_samples(len(rays.slots), how.max_samples)
+    padded, padded_rows = _scratch_samples(len(rays.slots) * how.max_samples)
     count, reached = torch.empty(2, len(rays.slots), dtype=torch.int32)
     first = torch.empty(len(rays.slots), dtype=torch.int64)
     numba_rendering.march(
         *(part.numpy() for part in rays), np.float32(how.sample_step_m),
         *(part.numpy() for part in cells[:4]), np.float32(cells.cell_m),
-        *(part.numpy() for part in grid), how.opaque_margin_steps, padded, padded_rows,
-        count.numpy(), reached.numpy(),
+        *(part.numpy() for part in grid), how.opaque_margin_steps, how.max_samples, padded,
+        padded_rows, count.numpy(), reached.numpy(),
     )  # fmt: skip
     total = numba_rendering.prefix_sum(count.numpy(), first.numpy())
     points, rows = torch.empty(total, 3), torch.empty(total, dtype=torch.int32)
     numba_rendering.pack_samples(
-        padded, padded_rows, first.numpy(), count.numpy(), points.numpy(), rows.numpy()
+        padded, padded_rows, how.max_samples, count.numpy(), points.numpy(), rows.numpy()
     )
     return RaySamples(points, first, count, rows), rays.jitter + reached
 
 
 def _scratch_samples(
-    rays: int, max_samples: int
-) -> tuple[Float32[np.ndarray, "rays most 3"], Int32[np.ndarray, "rays most"]]:
-    """Room for the samples of rays before they are packed; what a thread asked for last, if small.
+    most: int,
+) -> tuple[Float32[np.ndarray, "most 3"], Int32[np.ndarray, "most"]]:
+    """Room for samples before they are packed; what a thread asked for last, if small.
 
     Fresh memory costs a page fault for every 4 KiB: a third of a march of one-sample rays.
     """
-    key, room = getattr(_SCRATCH, "room", (None, None))
-    if room is None or key != (rays, max_samples):
-        room = (
-            np.empty((rays, max_samples, 3), dtype=np.float32),
-            np.empty((rays, max_samples), dtype=np.int32),
-        )
-        _SCRATCH.room = (
-            ((rays, max_samples), room)
-            if rays * max_samples <= MAX_REUSED_SAMPLES
-            else (None, None)
-        )
+    room = getattr(_SCRATCH, "room", None)
+    if room is None or len(room[1]) < most:
+        room = np.empty((most, 3), dtype=np.float32), np.empty(most, dtype=np.int32)
+        _SCRATCH.room = room if most <= MAX_REUSED_SAMPLES else None
     return room
 
 

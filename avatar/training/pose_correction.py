@@ -35,6 +35,8 @@ NEIGHBOR_PRECISION = 16.0
 an estimate is as large as the error that neighbors leave unknown."""
 MIN_NOISE_SHARE = 0.1
 """Least share of noise in the estimates' power."""
+PRIORS_PER_PRECISION = 8
+"""Priors for which the neighbors' precision, a sum over all frames, is measured once."""
 MAX_PERSISTENCE = 0.9
 """Largest correlation of neighbors' errors that is believed."""
 
@@ -61,6 +63,7 @@ class TemporalPosePrior:
     def __init__(self, capacity: int) -> None:
         """Starts without frames."""
         self._frames = np.zeros(capacity, dtype=np.int64)
+        self._precision, self._priors = 0.0, 0
         self._unregularized = np.zeros((capacity, 25, 3))
         self._is_sequential, self._has_estimate = np.zeros((2, capacity), dtype=bool)
 
@@ -68,6 +71,7 @@ class TemporalPosePrior:
         """Assigns a frame number to a slot; None if the frame has no neighbors."""
         self._is_sequential[slot], self._has_estimate[slot] = frame is not None, False
         self._frames[slot] = frame or 0
+        self._priors = 0
 
     def record_estimate(self, slot: int, unregularized: Float[np.ndarray, "25 3"]) -> None:
         """Records the correction that a slot's rays alone would make, in prior sigmas."""
@@ -81,9 +85,13 @@ class TemporalPosePrior:
         row = self._is_sequential
         if not row[slot]:
             return UNINFORMATIVE_PRIOR
-        precision = neighbor_precision(self._frames, self._unregularized, self._has_estimate)
+        if self._priors % PRIORS_PER_PRECISION == 0:
+            self._precision = neighbor_precision(
+                self._frames, self._unregularized, self._has_estimate
+            )
+        self._priors += 1
         frame = int(self._frames[slot])
-        return prior_from_neighbors(frame, self._frames, corrections, row, precision)
+        return prior_from_neighbors(frame, self._frames, corrections, row, self._precision)
 
 
 @compile_kernel(**FAST_MATH)
@@ -202,7 +210,8 @@ MAX_STEP = 0.1
 """Largest change of a parameter in one step, radians or metres."""
 
 
-PRIOR_SIGMAS = np.append(np.full(24, PRIOR_SIGMA_RAD), PRIOR_SIGMA_M)[:, None]
+SIGMA_OF_ROW = np.append(np.full(24, PRIOR_SIGMA_RAD), PRIOR_SIGMA_M)
+PRIOR_SIGMAS = SIGMA_OF_ROW[:, None]
 """Prior standard deviation of each row of a correction."""
 
 
@@ -280,14 +289,12 @@ class RaySums:
 
         The count starts again from 0; the rays so far weigh `decay`, in [0, 1).
         """
-        curvature, gradient = self._curvatures[slot], self._gradients[slot]
-        steps = (moved / PRIOR_SIGMAS).astype(np.float32).reshape(75)
-        # linearized at the new correction: g + (Σ ∇ℓ ∇ℓᵀ / 2ℓ) moved, in prior sigmas
-        gradient[:75] = decay * (gradient[:75] + curvature[:, :75] @ steps)
-        curvature *= decay
+        moments = self._moments[slot] if len(self._moments) else self._moments[:, 0]
+        numba_pose.fade(
+            self._curvatures[slot], self._gradients[slot], moments, moved, SIGMA_OF_ROW,
+            np.float32(decay),
+        )  # fmt: skip
         self.counts[slot], self._powers[slot] = 0, 0.0
-        if len(self._moments):
-            self._moments[slot] *= decay
 
     def clear(self, slot: int) -> None:
         """Forgets a slot's rays."""
@@ -328,19 +335,12 @@ def gauss_newton_step(
         full = FULL_EVIDENCE - MIN_EVIDENCE
         share = min(max((0.5 * (evidence + shared_evidence) - MIN_EVIDENCE) / full, 0.0), 1.0)
 
-    room = np.empty((75, 75))
-
-    def asked(believed: PosePrior) -> Float[np.ndarray, "25 3"]:
-        back, found = ((correction - believed.mean) / PRIOR_SIGMAS).reshape(75), np.empty(75)
-        stiffness = believed.precision * rays.ray_stiffness
-        numba_pose.solve_with_prior(rays.curvature, rays.gradient, stiffness, back, room, found)
-        return found.reshape(25, 3)
-
-    # Gauss-Newton: (C + s) Δ = -(g + s (correction - mean)), in prior sigmas
-    change = -share * PRIOR_SIGMAS * asked(prior)
-    shortened = MAX_STEP / max(float(np.abs(change).max()), MAX_STEP)
-    alone = correction / PRIOR_SIGMAS - asked(UNINFORMATIVE_PRIOR)
-    return GaussNewtonStep(shortened * change, evidence, alone)
+    change, alone = np.empty((2, 25, 3))
+    numba_pose.gauss_newton(
+        rays.curvature, rays.gradient, rays.ray_stiffness, correction, prior.mean,
+        float(prior.precision), SIGMA_OF_ROW, share, MAX_STEP, change, alone,
+    )  # fmt: skip
+    return GaussNewtonStep(change, evidence, alone)
 
 
 def _agreement(rays: NormalEquations) -> float:

@@ -18,7 +18,7 @@ from jaxtyping import Float, Float32, Int64
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from avatar.kernels.numba_pose import pose_joints
+from avatar.kernels.numba_pose import largest_distance, pose_joints
 from avatar.kernels.operands import SkinningVolume
 from avatar.rig import Rig
 from avatar.training.pose_correction import (
@@ -151,6 +151,7 @@ class PoseOptimizer:
         self._estimate_count, self._evidence_sum = np.zeros((2, capacity))
         self._temporal_prior = TemporalPosePrior(capacity)
         self._is_correctable = np.ones(capacity, dtype=bool)
+        self._is_held = np.zeros(capacity, dtype=bool)
 
     def set_pose(
         self,
@@ -167,7 +168,7 @@ class PoseOptimizer:
         """
         self._tracker_poses[slot] = pose
         self._added_at_step[slot] = step
-        self._is_correctable[slot] = True
+        self._is_correctable[slot] = self._is_held[slot] = True
         self._is_frozen[slot] = False
         self._temporal_prior.set_frame(slot, frame)
         self._estimate_count[slot] = self._evidence_sum[slot] = 0.0
@@ -216,7 +217,6 @@ class PoseOptimizer:
         Poses of new frames wait; poses that proved exact, or that may be exact and were refined
         long enough, are frozen.
         """
-        held = np.array([pose is not None for pose in self._tracker_poses])
         age = step - self._added_at_step
         self._can_freeze = age >= MIN_STEPS_BEFORE_FREEZE
         told = self._evidence_sum / self._estimate_count.clip(min=1)
@@ -225,7 +225,7 @@ class PoseOptimizer:
         )
         if self.poses_may_be_exact:
             self._is_frozen |= exact | (age >= FREEZE_AFTER_STEPS)
-        open_now = held & ~self._is_frozen & (age >= FIRST_CORRECTION_STEPS)
+        open_now = self._is_held & ~self._is_frozen & (age >= FIRST_CORRECTION_STEPS)
         self._is_correctable = open_now
         self._rays.counts *= open_now
         return bool(open_now.any())
@@ -269,8 +269,7 @@ class PoseOptimizer:
         self._moved_share += (1.0 - EVIDENCE_EMA_DECAY) * (moves - self._moved_share)
         change, before = rate * step.change, self.corrections[slot].copy()
         if moves and self.poses_may_be_exact:
-            held = [i for i, pose in enumerate(self._tracker_poses) if pose is not None]
-            mean = self.corrections[held].mean(axis=0)
+            mean = self.corrections[self._is_held].mean(axis=0)
             change = STEP_DAMPING * change - MEAN_CORRECTION_DECAY * mean
         if moves:
             self._apply_correction(slot, np.clip(before + change, -MAX_CORRECTION, MAX_CORRECTION))
@@ -289,10 +288,10 @@ class PoseOptimizer:
         The caller is expected to solve them when the answer is True.
         """
         places = self._joints.places[slot]
-        moved = np.linalg.norm(places - self._joints_at_solve[slot], axis=1).max()
+        moved = largest_distance(places, self._joints_at_solve[slot])
         if moved > RESOLVE_DISTANCE_M:
             self._joints_at_solve[slot] = places
-        return bool(moved > RESOLVE_DISTANCE_M)
+        return moved > RESOLVE_DISTANCE_M
 
     def root_correction(self, slot: int) -> RootCorrection:
         """Motion of the slot's rays by its root correction."""
@@ -308,16 +307,15 @@ class PoseOptimizer:
         before, places = self.corrections[slot].copy(), self._joints.places[slot].copy()
         self.corrections[slot] = correction
         self._update_bones(slot)
-        moved = float(np.linalg.norm(self._joints.places[slot] - places, axis=1).max())
+        moved = largest_distance(self._joints.places[slot], places)
         if moved > MAX_JOINT_STEP_M:
             self.corrections[slot] = before + MAX_JOINT_STEP_M / moved * (correction - before)
             self._update_bones(slot)
 
     def _update_bones(self, slot: int) -> None:
         turns, places, root_turns = self._joints
-        bones = np.empty((24, 12), dtype=np.float32)
         pose_joints(
             self._given_turns[slot], self.corrections[slot], self.rig.rest_joints, self._parents,
-            self._rest_from_canonical, turns[slot], places[slot], bones, root_turns[slot],
+            self._rest_from_canonical, turns[slot], places[slot], self.bones.numpy()[slot],
+            root_turns[slot],
         )  # fmt: skip
-        self.bones[slot] = torch.from_numpy(bones)

@@ -81,6 +81,7 @@ def step_optimizer(optimizer: UncompiledAdam) -> None:
     The state is that of `torch.optim.Adam`, whose own kernel takes 1.5 times as long.
     """
     for group in optimizer.param_groups:
+        parameters, steps = [], 0
         for parameter in group["params"]:
             state = optimizer.state[parameter]
             if not state:
@@ -88,10 +89,11 @@ def step_optimizer(optimizer: UncompiledAdam) -> None:
                 state["exp_avg"] = torch.zeros_like(parameter)
                 state["exp_avg_sq"] = torch.zeros_like(parameter)
             state["step"] += 1
-            how = AdamSettings(group["lr"], group["betas"], group["eps"], int(state["step"]))
-            operations.adam_step(
-                how, parameter.grad, state["exp_avg"], state["exp_avg_sq"], parameter
-            )
+            steps = int(state["step"])  # a group's parameters have made as many
+            means = state["exp_avg"], state["exp_avg_sq"]
+            parameters.append((parameter.grad, *means, parameter))
+        how = AdamSettings(group["lr"], group["betas"], group["eps"], steps)
+        operations.adam_step(how, parameters)
 
 
 NETWORK_RATE_FACTOR = 0.3

@@ -137,15 +137,14 @@ def compute_gradients(
     priors = _prior_points(
         sampler, learner.occupancy, samples.points, config, surface_share, generator
     )
-    count = len(samples.points)
-    chances = torch.rand(count + sum(map(len, priors.lists)), generator=generator)
-    bones = None
+    count, bones = len(samples.points), None
+    seed = int(torch.randint(1 << 32, (), generator=generator))
     if poses is not None and count:
-        levels = field.levels.coarser_than(poses.min_gradient_cell_m)
-        bones = PosedBones(poses.skinning, poses.bones, len(levels.cells_per_m))
+        levels = field.levels.count_from(poses.min_gradient_cell_m)
+        bones = PosedBones(poses.skinning, poses.bones, levels)
     learnt = operations.learn(
         batch.rays, batch.target, batch.world_from_body, samples, correspondences, priors,
-        learner.shading.lit_skin(), bones, chances, field.table, field.levels, field.network,
+        learner.shading.lit_skin(), bones, seed, field.table, field.levels, field.network,
         LossSettings(
             config.sample_step_m, config.alpha_weight,
             config.hard_surface_weight * hard_surface_share,

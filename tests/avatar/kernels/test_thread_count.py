@@ -40,7 +40,7 @@ def results_of(learnt) -> dict[str, list[torch.Tensor]]:
         batch.rays, batch.target, batch.world_from_body, samples, cells,
         PriorPoints([points[:300]] + [points[:0]] * 6, points[0, :0], np.ones((7, 2), "f4"), 1.0),
         trainer.learner.shading.lit_skin(), PosedBones(poses.skinning, poses.bones, 4),
-        torch.rand(count + 300, generator=generator), field.table, field.levels, field.network,
+        1, field.table, field.levels, field.network,
         LossSettings(0.01, 0.1, 0.1, 1e-5),
     )  # fmt: skip
     moved = cells._replace(roots=cells.roots.clone())
@@ -48,7 +48,7 @@ def results_of(learnt) -> dict[str, list[torch.Tensor]]:
     volume = trainer.learner.shading._normals
     normals = operations.mean_normals(raw, samples, 0.01, batch.rays.slots, cells, volume)
     stepped = [grad_table.clone(), *(torch.ones_like(grad_table) for _ in range(3))]
-    operations.adam_step(AdamSettings(0.01, (0.9, 0.99), 1e-15, 1), *stepped)
+    operations.adam_step(AdamSettings(0.01, (0.9, 0.99), 1e-15, 1), [tuple(stepped)])
     return {
         "mean_normals": [normals],
         "adam_step": stepped[1:],

@@ -308,13 +308,14 @@ def test_cells_that_tell_of_poses_are_small_enough_whatever_the_detail(footprint
         np.zeros(3, np.float32), np.ones(3, np.float32), coarsest_m=COARSEST_M,
         finest_m=config.finest_m, levels=config.levels, table_size=config.table_size,
     )  # fmt: skip
-    assert 1.0 / levels.coarser_than(MIN_POSE_GRADIENT_CELL_M).cells_per_m[-1] < 0.025
+    finest = levels.count_from(MIN_POSE_GRADIENT_CELL_M) - 1
+    assert 1.0 / levels.cells_per_m[finest] < 0.025
 
 
 def test_fine_levels_pull_held_out_poses_in_the_second_half_alone(learnt, clip, monkeypatch):
     asked = list[float]()
     monkeypatch.setattr(
-        HashLevels, "coarser_than", lambda levels, cell_m: (asked.append(cell_m), levels)[1]
+        HashLevels, "count_from", lambda levels, cell_m: (asked.append(cell_m), 1)[1]
     )
     list(fit_test_poses(learnt.trainer, [HeldOutFrame(observation=clip.observations[11])]))
     assert asked == 6 * [MIN_POSE_GRADIENT_CELL_M] + 6 * [0.0]
