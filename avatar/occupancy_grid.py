@@ -37,7 +37,7 @@ OFF_SKIN_M = 0.03
 """Distance from the skin within which clothes are spared, metres."""
 MIN_COMPONENT_SHARE = 0.003
 """Size, relative to the largest component, below which a component is a floater."""
-FLOATER_INTERVAL = 4
+FLOATER_INTERVAL = 8
 """Updates of the occupancy between searches for floaters."""
 
 
