@@ -43,10 +43,11 @@ class RadianceField:
 
     One network of `width → 64 → 4`: 2.8 times cheaper than the two of the paper's code. `layers`
     are the weights and biases of both layers; `backward` of a frozen field leaves their gradients
-    out.
+    out. `gradient_strength` is the mean strength of the points' gradients in the last step.
     """
 
     is_frozen = False
+    gradient_strength = 0.0
 
     def __init__(self, levels: HashLevels, generator: torch.Generator) -> None:
         """Draws the initial parameters from `generator`."""

@@ -86,16 +86,14 @@ def _fit_frames(
     sampler = OccupancySampler(avatar.occupancy, config)
     generator = torch.Generator().manual_seed(config.seed)
     steps = math.ceil(CORRECTIONS_PER_FRAME * len(replay) / at_once)
-    strength = 0.0
     for step in range(steps):
         if step >= COARSE_SHARE * steps:
             poses.min_gradient_cell_m = 0.0
         batch = replay.sample_rays(config.rays, generator)
         result = compute_gradients(
             avatar, sampler, replay.correspondences, exposures.neutralize(batch), config,
-            hard_surface_share=1.0, poses=poses, mean_strength=strength, generator=generator,
+            hard_surface_share=1.0, poses=poses, generator=generator,
         )  # fmt: skip
-        strength = result.mean_strength
         if config.estimate_exposures:
             exposures.observe(batch, result.rendered)
         for _ in range(at_once):

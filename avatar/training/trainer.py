@@ -152,7 +152,7 @@ class Trainer:
         self.pose_corrections: dict[int, Float[np.ndarray, "25 3"]] = {}
         self.steps = self.rays = self.samples = self.frames_seen = 0
         self.wall_seconds = self.cpu_seconds = 0.0
-        self.step_cpu_seconds = self._mean_strength = 0.0
+        self.step_cpu_seconds = 0.0
         self.paused_wall_seconds = self.paused_cpu_seconds = 0.0
         self.generator = torch.Generator().manual_seed(config.seed)
         rate = config.learning_rate
@@ -243,10 +243,8 @@ class Trainer:
             surface_share=1.0 - falling,
             caches_density=self.steps % config.occupancy_interval < 2,
             poses=self.poses if refines else None,
-            mean_strength=self._mean_strength,
             generator=self.generator,
         )  # fmt: skip
-        self._mean_strength = result.mean_strength
         for group, base in zip(
             self.optimizer.param_groups, (1.0, NETWORK_RATE_FACTOR), strict=True
         ):

@@ -93,13 +93,12 @@ class OccupancySampler:
 
 
 class StepResult(NamedTuple):
-    """Loss, rendering and world normal of each ray; samples, and their gradients' mean strength."""
+    """Loss, shaded rendering and world normal of each ray, and the number of all their samples."""
 
     loss: Float32[Tensor, "rays"]
     rendered: PremultipliedPixels
     normals: Float32[Tensor, "rays 3"]
     sample_count: int
-    mean_strength: float
 
 
 @torch.no_grad()
@@ -114,14 +113,13 @@ def compute_gradients(
     surface_share: float = 0.0,
     caches_density: bool = False,
     poses: PoseOptimizer | None = None,
-    mean_strength: float = 0.0,
     generator: torch.Generator,
 ) -> StepResult:
     """Renders a batch and adds the gradient of its mean loss to the field's parameters.
 
     Half of the samples have a negligible gradient. Leaving these out biases the sum, and Adam
     enlarges small gradients; a few of them, divided by their chance, keep the expected sum
-    ("Russian roulette").
+    ("Russian roulette"). They are those below a share of the mean strength in the step before.
 
     Args:
         hard_surface_share: Share of the hard-surface loss's weight, in [0, 1]; it grows in, because
@@ -129,8 +127,6 @@ def compute_gradients(
         surface_share: Progress from smooth densities to firm surfaces, in [0, 1].
         caches_density: Whether the samples raise the occupancy's cached densities.
         poses: Accumulates the samples' wrenches, if poses are refined.
-        mean_strength: Mean strength of the gradients of the step before; those below a share of it
-            (`faint_gradient_share`) are propagated by chance.
     """
     field = learner.field
     samples = sampler.sample_rays(batch.rays, correspondences)
@@ -148,18 +144,19 @@ def compute_gradients(
         LossSettings(
             config.sample_step_m, config.alpha_weight,
             config.hard_surface_weight * hard_surface_share,
-            config.faint_gradient_share * mean_strength,
+            config.faint_gradient_share * field.gradient_strength,
         ),
         is_frozen=field.is_frozen,
     )  # fmt: skip
     field.add_gradients(learnt)
+    field.gradient_strength = learnt.strength
     if poses is not None and bones is not None:
         poses.accumulate(batch.rays.slots.long(), learnt.wrenches, learnt.loss)
     if caches_density:
         operations.scatter_max_density(
             samples.points, learnt.log_density.contiguous(), learner.occupancy.density_grid
         )
-    return StepResult(learnt.loss, learnt.rendered, learnt.normals, count, learnt.strength)
+    return StepResult(learnt.loss, learnt.rendered, learnt.normals, count)
 
 
 def _prior_points(
