@@ -31,7 +31,7 @@ from preprocess.capture_session import Capture
 from preprocess.open_capture import open_capture
 from preprocess.poses.pose_format_registry import read_poses
 from preprocess.sfm.camera_solution import CameraSolution
-from preprocess.sfm.capture_solving import apply_camera_solution, solve_capture_cameras
+from preprocess.sfm.camera_solver import apply_camera_solution, solve_capture_cameras
 
 MOST_CENTER_CM, MOST_ROTATION_DEG, MOST_SCALE, MOST_SCALE_STATED = 1.0, 0.2, 0.03, 0.01
 MOST_PSNR_LOSS = 0.5

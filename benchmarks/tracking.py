@@ -32,7 +32,7 @@ from benchmarks.tracking_scores import (
     score_joints,
 )
 from capture.source_opening import open_source
-from preprocess.capture_paths import find_own_masks
+from preprocess.capture_inputs import find_own_masks
 
 AVATAR_TARGETS = {
     "held out, fitted poses": ("≥ -3", "≥ -1"),

@@ -20,7 +20,7 @@ from instant_avatar.run.person_tracking import fit_tracked_video
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.masks.mask_refinement import MaskRefiner
 from preprocess.plugins import make_tracker
-from preprocess.tracking.video_tracking import track_video
+from preprocess.tracking.video_tracking import VideoTracking
 
 WARM_FRAMES = slice(0, 12)
 """Frames that are tracked first, to load code and networks."""
@@ -56,7 +56,10 @@ def measure_costs(video: Path, frames: slice | None = None) -> dict[str, float]:
     source = open_source(video, frames=frames)
     networks, masks = CpuTimed(make_tracker()), CpuTimed(MaskRefiner(source.size_px))
     with TemporaryDirectory() as folder:
-        tracked = track_video(source, networks, masks, Path(folder))
+        tracking = VideoTracking(source, networks, masks, Path(folder))
+        for _ in tracking.run():
+            pass
+        tracked = tracking.result()
         fit = CpuTimed(fit_tracked_video)
         inputs = CaptureInputs(
             video=video, frames=frames, poses=Path(folder) / "poses.npz", masks=Path(folder)

@@ -21,8 +21,8 @@ from preprocess.cameras.camera_file import (
     assume_static_camera,
     read_cameras,
 )
-from preprocess.capture_inputs import CaptureInputs
-from preprocess.capture_paths import (
+from preprocess.capture_inputs import (
+    CaptureInputs,
     CapturePaths,
     find_own_masks,
     find_own_poses,

@@ -26,7 +26,7 @@ from capture.source import Frame, FrameSource, WrappedSource
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.cameras.camera_file import CameraTrack
-from preprocess.capture_session import Capture
+from preprocess.capture_session import Capture, ObservationSource
 from preprocess.fitting.clip_fitting import SIGMA_LOG_FOCAL, SIGMA_LOG_LIVE_FOCAL
 from preprocess.fitting.tracked_frames import (
     LAG_FRAMES,
@@ -38,7 +38,6 @@ from preprocess.fitting.tracked_frames import (
 )
 from preprocess.masks.mask_sources import MaskSource
 from preprocess.observation import DroppedFrame, Observation, join_frame, shrink_to_longer_side
-from preprocess.observation_source import ObservationSource
 from preprocess.plugins import PersonTracker
 from preprocess.tracking.keypoints import PersonKeypoints
 from preprocess.tracking.video_tracking import NOT_FOUND, MaskRefinement

@@ -18,8 +18,7 @@ from avatar.evaluation.image_metrics import composite_on_white, ground_truth_on_
 from instant_avatar.studio.lighting import NO_FACE, rasterize
 from preprocess.body.kinematics import descendant_matrix
 from preprocess.body.parametric_body import ShapedBody
-from preprocess.fitting.capture_fit import correct_pose
-from preprocess.fitting.clip_poses import POSE_SIGMA
+from preprocess.fitting.clip_poses import POSE_SIGMA, ClipPoses
 from preprocess.observation import Observation
 
 Renderer = Callable[[Observation], Float32[np.ndarray, "height width 4"]]
@@ -67,7 +66,7 @@ def align_pose(
     found, moved, step = seen.pose, np.zeros(75), np.zeros(75)
     picture, least, damping = truth, np.inf, DAMPING[0]
     for turn in range(renderings):
-        pose = correct_pose(found, step, view)
+        pose = ClipPoses.stack([found]).moved(step[None], view[None, :3, :3])[0]
         drawn = composite_on_white(render(replace(small, pose=pose)))
         error = float(np.square(_blur(drawn - truth, SCORED_BLUR_PX)).mean())
         if error < least:
@@ -112,7 +111,7 @@ class _BodySurface:
         self, seen: Observation, picture: Colors, truth: Colors, moved: Float[np.ndarray, "75"],
         damping: float,
     ) -> Float[np.ndarray, "75"]:  # fmt: skip
-        """Gauss-Newton step of the observation's pose, as `correct_pose` takes it.
+        """Gauss-Newton step of the observation's pose, as `ClipPoses.moved` takes it.
 
         Args:
             seen: With the pose that the picture shows.

@@ -20,7 +20,7 @@ from instant_avatar.batching.remote_files import ListedFile, is_url, list_files,
 from instant_avatar.cli.command_line import parse_arguments
 from instant_avatar.cli.shared_options import USUAL_NAMES
 from instant_avatar.run.ingest_arguments import IngestArguments
-from preprocess.capture_paths import CAMERA_NAMES, MASK_NAMES, POSE_FILE_NAMES
+from preprocess.capture_inputs import CAMERA_NAMES, MASK_NAMES, POSE_FILE_NAMES
 
 PART_NAMES = frozenset((*POSE_FILE_NAMES, *MASK_NAMES, *CAMERA_NAMES))
 """Names of files and folders beside the video of a capture folder."""

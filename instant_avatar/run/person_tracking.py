@@ -4,7 +4,7 @@ import os
 import shutil
 import threading
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,8 +20,12 @@ from preprocess.body.body_pose import Motion
 from preprocess.body.body_surface import SkinPoints
 from preprocess.body.parametric_body import load_body_model
 from preprocess.cameras.camera_file import assume_camera
-from preprocess.capture_inputs import CaptureInputs
-from preprocess.capture_paths import CapturePaths, find_own_masks, find_stream_cameras
+from preprocess.capture_inputs import (
+    CaptureInputs,
+    CapturePaths,
+    find_own_masks,
+    find_stream_cameras,
+)
 from preprocess.capture_session import Capture
 from preprocess.fitting.capture_fitting import fit_capture, fitted_motion
 from preprocess.masks.mask_files import open_masks
@@ -35,7 +39,7 @@ from preprocess.tracking.first_look import FirstLook, look_at
 from preprocess.tracking.keypoints import KeypointTrack
 from preprocess.tracking.pose_lift import lift_keypoints
 from preprocess.tracking.tracking_grade import TrackingGrade, grade_tracking
-from preprocess.tracking.video_tracking import TrackedVideo, track_video
+from preprocess.tracking.video_tracking import TrackedVideo, VideoTracking
 
 GRADED_FRAMES = 60
 """Frames, evenly spread, whose masks are compared with the body."""
@@ -210,22 +214,19 @@ def _run_networks(
         source = reopen(source, slice(after, chosen.stop, chosen.step))
     elif before is not None:  # someone else, from here on
         tracker, before = make_tracker(name, person), None
-    done = 0 if before is None else len(before.frame_times_s)
-    with console.progress("tracking the person", float(total or 1)) as bar:
-        try:
-            return track_video(
-                source,
-                tracker,
-                MaskRefiner(source.size_px),
-                mask_folder,
-                advance=lambda count: bar.set_count(done + count),
-                stop=stop,
-                before=before,
-            )
-        except InputError:
-            if stop is not None and stop.is_set():  # too early to tell
-                raise KeyboardInterrupt from None
-            raise
+    tracking = VideoTracking(source, tracker, MaskRefiner(source.size_px), mask_folder, before)
+    with (
+        console.progress("tracking the person", float(total or 1)) as bar,
+        closing(tracking.run()) as counts,
+    ):
+        while not (stop is not None and stop.is_set()) and (done := next(counts, None)) is not None:
+            bar.set_count(done)
+    try:
+        return tracking.result()
+    except InputError:
+        if stop is not None and stop.is_set():  # too early to tell
+            raise KeyboardInterrupt from None
+        raise
 
 
 def _earlier_frames(
@@ -288,7 +289,7 @@ def fit_tracked_video(
     return replace(
         capture,
         motion=fitted_motion(capture, fit),
-        cameras=fit.scale_focal_lengths(capture.cameras),
+        cameras=capture.cameras.scale_focal(fit.focal_factor),
         shaped=fit.shape(capture.shaped),
     )
 

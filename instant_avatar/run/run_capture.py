@@ -17,11 +17,15 @@ from instant_avatar.run.run_folder import RunFolder
 from instant_avatar.run.run_tracking import import_tracked
 from preprocess.cameras.camera_file import write_cameras
 from preprocess.capture_inputs import CaptureInputs, InputKind
-from preprocess.capture_session import Capture, video_identity
+from preprocess.capture_session import (
+    Capture,
+    ObservationSource,
+    RecordedObservations,
+    video_identity,
+)
 from preprocess.fitting.capture_fit import CaptureFit, load_capture_fit
 from preprocess.fitting.capture_fitting import apply_fit, fit_capture
 from preprocess.masks.mask_refinement import MaskRefiner
-from preprocess.observation_source import ObservationSource, RecordedObservations
 from preprocess.open_capture import (
     ImportedCapture,
     align_capture,
@@ -30,7 +34,7 @@ from preprocess.open_capture import (
 )
 from preprocess.plugins import DEFAULT_TRACKER, make_tracker
 from preprocess.poses.pose_file import write_motion
-from preprocess.sfm.capture_solving import apply_camera_solution, solve_capture_cameras
+from preprocess.sfm.camera_solver import apply_camera_solution, solve_capture_cameras
 from preprocess.tracking.first_look import look_at
 from preprocess.tracking.keypoints import PersonKeypoints
 

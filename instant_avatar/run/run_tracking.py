@@ -19,8 +19,7 @@ from instant_avatar.run.person_tracking import (
 )
 from instant_avatar.run.run_folder import RunFolder
 from instant_avatar.tracked_video import write_tracked_video
-from preprocess.capture_inputs import CaptureInputs
-from preprocess.capture_paths import find_own_poses
+from preprocess.capture_inputs import CaptureInputs, find_own_poses
 from preprocess.capture_session import Provenance
 from preprocess.open_capture import ImportedCapture, read_capture
 

@@ -29,9 +29,8 @@ from instant_avatar.run.run_folder import RunFolder
 from instant_avatar.run.run_tracking import remove_tracking
 from instant_avatar.run.session_events import EventReader, SessionEvent
 from instant_avatar.run.training_session import TrainingSession
-from preprocess.capture_session import Capture
+from preprocess.capture_session import Capture, ObservationSource
 from preprocess.licence_chain import made_with
-from preprocess.observation_source import ObservationSource
 
 
 def set_threads(requested: int | None) -> int:

@@ -16,8 +16,7 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any, final
 
 from capture.source import FrameSource
-from preprocess.capture_inputs import CaptureInputs, InputKind
-from preprocess.capture_paths import find_own_masks
+from preprocess.capture_inputs import CaptureInputs, InputKind, find_own_masks
 from preprocess.plugins import segmenter_name
 
 if TYPE_CHECKING:  # the process that fits needs no console, and scipy only once it has begun

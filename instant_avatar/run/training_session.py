@@ -56,9 +56,9 @@ from instant_avatar.run.session_events import (
 from instant_avatar.run.snapshot_writer import CheckpointWriter, validation_views, write_packages
 from instant_avatar.run.stream_meter import StreamMeter
 from preprocess.body.body_pose import BodyPose
+from preprocess.capture_session import ObservationSource
 from preprocess.licence_chain import licence_chain
 from preprocess.observation import Observation
-from preprocess.observation_source import ObservationSource
 
 REVISED_PER_STEP = 2
 """Frames whose poses are replaced between two steps; each solves its correspondences again."""

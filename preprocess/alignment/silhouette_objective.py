@@ -159,8 +159,8 @@ def _box_fill(alpha: Bool[np.ndarray, "height width"]) -> float:
 
 def spaced_indices(total: int, count: int) -> list[int]:
     """At most `count` indices below `total`, evenly spaced, without the ends."""
-    places = (np.arange(min(count, total)) + 0.5) / min(count, total) * total
-    return [int(place) for place in places]
+    count = min(count, total)
+    return [int((place + 0.5) / count * total) for place in range(count)]
 
 
 def sample_masks(

@@ -24,14 +24,35 @@ def rotation_matrices(
     """Rotation matrices of axis-angle vectors in radians (Rodrigues' formula)."""
     axis_angles = np.asarray(axis_angles, dtype=np.float64)
     angle = np.linalg.norm(axis_angles, axis=-1)[..., None, None]
-    x, y, z = np.moveaxis(axis_angles, -1, 0)
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1)
-    cross = cross.reshape(*axis_angles.shape[:-1], 3, 3)
+    cross = cross_matrices(axis_angles)
     # sin(a)/a and (1 - cos(a))/a², both smooth at a = 0
     sine = np.sinc(angle / np.pi)
     cosine = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
     return np.eye(3) + sine * cross + cosine * (cross @ cross)
+
+
+def cross_matrices(vectors: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
+    """The matrices that multiply by the cross product."""
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1)
+    return cross.reshape(*vectors.shape, 3)
+
+
+def unit_vectors(vectors: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+    """Vectors of length 1; 0 stays."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
+
+
+def shortest_turn(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+    """The rotation by the least angle that takes direction a to direction b."""
+    a, b = unit_vectors(a), unit_vectors(b)
+    axis = np.cross(a, b)
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-8:
+        axis = np.cross(a, np.eye(3)[np.abs(a).argmin()])
+        return rotation_matrices(unit_vectors(axis) * (0.0 if a @ b > 0.0 else np.pi))
+    return rotation_matrices(axis / sine * np.arctan2(sine, a @ b))
 
 
 def rigid_transform(

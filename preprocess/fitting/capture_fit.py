@@ -1,33 +1,20 @@
 """The changes that the alignment of a capture makes: saved with a run, and described for people."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from capture.atomic_files import atomic_file
 from capture.input_error import InputError
 from preprocess.alignment.capture_geometry import CaptureGeometry
-from preprocess.body.body_pose import BodyPose, Motion
+from preprocess.body.body_pose import Motion
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.proportion_space import ProportionSpace
-from preprocess.cameras.camera_file import CameraTrack
 from preprocess.file_content import read_npz
-
-
-def correct_pose(
-    pose: BodyPose, correction: Float[np.ndarray, "75"], camera_from_world: Float[np.ndarray, "4 4"]
-) -> BodyPose:
-    """A pose with a correction: rotations in the joints' axes, translation in the camera's."""
-    given = Rotation.from_rotvec(np.concatenate([pose.root_rotation[None], pose.joint_rotations]))
-    turned = (given * Rotation.from_rotvec(correction[:72].reshape(24, 3))).as_rotvec()
-    return BodyPose(
-        root_rotation=turned[0],
-        root_translation=pose.root_translation + correction[72:] @ camera_from_world[:3, :3],
-        joint_rotations=turned[1:],
-    )
+from preprocess.fitting.clip_poses import ClipPoses
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -60,42 +47,28 @@ class CaptureFit:
         """The person, with fitted proportions."""
         return ProportionSpace.around(shaped).shape(self.coefficients)
 
-    def scale_focal_lengths(self, cameras: CameraTrack) -> CameraTrack:
-        """The cameras, with the fitted focal length."""
-        return cameras.scale_focal(self.focal_factor)
-
     def correct_motion(self, geometry: CaptureGeometry) -> Motion:
         """The motion of the geometry that was fitted, with a correction of each row."""
-        motion, cameras = geometry.motion, geometry.camera_rows()
-        poses = [
-            correct_pose(motion[row], self.corrections[row], geometry.extrinsics[cameras[row]])
-            for row in range(len(motion))
-        ]
-        return replace(
-            motion,
-            root_rotations=np.stack([pose.root_rotation for pose in poses]),
-            root_translations=np.stack([pose.root_translation for pose in poses]),
-            joint_rotations=np.stack([pose.joint_rotations for pose in poses]),
-        )
+        motion, views = geometry.motion, geometry.extrinsics[geometry.camera_rows()]
+        poses = ClipPoses.of(motion, range(len(motion)))
+        return poses.moved(self.corrections, views[:, :3, :3]).replace_in(motion)
 
     def describe(self) -> str:
         """Describe the changes, for people."""
         vectors = self.corrections[:, :72].reshape(-1, 24, 3)
         turned = np.degrees(np.linalg.norm(vectors, axis=2)).mean(axis=0)
+        given = ""
+        if self.keypoint_share:
+            given = (
+                f" The given poses count by {1.0 - self.keypoint_share:.0%}, those that the "
+                "built-in tracker's key points tell by the rest."
+            )
         return (
             "Body, poses and focal length were fitted to the masks: their outlines were "
             f"{self.error_before_cm:.1f} cm apart, and {self.error_after_cm:.1f} cm by the fit, of "
             f"which {self.share:.0%} was made (the root turned by {turned[0]:.1f} "
             f"degrees on average, other joints by {turned[1:].mean():.1f}; focal length times "
-            f"{self.focal_factor:.2f}).{self._describe_keypoints()}"
-        )
-
-    def _describe_keypoints(self) -> str:
-        if not self.keypoint_share:
-            return ""
-        return (
-            f" The given poses count by {1.0 - self.keypoint_share:.0%}, those that the built-in "
-            "tracker's key points tell by the rest."
+            f"{self.focal_factor:.2f}).{given}"
         )
 
     def as_json(self) -> dict[str, float | bool]:
@@ -119,22 +92,14 @@ def load_capture_fit(path: Path, video: str) -> CaptureFit | None:
     """Read what `CaptureFit.save` wrote; None if there is nothing for this video."""
     if not path.is_file():
         return None
-    scalars = (
-        "focal_factor",
-        "error_before_cm",
-        "error_after_cm",
-        "share",
-        "keypoint_share",
-        "fits_body",
-    )
+    names = [field.name for field in fields(CaptureFit)]
     try:
-        read = read_npz(path, ("coefficients", "corrections", "video", *scalars))
+        read = read_npz(path, (*names, "video"))
         if str(read["video"]) != video:
             return None
-        return CaptureFit(
-            coefficients=read["coefficients"],
-            corrections=read["corrections"],
-            **{name: read[name].item() for name in scalars},
-        )
+        values: dict[str, Any] = {
+            name: read[name] if read[name].ndim else read[name].item() for name in names
+        }
+        return CaptureFit(**values)
     except (InputError, KeyError):
         return None

@@ -3,21 +3,31 @@
 The fit would change exact poses, too, by its own noise. How much of its changes is made follows
 from how much larger they are than that noise (Wiener's factor), without a step: nothing of those of
 exact poses, nearly all of those of a tracker's.
+
+Outlines do not show how far limbs turn about themselves; the built-in tracker's key points tell it
+in part, by depth. Both estimates of a pose err independently, so each counts by the inverse of its
+error's variance. The given poses' error is estimated by how far outlines turned them, the key
+points' by the rest of the disagreement between the two.
 """
 
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
-from capture.source import FrameSource
+from capture.input_error import InputError
+from capture.source import Frame, FrameSource
+from capture.source_opening import reopen
 from preprocess.alignment.capture_geometry import CaptureGeometry, rescale_motion
+from preprocess.alignment.silhouette_objective import spaced_indices
 from preprocess.body.body_pose import Motion
-from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.proportion_space import SIGMA_BETA, ProportionSpace
 from preprocess.capture_session import Capture, Provenance
 from preprocess.fitting.capture_fit import CaptureFit
 from preprocess.fitting.clip_fitting import (
+    POSES_ALONE,
     TRACKED_WEIGHTS,
     USUAL_WEIGHTS,
     ClipFitter,
@@ -25,10 +35,11 @@ from preprocess.fitting.clip_fitting import (
     EvidenceWeights,
     FitParameters,
 )
-from preprocess.fitting.keypoint_poses import blend_poses, weigh_keypoint_poses
+from preprocess.fitting.clip_poses import ClipPoses
 from preprocess.fitting.outlines import OUTLINE_PERSON_PX, OutlineDistances
 from preprocess.fitting.silhouettes import read_silhouettes
 from preprocess.observation import associate_cameras
+from preprocess.tracking.keypoints import MIN_PRESENCE, KeypointTrack, PersonKeypoints
 
 KEY_FRAMES = 50
 """Frames, evenly spread, whose masks are fitted."""
@@ -58,6 +69,19 @@ NOISE_DEG_PER_CM = 1.5
 after it (1.4, 1.4 and 1.55 on three exact captures; a tracker's, real and simulated: 5 to 8)."""
 MIN_FRAMES = 4
 """Fewest frames with a usable mask for which an alignment is attempted."""
+MOST_TRACKED_FRAMES = 80
+"""Frames in which key points would be found if they alone counted, 30 core-ms each. The number is
+this times the weight that they are expected to get."""
+MIN_TRACKED_FRAMES = 4
+"""Fewest frames with key points that tell poses."""
+BESIDE_ITERATIONS = (4, 3)
+"""Of those poses, iterations with key points alone, and then with outlines."""
+ERROR_PER_TURN = 1.2
+"""Error that outlines leave in given poses, per rotation by which they turned them: 0.9 to 1.3 in
+films of studio motions, 1.7 to 2.3 in real ones."""
+LEAST_ERROR_RAD = math.radians(5.0)
+"""Least error of poses by key points that is assumed: it is 3.5 degrees in films of studio motions,
+10 to 14 in real ones."""
 
 
 def apply_fit(capture: Capture, fit: CaptureFit, *, height_m: float | None = None) -> Capture:
@@ -71,10 +95,11 @@ def apply_fit(capture: Capture, fit: CaptureFit, *, height_m: float | None = Non
     if not fit.share:
         return capture.with_part(made, fits=(*capture.fits, fit))
     geometry = capture.geometry()
-    motion, cameras = fit.correct_motion(geometry), fit.scale_focal_lengths(capture.cameras)
+    motion, cameras = fit.correct_motion(geometry), capture.cameras.scale_focal(fit.focal_factor)
     shaped = fit.shape(capture.shaped) if fit.fits_body else capture.shaped
     if height_m is None and not cameras.is_moving:
-        height_m = shaped.height_m * _size_ratio(capture.shaped, shaped)
+        a, b = (each.joints - each.joints[0] for each in (capture.shaped, shaped))
+        height_m = shaped.height_m * float((a * b).sum() / (b * b).sum())  # least squares
     if height_m is not None and fit.fits_body:
         sized = shaped.scaled_to(height_m)
         there = CaptureGeometry.of(motion, cameras, capture.source)
@@ -82,12 +107,6 @@ def apply_fit(capture: Capture, fit: CaptureFit, *, height_m: float | None = Non
     return capture.with_part(
         made, motion=motion, shaped=shaped, cameras=cameras, fits=(*capture.fits, fit)
     )
-
-
-def _size_ratio(one: ShapedBody, other: ShapedBody) -> float:
-    """Size of one person relative to another, by least squares over their joints."""
-    a, b = one.joints - one.joints[0], other.joints - other.joints[0]
-    return float((a * b).sum() / (b * b).sum())
 
 
 def fit_capture(capture: Capture, *, fit_body: bool = True) -> CaptureFit | None:
@@ -116,11 +135,10 @@ def fit_capture(capture: Capture, *, fit_body: bool = True) -> CaptureFit | None
     keypoint_share = 0.0
     if not tracked and share:
         keypoint_share = _take_keypoints(capture, fitter, share)
-    corrections = fitter.corrections
     return CaptureFit(
         coefficients=share * fitter.coefficients,
         focal_factor=float(np.exp(share * fitter.log_focal)),
-        corrections=share * _interpolate_corrections(capture, fitter, corrections),
+        corrections=share * _interpolate_corrections(capture, fitter),
         error_before_cm=before * pixel_cm,
         error_after_cm=after * pixel_cm,
         share=share,
@@ -130,15 +148,37 @@ def fit_capture(capture: Capture, *, fit_body: bool = True) -> CaptureFit | None
 
 
 def _take_keypoints(capture: Capture, fitter: ClipFitter, share: float) -> float:
-    """Fit poses once more, near given ones and those by key points; return the latter's weight."""
-    evidence = weigh_keypoint_poses(capture, fitter, share)
-    if evidence is None:
+    """Fit given poses once more, near them and those by key points; return the latter's weight.
+
+    `share` of the fit's changes is no noise. The weight, in [0, 1], is 0 if the person is not
+    found, or if key points would count by less than a twentieth.
+    """
+    error2 = share * (ERROR_PER_TURN * _mean_turn(fitter.corrections)) ** 2
+    count = round(MOST_TRACKED_FRAMES * error2 / (error2 + LEAST_ERROR_RAD**2))
+    if count < MIN_TRACKED_FRAMES:
         return 0.0
-    turns, weight = fitter.camera_rotations, evidence.weight
-    fitter.expect(blend_poses(fitter.given, fitter.as_stated(evidence.poses), weight, turns))
-    fitter.poses = blend_poses(fitter.poses, evidence.poses, weight, turns)
-    for _ in range(BLENDED_ITERATIONS):
-        fitter.iterate(FitParameters(proportions=False, focal=False))
+    track = _find_keypoints(capture, fitter, _choose_frames(fitter.frames, count))
+    if len(track) < MIN_TRACKED_FRAMES:
+        return 0.0
+    rows = np.flatnonzero(np.isin(fitter.numbers, track.frames)).tolist()
+    beside = ClipFitter(
+        fitter.given.rows(rows),
+        fitter.model.space,
+        [fitter.frames[row] for row in rows],
+        track=track,
+        weights=TRACKED_WEIGHTS,
+    )
+    beside.take_person(fitter)
+    beside.poses = fitter.poses.rows(rows)
+    beside.iterate_stages(POSES_ALONE, *BESIDE_ITERATIONS)
+    steps = beside.poses.steps_from(fitter.poses.rows(rows), beside.camera_rotations)
+    weight = error2 / max(_mean_turn(steps) ** 2, error2 + LEAST_ERROR_RAD**2)
+    each_step = [np.interp(fitter.numbers, beside.numbers, each) for each in steps.T]
+    turns, further = fitter.camera_rotations, np.column_stack(each_step)
+    stated = fitter.as_stated(fitter.poses.moved(further, turns))
+    fitter.expect(fitter.given.moved(weight * stated.steps_from(fitter.given, turns), turns))
+    fitter.poses = fitter.poses.moved(weight * further, turns)
+    fitter.iterate_stages(POSES_ALONE, 0, BLENDED_ITERATIONS)
     return weight
 
 
@@ -158,12 +198,10 @@ def _fit_tracked(fitter: ClipFitter, everything: FitParameters) -> list[float]:
 
     Returns the error before each iteration with outlines.
     """
-    for _ in range(KEYPOINT_ITERATIONS):
-        fitter.iterate(everything._replace(outlines=False))
-    errors = [fitter.iterate(everything) for _ in range(TRACKED_ITERATIONS)]
+    errors = fitter.iterate_stages(everything, KEYPOINT_ITERATIONS, TRACKED_ITERATIONS)
     fitter.weights = TRACKED_POSE_WEIGHTS
     poses = everything._replace(proportions=False, focal=False)
-    return errors + [fitter.iterate(poses) for _ in range(POSE_ITERATIONS)]
+    return errors + fitter.iterate_stages(poses, 0, POSE_ITERATIONS)
 
 
 def _iterate_until_settled(fitter: ClipFitter, fitted: FitParameters) -> list[float]:
@@ -191,7 +229,8 @@ def make_fitter(capture: Capture) -> ClipFitter | None:
     numbers = {*samples, *others}
     sizes = [each.alpha.shape[::-1] for each in samples.values()]
     size_px = sizes[0] if sizes else _reduced_size_px(capture)
-    camera_row, frames = associate_cameras(capture.cameras, capture.source), []
+    camera_row = associate_cameras(capture.cameras, capture.source)
+    rows, frames = list[int](), list[ClipFrame]()
     for number in sorted(numbers - capture.cameras.frames_without_camera):
         row = geometry.row_for_frame(number)
         if row is not None:
@@ -199,20 +238,15 @@ def make_fitter(capture: Capture) -> ClipFitter | None:
             mask = picture = None
             if sample is not None:
                 mask, picture = OutlineDistances.of(sample.alpha, camera), sample.picture
+            rows.append(row)
             frames.append(
-                ClipFrame(row=row, number=float(number), camera=camera, mask=mask, picture=picture)
+                ClipFrame(number=float(number), camera=camera, mask=mask, picture=picture)
             )
     if len(frames) < MIN_FRAMES or (track is None and len(samples) < MIN_FRAMES):
         return None
-    if track is None:
-        return ClipFitter(capture.motion, space, frames)
-    return ClipFitter(
-        capture.motion,
-        space,
-        frames,
-        track=track,
-        weights=TRACKED_WEIGHTS if samples else USUAL_WEIGHTS,
-    )
+    weights = TRACKED_WEIGHTS if track is not None and samples else USUAL_WEIGHTS
+    given = ClipPoses.of(capture.motion, rows)
+    return ClipFitter(given, space, frames, track=track, weights=weights)
 
 
 def _spread_frames(source: FrameSource) -> range:
@@ -239,7 +273,7 @@ def fitted_motion(capture: Capture, fit: CaptureFit) -> Motion:
     """
     moved = fit.correct_motion(capture.geometry())
     betas = SIGMA_BETA * fit.coefficients[: capture.shaped.body.shape_directions.shape[-1]]
-    cameras = fit.scale_focal_lengths(capture.cameras)
+    cameras = capture.cameras.scale_focal(fit.focal_factor)
     intrinsic = None if cameras.is_moving else cameras[0].intrinsic
     return replace(moved, betas=betas, proportions=fit.coefficients, intrinsic=intrinsic)
 
@@ -250,10 +284,52 @@ def _reduction(capture: Capture, fitter: ClipFitter) -> float:
     return min(capture.size_px, longer) / max(fitter.frames[0].camera.size_px)
 
 
-def _interpolate_corrections(
-    capture: Capture, fitter: ClipFitter, corrections: Float[np.ndarray, "frames 75"]
-) -> Float[np.ndarray, "poses 75"]:
+def _interpolate_corrections(capture: Capture, fitter: ClipFitter) -> Float[np.ndarray, "poses 75"]:
     """A correction for each row of the motion, linear in time between the fitted frames."""
-    numbers = np.array([frame.number for frame in fitter.frames])
     rows = np.nan_to_num(capture.geometry().row_frames)
-    return np.column_stack([np.interp(rows, numbers, each) for each in corrections.T])
+    return np.column_stack([np.interp(rows, fitter.numbers, c) for c in fitter.corrections.T])
+
+
+def _choose_frames(frames: Sequence[ClipFrame], count: int) -> list[ClipFrame]:
+    """Choose `count` frames, evenly spread, those with outlines first."""
+    outlined = [frame for frame in frames if frame.mask is not None]
+    others = [frame for frame in frames if frame.mask is None]
+    chosen = [outlined[n] for n in spaced_indices(len(outlined), count)]
+    chosen += [others[n] for n in spaced_indices(len(others), count - len(chosen))]
+    return sorted(chosen, key=lambda frame: frame.number)
+
+
+def _find_keypoints(
+    capture: Capture, fitter: ClipFitter, frames: Sequence[ClipFrame]
+) -> KeypointTrack:
+    """Key points of the person in some of a fit's frames, where the fitted poses put the body."""
+    from preprocess.tracking.blazepose import PosedPersonFinder  # loads onnxruntime
+
+    places = dict(zip(fitter.numbers.astype(int).tolist(), range(len(fitter.frames)), strict=True))
+    wanted = [int(frame.number) for frame in frames]
+    find = PosedPersonFinder(fitter.model.space.shape(fitter.coefficients))
+    source, camera_row = capture.source, associate_cameras(capture.cameras, capture.source)
+    zoom = float(np.exp(fitter.log_focal))
+    persons = dict[int, PersonKeypoints]()
+    times_s = dict[int, float]()
+    size_px, step = source.size_px, int(np.gcd.reduce(np.diff(wanted)))
+    pictures: Iterable[Frame] = [each.picture for each in frames if each.picture is not None]
+    if len(pictures) < len(frames):
+        pictures = reopen(source, slice(wanted[0], wanted[-1] + 1, step)).frames()
+    for frame in pictures:
+        if frame.index not in wanted or "corrupt" in frame.flags:
+            continue
+        size_px = frame.size_px
+        camera = capture.cameras[camera_row(frame.index)].scale_focal(zoom).resize(size_px)
+        try:
+            person, _ = find(frame.rgb, fitter.poses[places[frame.index]], camera)
+        except InputError:  # the body is outside the image
+            continue
+        if person.presence >= MIN_PRESENCE:
+            persons[frame.index], times_s[frame.index] = person, frame.time_s
+    return KeypointTrack.of(list(persons), list(persons.values()), size_px, list(times_s.values()))
+
+
+def _mean_turn(steps: Float[np.ndarray, "frames 75"]) -> float:
+    """Mean rotation of the joints but hands' inner ones and root, radians."""
+    return float(np.linalg.norm(steps[:, 3:66].reshape(-1, 21, 3), axis=2).mean())

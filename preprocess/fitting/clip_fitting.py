@@ -16,7 +16,6 @@ from jaxtyping import Float
 
 from capture.camera import Camera
 from capture.source import ASSUMED_FPS, Frame
-from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.fitting.clip_poses import POSE_SIGMA, ClipPoses, GivenPosePrior, HumanPosePrior
 from preprocess.fitting.keypoint_rows import ClipCameras, ClipKeypoints, KeypointModel
@@ -56,13 +55,12 @@ class EvidenceWeights(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ClipFrame:
-    """A frame whose pose is fitted: its row of the motion, and its number.
+    """A frame whose pose is fitted, by its number.
 
     The camera is of the reduced masks' size; without a mask the frame is not compared with one.
     A picture is there if it was decoded for the mask and kept.
     """
 
-    row: int
     number: float
     camera: Camera
     mask: OutlineDistances | None = None
@@ -84,6 +82,8 @@ TRACKED_WEIGHTS = EvidenceWeights(outline_rows=120.0, keypoints=0.3)
 """Outlines tell where limbs are better than key points, which are off by 2 cm for many frames."""
 ALL_PARAMETERS = FitParameters()
 """Poses, proportions and focal length together."""
+POSES_ALONE = FitParameters(proportions=False, focal=False)
+"""Poses of a person and a camera that stay."""
 
 
 @final
@@ -91,7 +91,7 @@ class ClipFitter:
     """The parameters of one clip's alignment, and its Gauss-Newton iterations.
 
     Attributes:
-        frames: The frames that are fitted, in time order.
+        frames: The frames that are fitted, in time order; `numbers` are theirs.
         coefficients: Proportions, in prior standard deviations.
         log_focal: Logarithm of the focal length's factor.
         weights: May be changed between iterations.
@@ -101,7 +101,7 @@ class ClipFitter:
 
     def __init__(
         self,
-        motion: Motion,
+        given: ClipPoses,
         space: ProportionSpace,
         frames: Sequence[ClipFrame],
         *,
@@ -114,9 +114,10 @@ class ClipFitter:
         """Starts with the poses, the proportions and the focal length as they are.
 
         Args:
+            given: A pose of each frame.
             frames: The frames to fit, in time order.
             track: Key points, as further evidence. With them the poses are merely human; without,
-                they are near the motion's.
+                they are near the given ones.
             settled: Whether these poses were fitted to key points before.
             sigma_log_focal: Prior standard deviation of the focal length's logarithm.
             model: The person at the space's origin, where several clips share it.
@@ -127,12 +128,11 @@ class ClipFitter:
         self.weights = weights
         self.coefficients = np.zeros(space.count)
         self.log_focal, self._sigma_log_focal = 0.0, sigma_log_focal
-        self.given = ClipPoses.of(motion, [frame.row for frame in self.frames])
-        self.poses = self.given
+        self.given = self.poses = given
         self.camera_rotations = np.stack(
             [each.camera.camera_from_world[:3, :3] for each in self.frames]
         )
-        numbers = np.array([frame.number for frame in self.frames])
+        self.numbers = np.array([frame.number for frame in self.frames])
         masked = np.flatnonzero([frame.mask is not None for frame in self.frames])
         used = masked if track is None and len(masked) else np.arange(len(self.frames))
         self._priors = len(used) / self.given.rows(used).independent_count(
@@ -140,19 +140,19 @@ class ClipFitter:
         )
         self._keypoints: ClipKeypoints | None = None
         if track is None:
-            self._prior = GivenPosePrior(self.given, self.camera_rotations, numbers)
-        else:
-            cameras = [frame.camera for frame in self.frames]
-            used = [int(frame.number) for frame in self.frames]
-            self._keypoints = ClipKeypoints.of(track, used, cameras, space.shaped.joints)
-            self._prior = HumanPosePrior(
-                self.camera_rotations, _times_s(track, numbers), settled=settled
-            )
+            self.expect(given)
+            return
+        cameras = [frame.camera for frame in self.frames]
+        whole = self.numbers.astype(int).tolist()
+        self._keypoints = ClipKeypoints.of(track, whole, cameras, space.shaped.joints)
+        times_s = self.numbers / ASSUMED_FPS
+        if track.times_s is not None:  # a frame may lie between those with key points
+            times_s = np.interp(self.numbers, track.frames, track.times_s)
+        self._prior = HumanPosePrior(self.camera_rotations, times_s, settled=settled)
 
     def expect(self, given: ClipPoses) -> None:
-        """Go on near other poses of the frames than those given."""
-        numbers = np.array([frame.number for frame in self.frames])
-        self._prior = GivenPosePrior(given, self.camera_rotations, numbers)
+        """Go on near some poses of the frames."""
+        self._prior = GivenPosePrior(given, self.camera_rotations, self.numbers)
 
     def take_person(self, other: "ClipFitter") -> None:
         """Go on with another fit's proportions and focal length; both are around one shape."""
@@ -170,9 +170,13 @@ class ClipFitter:
         """Camera of a frame, with the present focal length."""
         return self.frames[index].camera.scale_focal(float(np.exp(self.log_focal)))
 
-    def pose(self, index: int) -> BodyPose:
-        """Present pose of a frame."""
-        return self.poses[index]
+    def iterate_stages(
+        self, fitted: FitParameters, keypoint_count: int, outline_count: int
+    ) -> list[float]:
+        """Iterates with key points alone, then with outlines; returns errors before the latter."""
+        for _ in range(keypoint_count):
+            self.iterate(fitted._replace(outlines=False))
+        return [self.iterate(fitted) for _ in range(outline_count)]
 
     def iterate(self, fitted: FitParameters = ALL_PARAMETERS) -> float:
         """Makes one Gauss-Newton step; returns the outlines' robust error before it.
@@ -270,12 +274,3 @@ class ClipFitter:
         held[-1] = 0.0 if fitted.focal else HELD_PRECISION
         equations.hold(held, 0.0 if fitted.poses else HELD_PRECISION)
         return steps
-
-
-def _times_s(
-    track: KeypointTrack, numbers: Float[np.ndarray, "frames"]
-) -> Float[np.ndarray, "frames"]:
-    """Times of frames, of which each may lie between those of the key points."""
-    if track.times_s is None:
-        return numbers / ASSUMED_FPS
-    return np.interp(numbers, track.frames, track.times_s)

@@ -4,7 +4,7 @@ All frames are computed at once. Poses are near those given, or merely human.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, final
 
 import numpy as np
@@ -17,6 +17,7 @@ from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.kinematics import (
     PARENTS,
     axis_angles_from_matrices,
+    cross_matrices,
     rigid_transform,
     rotation_matrices,
 )
@@ -87,11 +88,25 @@ class ClipPoses:
     @classmethod
     def of(cls, motion: Motion, rows: Sequence[int]) -> "ClipPoses":
         """Some rows of a motion."""
-        some = list(rows)
-        vectors = [motion.root_rotations[some][:, None], motion.joint_rotations[some]]
+        return cls.stack([motion[row] for row in rows])
+
+    @classmethod
+    def stack(cls, poses: Sequence[BodyPose]) -> "ClipPoses":
+        """Poses of frames one after the other."""
+        vectors = [np.vstack([each.root_rotation, each.joint_rotations]) for each in poses]
         return cls(
-            rotations=rotation_matrices(np.concatenate(vectors, axis=1)),
-            translations=motion.root_translations[some].astype(np.float64),
+            rotations=rotation_matrices(np.stack(vectors)),
+            translations=np.stack([each.root_translation for each in poses]).astype(np.float64),
+        )
+
+    def replace_in(self, motion: Motion) -> Motion:
+        """The motion with these poses in its rows."""
+        vectors = axis_angles_from_matrices(self.rotations)
+        return replace(
+            motion,
+            root_rotations=vectors[:, 0],
+            root_translations=self.translations,
+            joint_rotations=vectors[:, 1:],
         )
 
     def __getitem__(self, index: int) -> BodyPose:
@@ -289,15 +304,9 @@ class HumanPosePrior:
     ) -> Float[np.ndarray, "frames 75 75"]:
         """Adds it to the equations of a step; returns the poses' steps by their parameters."""
         _add_human(equations, poses, _SIGMA)
-        each = np.arange(72, 75)
+        each, count = np.arange(72, 75), len(poses.rotations)
         equations.blocks[:, each, each] += (POSE_SIGMA[72:] / SIGMA_FREE) ** 2
-        self._add_links(equations, poses)
-        self._fast_change = max(FAST_CHANGE, 0.5 * self._fast_change)
-        return np.broadcast_to(np.diag(POSE_SIGMA), equations.blocks.shape)
-
-    def _add_links(self, equations: ChainEquations, poses: ClipPoses) -> None:
-        before = ClipPoses(rotations=poses.rotations[:-1], translations=poses.translations[:-1])
-        after = ClipPoses(rotations=poses.rotations[1:], translations=poses.translations[1:])
+        before, after = poses.rows(range(count - 1)), poses.rows(range(1, count))
         apart = after.steps_from(before, self._cameras[:-1])
         turned = np.linalg.norm(apart[:, :3], axis=1)
         apart -= gaussian_filter1d(apart, self._steady_frames, axis=0, mode="nearest")
@@ -306,6 +315,8 @@ class HumanPosePrior:
         usual = np.repeat(1.0 / (1.0 + size / self._fast_change**2) ** 2, 3, axis=1)
         usual *= 1.0 / (1.0 + (turned / CUT_TURN_RAD) ** 2)[:, None] ** 2
         equations.add_links(apart / POSE_SIGMA, usual * (POSE_SIGMA / self._change) ** 2)
+        self._fast_change = max(FAST_CHANGE, 0.5 * self._fast_change)
+        return np.broadcast_to(np.diag(POSE_SIGMA), equations.blocks.shape)
 
 
 def _add_human(
@@ -388,8 +399,5 @@ def _inverse_right_jacobian(
     angle = np.linalg.norm(vectors, axis=-1)
     safe = np.clip(angle, 1e-3, 3.0)
     factor = 1.0 / safe**2 - (1.0 + np.cos(safe)) / (2.0 * safe * np.sin(safe))
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1)
-    cross = cross.reshape(*vectors.shape[:-1], 3, 3)
+    cross = cross_matrices(vectors)
     return np.eye(3) + 0.5 * cross + factor[..., None, None] * (cross @ cross)

@@ -19,6 +19,7 @@ from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.fitting.clip_fitting import (
+    POSES_ALONE,
     SIGMA_LOG_FOCAL,
     TRACKED_WEIGHTS,
     USUAL_WEIGHTS,
@@ -27,6 +28,7 @@ from preprocess.fitting.clip_fitting import (
     EvidenceWeights,
     FitParameters,
 )
+from preprocess.fitting.clip_poses import ClipPoses
 from preprocess.fitting.outlines import OUTLINE_PERSON_PX, OutlineDistances, OutlineModel
 from preprocess.observation import shrink_to_longer_side
 from preprocess.tracking.keypoints import KeypointTrack, PersonKeypoints
@@ -82,20 +84,14 @@ def fit_first_frames(
         camera: Camera of the frames, whose focal length is not exact.
         sigma_log_focal: Prior standard deviation of the focal length's logarithm.
     """
-    space = ProportionSpace.around(shaped)
+    model, lifted = OutlineModel(ProportionSpace.around(shaped)), _lift(seen, shaped, camera)
     fitter = _fitter(
-        seen, None, OutlineModel(space), camera, range(len(seen)),
-        sigma_log_focal=sigma_log_focal, weights=USUAL_WEIGHTS,
+        seen, ClipPoses.of(lifted, range(len(seen))), model, camera, range(len(seen)),
+        settled=False, sigma_log_focal=sigma_log_focal, weights=USUAL_WEIGHTS,
     )  # fmt: skip
-    everything = FitParameters(proportions=not fixed)
-    for _ in range(FIRST_ITERATIONS[0]):
-        fitter.iterate(everything._replace(outlines=False))
-    for _ in range(FIRST_ITERATIONS[1]):
-        fitter.iterate(everything)
-    poses = [fitter.pose(index) for index in range(len(seen))]
-    motion = _as_motion(seen, poses, space.shaped, camera)
+    fitter.iterate_stages(FitParameters(proportions=not fixed), *FIRST_ITERATIONS)
     fitted = camera.scale_focal(float(np.exp(fitter.log_focal)))
-    return motion, space.shape(fitter.coefficients), fitted
+    return fitter.poses.replace_in(lifted), model.space.shape(fitter.coefficients), fitted
 
 
 @final
@@ -106,7 +102,7 @@ class FramePoseFitter:
         """Start without frames."""
         self._model, self._camera = OutlineModel(ProportionSpace.around(shaped)), camera
         self._seen: deque[SeenPerson] = deque(maxlen=WINDOW_FRAMES)
-        self._poses: deque[BodyPose] = deque(maxlen=WINDOW_FRAMES)
+        self._poses: list[BodyPose] = []
         self._last: BodyPose | None = None
 
     def add(self, seen: SeenPerson, start: BodyPose | None = None) -> None:
@@ -120,16 +116,12 @@ class FramePoseFitter:
             start = _lift([seen], shaped, self._camera)[0]
             if self._last is not None:
                 start = _at_distance_of(start, self._last, shaped.joints[0])
-        self._poses.append(start)
         count = len(self._seen)
+        poses = ClipPoses.stack([*self._poses, start][-count:])
         outlined = {count - 1, count - 1 - LAG_FRAMES}
-        fitter = _fitter(self._seen, self._poses, self._model, self._camera, outlined)
-        poses_only = FitParameters(proportions=False, focal=False)
-        for _ in range(FRAME_ITERATIONS[0]):
-            fitter.iterate(poses_only._replace(outlines=False))
-        for _ in range(FRAME_ITERATIONS[1]):
-            fitter.iterate(poses_only)
-        self._poses = deque((fitter.pose(index) for index in range(count)), maxlen=WINDOW_FRAMES)
+        fitter = _fitter(self._seen, poses, self._model, self._camera, outlined)
+        fitter.iterate_stages(POSES_ALONE, *FRAME_ITERATIONS)
+        self._poses = [fitter.poses[place] for place in range(count)]
         self._last = self._poses[-1]
 
     def forget(self) -> None:
@@ -192,10 +184,10 @@ class EarlierPoses:
     def _fit_again(self, new: dict[SeenPerson, BodyPose]) -> None:
         frames = {**self._recent, **new}
         seen, count = list(frames), len(frames)
-        fitter = _fitter(seen, list(frames.values()), self._model, self._camera, range(count))
-        for _ in range(REVISION_ITERATIONS):
-            fitter.iterate(FitParameters(proportions=False, focal=False))
-        poses = [fitter.pose(row) for row in range(count)]
+        start = ClipPoses.stack(list(frames.values()))
+        fitter = _fitter(seen, start, self._model, self._camera, range(count))
+        fitter.iterate_stages(POSES_ALONE, 0, REVISION_ITERATIONS)
+        poses = [fitter.poses[place] for place in range(count)]
         self._recent.clear()
         self._recent.update(zip(seen[-OVERLAP_FRAMES:], poses[-OVERLAP_FRAMES:], strict=True))
         self._revised.append({each.number: p for each, p in zip(seen, poses, strict=True)})
@@ -208,7 +200,12 @@ def _at_distance_of(pose: BodyPose, other: BodyPose, pelvis: Float[np.ndarray, "
 
 
 def _lift(seen: Sequence[SeenPerson], shaped: ShapedBody, camera: Camera) -> Motion:
-    return lift_keypoints(_track(seen, camera), shaped, camera)
+    """First guess of the poses of frames, which need not follow one another."""
+    track, numbers = _track(seen, camera), np.array([each.number for each in seen])
+    motion = lift_keypoints(track, shaped, camera)
+    assert motion.frames is not None
+    rows = np.searchsorted(motion.frames, numbers)  # others bridge the gaps between them
+    return replace(motion.select_rows(rows, numbers), times_s=track.times_s)
 
 
 def _track(seen: Sequence[SeenPerson], camera: Camera) -> KeypointTrack:
@@ -222,48 +219,26 @@ def _track(seen: Sequence[SeenPerson], camera: Camera) -> KeypointTrack:
 
 def _fitter(
     seen: Sequence[SeenPerson],
-    poses: Sequence[BodyPose] | None,
+    poses: ClipPoses,
     model: OutlineModel,
     camera: Camera,
     outlined: Collection[int],
     *,
+    settled: bool = True,
     sigma_log_focal: float = SIGMA_LOG_FOCAL,
     weights: EvidenceWeights = TRACKED_WEIGHTS,
 ) -> ClipFitter:
     """The fit of some frames, of which those at some places are compared with their masks."""
-    shaped = model.space.shaped
-    motion = (
-        _lift(seen, shaped, camera) if poses is None else _as_motion(seen, poses, shaped, camera)
-    )
-    height, width = seen[0].mask.shape
-    small = camera.resize((width, height))
+    small = camera.resize(seen[0].mask.shape[::-1])
     frames = [
         ClipFrame(
-            row=row,
             number=float(each.number),
             camera=small,
-            mask=OutlineDistances.of(each.mask, small) if row in outlined else None,
+            mask=OutlineDistances.of(each.mask, small) if place in outlined else None,
         )
-        for row, each in enumerate(seen)
+        for place, each in enumerate(seen)
     ]
     return ClipFitter(
-        motion, model.space, frames, model=model, track=_track(seen, camera),
-        settled=poses is not None,
-        sigma_log_focal=sigma_log_focal, weights=weights,
+        poses, model.space, frames, model=model, track=_track(seen, camera),
+        settled=settled, sigma_log_focal=sigma_log_focal, weights=weights,
     )  # fmt: skip
-
-
-def _as_motion(
-    seen: Sequence[SeenPerson], poses: Sequence[BodyPose], shaped: ShapedBody, camera: Camera
-) -> Motion:
-    return Motion(
-        root_rotations=np.stack([pose.root_rotation for pose in poses]),
-        root_translations=np.stack([pose.root_translation for pose in poses]),
-        joint_rotations=np.stack([pose.joint_rotations for pose in poses]),
-        valid=np.ones(len(poses), dtype=bool),
-        betas=np.zeros(shaped.body.shape_directions.shape[-1]),
-        body_model=shaped.body.family,
-        frames=np.array([each.number for each in seen]),
-        times_s=np.array([each.time_s for each in seen]),
-        intrinsic=camera.intrinsic,
-    )

@@ -23,7 +23,7 @@ from preprocess.fitting.joint_fitting import (
 from preprocess.frame_association import frame_numbers_from_names
 from preprocess.poses.motion_builder import MotionByPerson, build_motion
 from preprocess.poses.skeleton_motion import find_upright
-from preprocess.poses.video_trackers import nearest_person
+from preprocess.poses.tracker_files import nearest_person
 
 BODIES = ("MHR", "MHR's key points", "SOMA", "Anny", "SMPL-H", "SMPL-X")
 """Bodies whose joints are known: the columns of the tables."""

@@ -10,25 +10,25 @@ import numpy as np
 from capture.image_folder import refuse_pipe
 from capture.input_error import InputError
 from preprocess.body.body_pose import Motion
-from preprocess.capture_paths import resolve_pose_path
+from preprocess.capture_inputs import resolve_pose_path
 from preprocess.file_content import explain_damage, read_untrusted_file
-from preprocess.poses import body_joints, mocap_formats, skeleton_files, video_trackers
-from preprocess.poses.instant_avatar import parse_instant_avatar, parse_per_frame
+from preprocess.poses import body_joints, skeleton_files, tracker_files
 from preprocess.poses.motion_builder import MAX_GAP_FRAMES, MotionByPerson, fill_gaps
+from preprocess.poses.pose_file import parse_instant_avatar, parse_per_frame
 
 TRACKERS: dict[str, Callable[[Any, bool], MotionByPerson | None]] = {
     "BVH": skeleton_files.parse_bvh,
     "glTF": skeleton_files.parse_gltf,
-    "PHALP (4D-Humans)": video_trackers.parse_phalp,
-    "WHAM": video_trackers.parse_wham,
-    "VIBE": video_trackers.parse_vibe,
-    "GVHMR": video_trackers.parse_gvhmr,
-    "PromptHMR": video_trackers.parse_prompthmr,
-    "TRAM": video_trackers.parse_tram,
-    "ROMP or BEV": video_trackers.parse_romp,
-    "EasyMocap": mocap_formats.parse_easymocap,
-    "SLAHMR or 3DPW": mocap_formats.parse_slahmr,
-    "AMASS or AIST++": mocap_formats.parse_amass,
+    "PHALP (4D-Humans)": tracker_files.parse_phalp,
+    "WHAM": tracker_files.parse_wham,
+    "VIBE": tracker_files.parse_vibe,
+    "GVHMR": tracker_files.parse_gvhmr,
+    "PromptHMR": tracker_files.parse_prompthmr,
+    "TRAM": tracker_files.parse_tram,
+    "ROMP or BEV": tracker_files.parse_romp,
+    "EasyMocap": tracker_files.parse_easymocap,
+    "SLAHMR or 3DPW": tracker_files.parse_slahmr,
+    "AMASS or AIST++": tracker_files.parse_amass,
     "SAM 3D Body, GEM-X or joints": body_joints.parse_joints,
 }
 """Trackers by name, in the order in which they try to read a file."""

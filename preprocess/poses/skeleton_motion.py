@@ -18,7 +18,8 @@ from preprocess.body.kinematics import (
     JOINT_NAMES,
     PARENTS,
     axis_angles_from_matrices,
-    rotation_matrices,
+    shortest_turn,
+    unit_vectors,
 )
 from preprocess.body.parametric_body import load_body_model
 from preprocess.poses.motion_builder import build_motion
@@ -225,7 +226,7 @@ def find_upright(points: Float[np.ndarray, "poses 24 3"]) -> Float[np.ndarray, "
     height = np.nanmedian(shoulders - feet, axis=0)
     axis = int(np.abs(height).argmax())
     up = np.sign(height[axis]) * np.eye(3)[axis]
-    return _shortest_turn(up, np.array([0.0, 1.0, 0.0]))
+    return shortest_turn(up, np.array([0.0, 1.0, 0.0]))
 
 
 def _leg_length(points: Float[np.ndarray, "24 3"]) -> float:
@@ -261,8 +262,8 @@ def _frames(points: Float[np.ndarray, "poses 24 3"]) -> Float[np.ndarray, "poses
         points[:, JOINT_NAMES.index("right_hip")],
     )
     shoulders = [JOINT_NAMES.index("left_shoulder"), JOINT_NAMES.index("right_shoulder")]
-    x = _unit(left - right)
-    z = _unit(np.cross(x, points[:, shoulders].mean(axis=1) - 0.5 * (left + right)))
+    x = unit_vectors(left - right)
+    z = unit_vectors(np.cross(x, points[:, shoulders].mean(axis=1) - 0.5 * (left + right)))
     return np.stack([x, np.cross(z, x), z], axis=-1)
 
 
@@ -281,9 +282,9 @@ def _nearest_to_rest(
     """The pose whose limbs have most nearly the directions of SMPL's at rest."""
     rows = np.unique(np.linspace(0, len(points) - 1, MAX_CANDIDATES).round().astype(int))
     start, end = np.array(LIMBS).T
-    bones = _unit(points[rows][:, end] - points[rows][:, start])
+    bones = unit_vectors(points[rows][:, end] - points[rows][:, start])
     trunk = np.einsum("nab,nka->nkb", _frames(points[rows]), bones)
-    wanted = _unit(target[end] - target[start]) @ _frames(target[None])[0]
+    wanted = unit_vectors(target[end] - target[start]) @ _frames(target[None])[0]
     angles = np.arccos(np.clip((trunk * wanted).sum(axis=-1), -1.0, 1.0)).mean(axis=1)
     return int(rows[np.nanargmin(angles)])
 
@@ -302,8 +303,8 @@ def _match_rest(
     for joint, parent in enumerate(PARENTS):
         if joint in ends:
             start = world[parent] if parent in ends else trunk
-            bone = start @ _unit(target[ends[joint]] - target[joint])
-            world[joint] = _shortest_turn(bone, _unit(points[ends[joint]] - points[joint])) @ start
+            bone = start @ (target[ends[joint]] - target[joint])
+            world[joint] = shortest_turn(bone, points[ends[joint]] - points[joint]) @ start
         elif parent in ends and "wrist" in JOINT_NAMES[joint]:
             world[joint] = world[parent]
         elif parent in ends and "ankle" in JOINT_NAMES[joint]:
@@ -311,23 +312,7 @@ def _match_rest(
             if columns[toe] >= 0:
                 flat = np.array([1.0, 0.0, 1.0])
                 now, wanted = trunk @ (target[toe] - target[joint]), points[toe] - points[joint]
-                world[joint] = _shortest_turn(_unit(flat * now), _unit(flat * wanted)) @ trunk
+                world[joint] = shortest_turn(flat * now, flat * wanted) @ trunk
         elif parent > 0 and JOINT_NAMES[parent].endswith(("ankle", "wrist")):
             world[joint] = world[parent]
     return world
-
-
-def _unit(vectors: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-9)
-
-
-def _shortest_turn(
-    a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "3 3"]:
-    """The rotation by the least angle that turns one unit vector into another."""
-    axis, cosine = np.cross(a, b), float(np.clip(a @ b, -1.0, 1.0))
-    length = float(np.linalg.norm(axis))
-    if length < 1e-9:
-        axis = np.cross(a, np.eye(3)[np.abs(a).argmin()])
-        length = float(np.linalg.norm(axis))
-    return rotation_matrices(np.arccos(cosine) * axis / length)

@@ -9,14 +9,20 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
+import cv2
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from capture.input_error import InputError
 from capture.process_metrics import peak_memory_mb
-from capture.source import FrameSource
+from capture.source import Frame, FrameSource
+from preprocess.body.body_surface import MeshSilhouette
+from preprocess.cameras.camera_file import ASSUMED_CAMERA_SOURCE
+from preprocess.capture_session import Capture, Provenance
 from preprocess.frame_association import interpolate_missing_cameras
+from preprocess.observation import associate_poses
 from preprocess.sfm import colmap_mapping
 from preprocess.sfm.camera_solution import (
     INTERPOLATED,
@@ -39,6 +45,7 @@ from preprocess.sfm.colmap_mapping import (
     select_keyframes,
     write_keyframes,
 )
+from preprocess.sfm.metric_world import MetricPlacement, place_in_metric_world, solution_report
 from preprocess.sfm.point_tracking import (
     MAX_STATIC_MOTION,
     ResectionResult,
@@ -57,6 +64,10 @@ MIN_SOLVED_FRAMES = 0.5
 """Fraction of the frames that must have a camera in the end."""
 MAX_IGNORED_DISTORTION_PX = 0.3
 """Distortion of the corners below which a lens counts as free of distortion, pixels."""
+BODY_MARGIN = 0.06
+"""Margin for clothes and hair around the posed body; a fraction of its height in the image."""
+MASK_THRESHOLD = 0.2
+"""Opacity from which a pixel of a mask counts as the person."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,7 +204,11 @@ def _map(
     failed = [gate for gate in gates if not gate.passed]
     if failed:
         raise _unsolved_error(failed)
-    return _drop_small_distortion(model), gates
+    corner = np.hypot(*model.size_px) / 2.0 / model.focal_px
+    shift_px = abs(model.radial_distortion) * corner**3 * model.focal_px
+    if shift_px < MAX_IGNORED_DISTORTION_PX:
+        model = replace(model, radial_distortion=0.0)
+    return model, gates
 
 
 def _unsolved_error(failed: list[QualityGate]) -> InputError:
@@ -222,13 +237,6 @@ def _tracking_gate(between: ResectionResult, keys: int) -> QualityGate:
     )  # fmt: skip
 
 
-def _drop_small_distortion(model: SparseModel) -> SparseModel:
-    """The model without distortion, where that moves the corners by less than can be measured."""
-    corner = np.hypot(*model.size_px) / 2.0 / model.focal_px
-    shift_px = abs(model.radial_distortion) * corner**3 * model.focal_px
-    return replace(model, radial_distortion=0.0) if shift_px < MAX_IGNORED_DISTORTION_PX else model
-
-
 def _cameras_of_all_frames(
     source: FrameSource, model: SparseModel, between: ResectionResult
 ) -> tuple[Float[np.ndarray, "frames 4 4"], Int[np.ndarray, "frames"]]:
@@ -244,3 +252,90 @@ def _cameras_of_all_frames(
     cameras, missing = interpolate_missing_cameras(found, total)
     status[list(missing)] = MISSING
     return np.stack([camera.camera_from_world for camera in cameras]), status
+
+
+def solve_capture_cameras(
+    capture: Capture, *, seed: int, threads: int, report_progress: Callable[[float], None]
+) -> CameraSolution:
+    """Solve the cameras of a capture whose poses are in the camera of each frame.
+
+    A focal length that the poses state is where the solver starts. The result does not depend on
+    the number of threads; progress is the fraction of the work that is done.
+    """
+    stated = capture.motion.intrinsic is not None
+    ratio = capture.cameras[0].focal_px[0] / max(capture.source.size_px) if stated else None
+    settings = SolverSettings(focal_ratio=ratio, seed=seed, threads=threads)
+    return solve_cameras(capture.source, make_person_mask(capture), settings, report_progress)
+
+
+def make_person_mask(capture: Capture) -> PersonMaskFn:
+    """Make the function that finds the person: by the masks, or by the posed body and a margin."""
+    source = capture.source
+    if capture.masks.is_given:
+        capture.masks.check()
+
+        def by_mask(frame: Frame, size_px: tuple[int, int]) -> Bool[np.ndarray, "_ _"] | None:
+            try:
+                return capture.masks.read(frame.index, size_px) > MASK_THRESHOLD
+            except InputError:  # one damaged mask
+                return None
+
+        return by_mask
+    outline, pose_row = MeshSilhouette(capture.shaped), associate_poses(capture.motion, source)
+
+    def by_body(frame: Frame, size_px: tuple[int, int]) -> Bool[np.ndarray, "_ _"] | None:
+        row = pose_row(frame)
+        if row is None or not capture.motion.valid[row]:
+            return None
+        body = outline.draw_pose(capture.motion[row], capture.cameras[0].resize(size_px))
+        rows = np.flatnonzero(body.any(axis=1))
+        if not len(rows):
+            return None
+        side = 2 * max(2, round(BODY_MARGIN * (rows[-1] - rows[0]))) + 1
+        disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
+        return cv2.dilate(body.astype(np.uint8), disc) > 0
+
+    return by_body
+
+
+def apply_camera_solution(capture: Capture, solved: CameraSolution) -> Capture:
+    """Return the capture in the world of its solved cameras; unchanged if the camera stood still.
+
+    Poses are in the camera of each frame before.
+    """
+    if solved.is_static:
+        note = (
+            "The camera stood still (the background moved by "
+            f"{solved.background_motion:.2%} of the picture), so there was nothing to solve."
+        )
+        report = solution_report(solved, None, capture.source)
+        return capture.with_part(Provenance("cameras", "solved", (note,), figures=report))
+    motion, camera = capture.motion, capture.cameras[0]
+    stated = motion.intrinsic is not None or motion.assumed_focal is not None
+    is_known = stated or capture.cameras.source != ASSUMED_CAMERA_SOURCE
+    placement = place_in_metric_world(
+        solved, motion, camera if is_known else None, capture.shaped, capture.source
+    )
+    report = solution_report(solved, placement, capture.source)
+    note = _describe_solution(report, placement, solved)
+    return capture.with_part(
+        Provenance("cameras", "solved", (note,), figures=report),
+        cameras=placement.cameras,
+        motion=placement.motion,
+    )
+
+
+def _describe_solution(
+    report: dict[str, Any], placement: MetricPlacement, solved: CameraSolution
+) -> str:
+    frames, scale = report["frames"], report["scale"]
+    several = f"{frames['interpolated']} interpolated, " if frames["interpolated"] else ""
+    size = f"size by {' and '.join(scale['cues'])}"
+    if solved.model is not None and solved.model.only_turns:
+        size = f"the camera only turns, by {solved.model.turn_deg():.0f}°; {size}"
+    else:
+        size = f"{size}, {placement.floor_points} points of the floor seen"
+    return (
+        f"Cameras: {frames['key']} key frames solved, {frames['placed']} placed between them, "
+        f"{several}{frames['missing']} missing; focal length {report['focal_px']:.0f} px; {size}."
+    )

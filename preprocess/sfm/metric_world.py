@@ -2,12 +2,21 @@
 
 Units are metres, y points up, the floor is at 0 and the person above the origin. z points from the
 person to the first camera, so that a person who faces it has SMPL's own axes.
+
+A camera-frame point q (metres) is X = R_iᵀ q + s c_i in the world, with s metres per unit of the
+solved world: linear in s, so that each cue is a row a s = b of one least-squares problem.
+
+* **ground**: the lowest foot stands on the floor, s h_i = sole - min_j n · (R_iᵀ f_ij), h_i being
+  the camera's height above the floor. One value a frame; half of them agree, or it is no cue.
+* **in place**: the person stays about where it is: s (c_i - c̄) = -(q_i - q̄), q_i = R_iᵀ p_i.
+
+One scale for all frames: with one a frame the body would jitter in depth.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from capture.camera import Camera
 from capture.input_error import InputError
@@ -18,16 +27,251 @@ from preprocess.body.kinematics import rigid_transform, rotation_matrices
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.poses.motion_builder import place_in_camera_world, transform_motion
-from preprocess.sfm.camera_solution import KEY, MISSING, PLACED, CameraSolution
-from preprocess.sfm.metric_scale import (
-    SOLE_THICKNESS_M,
-    FloorPlane,
-    MetricScale,
-    PersonInCameras,
-    estimate_metric_scale,
-    fit_floor_plane,
-    mean_camera_up,
-)
+from preprocess.sfm.camera_solution import KEY, MISSING, PLACED, CameraSolution, SparseModel
+
+MAX_TILT_DEG = 20.0
+"""Largest angle between the floor's normal and the first guess of up, degrees."""
+PLANE_TOLERANCE = 0.01
+"""Distance within which points belong to a plane; a fraction of their median camera distance."""
+MIN_POINTS = 40
+"""Fewest points that a floor is fitted to."""
+MIN_INLIER_FRACTION = 0.05
+"""Fraction of the points below the cameras that must lie on the floor."""
+MAX_FRACTION_BELOW = 0.05
+"""Largest fraction of the points that may lie below the floor."""
+RANSAC_ITERATIONS = 2000
+"""Number of planes through three points that are tried."""
+MIN_VIEWS = 3
+"""Fewest cameras that must see a point."""
+SIGMA_GROUND_M = 0.06
+"""Standard deviation of a sole's height above the floor by a tracker's depth, metres."""
+SIGMA_PLACE_M = 0.20
+"""Standard deviation of a person from its usual place, metres."""
+IRLS_ITERATIONS = 5
+"""Rounds of reweighted least squares."""
+HUBER_THRESHOLD = 1.345
+"""Residual beyond which a cue counts less; standard deviations (95 % efficiency)."""
+MAX_CUE_DIFFERENCE = 0.10
+"""Relative difference of both cues beyond which the person walks and only the ground counts."""
+MAX_GROUND_SPREAD = 0.25
+"""Largest relative spread of the frames' own scales by ground contact (robust deviation)."""
+MAX_WANDER_M = 0.35
+"""Largest r.m.s. distance of the person from its place, if that is the only cue; metres."""
+MIN_FRAMES = 5
+"""Fewest frames with a pose and a camera."""
+SOLE_THICKNESS_M = 0.01
+"""Usual height of a body's bare sole above the floor, from barefoot to a shoe of 3 cm; metres."""
+MIN_CAMERA_PATH_M = 0.3
+"""Shortest path of the camera for which the second cue counts, metres."""
+FOOT_JOINTS = (7, 8, 10, 11)
+"""Ankles and feet among SMPL's joints."""
+MAX_LEAN_DEG = 30.0
+"""Largest angle between up as the cameras are held and up as the person stands."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FloorPlane:
+    """A plane: normal · x + offset = 0, the unit normal pointing up to the cameras.
+
+    `offset` is in the world's own unit; `points` on it are 0 if it was not seen and only up is
+    known.
+    """
+
+    normal: Float[np.ndarray, "3"]
+    offset: float
+    points: int
+
+    def heights_above(self, places: Float[np.ndarray, "places 3"]) -> Float[np.ndarray, "places"]:
+        """Signed distances of places from the plane, up."""
+        return places @ self.normal + self.offset
+
+
+def mean_camera_up(model: SparseModel) -> Float[np.ndarray, "3"]:
+    """Up as the cameras hold their images: minus the mean of their y axes."""
+    up = -model.camera_from_world[:, 1, :3].mean(axis=0)
+    return up / np.linalg.norm(up)
+
+
+def fit_floor_plane(model: SparseModel, up: Float[np.ndarray, "3"]) -> FloorPlane | None:
+    """The largest plane below the cameras that is nearly level and has next to nothing below it.
+
+    RANSAC (Fischler & Bolles 1981) over triples of points, then least squares over near points;
+    `up` is a first guess.
+    """
+    views = np.bincount(model.observation_point, minlength=len(model.points))
+    points = model.points[views >= MIN_VIEWS]
+    centers = model.camera_centers()
+    distance = np.linalg.norm(
+        model.points[model.observation_point] - centers[model.observation_camera], axis=1
+    )
+    if not len(points):
+        return None
+    near = PLANE_TOLERANCE * float(np.median(distance))
+    lowest = float((centers @ up).min())
+    points = points[points @ up < lowest]
+    if len(points) < MIN_POINTS:
+        return None
+    rng = np.random.default_rng(0)
+    best, most = None, max(MIN_POINTS, MIN_INLIER_FRACTION * len(points))
+    for _ in range(RANSAC_ITERATIONS):
+        plane = _plane_through(points[rng.choice(len(points), 3, replace=False)], up)
+        if plane is None:
+            continue
+        heights = points @ plane[0] + plane[1]
+        inside = np.abs(heights) < near
+        if inside.sum() > most and (heights < -3.0 * near).mean() < MAX_FRACTION_BELOW:
+            best, most = inside, float(inside.sum())
+    return None if best is None else _refine_plane(points, best, up, near)
+
+
+def _plane_through(
+    three: Float[np.ndarray, "3 3"], up: Float[np.ndarray, "3"]
+) -> tuple[Float[np.ndarray, "3"], float] | None:
+    normal = np.cross(three[1] - three[0], three[2] - three[0])
+    length = float(np.linalg.norm(normal))
+    if length < 1e-12:
+        return None
+    normal = normal / length * (1.0 if normal @ up > 0.0 else -1.0)
+    if normal @ up < np.cos(np.radians(MAX_TILT_DEG)):
+        return None
+    return normal, -float(normal @ three[0])
+
+
+def _refine_plane(
+    points: Float[np.ndarray, "points 3"],
+    inside: Bool[np.ndarray, "points"],
+    up: Float[np.ndarray, "3"],
+    near: float,
+) -> FloorPlane:
+    """Least squares over the points of the plane, three times."""
+    normal, offset = up, 0.0
+    for _ in range(3):
+        middle = points[inside].mean(axis=0)
+        normal = np.linalg.svd(points[inside] - middle, full_matrices=False)[2][2]
+        normal = normal if normal @ up > 0.0 else -normal
+        offset = -float(normal @ middle)
+        inside = np.abs(points @ normal + offset) < near
+    return FloorPlane(normal=normal, offset=offset, points=int(inside.sum()))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PersonInCameras:
+    """The person in the cameras' own frames, one row for each frame with a pose and a camera.
+
+    Attributes:
+        world_from_camera: Rotations R_iᵀ.
+        centers: Cameras in the solved world's unit.
+        pelvis_positions: Pelvis in the camera, metres.
+        soles: Skin of both feet in the camera, metres.
+    """
+
+    world_from_camera: Float[np.ndarray, "frames 3 3"]
+    centers: Float[np.ndarray, "frames 3"]
+    pelvis_positions: Float[np.ndarray, "frames 3"]
+    soles: Float[np.ndarray, "frames soles 3"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetricScale:
+    """Metres per unit of the solved world.
+
+    Attributes:
+        cues: The cues that made it: "ground", "in place"; "the person" if the camera only turns.
+        ground, place: The scale by each alone; None where it says nothing.
+        spread: Of the frames' own values by ground contact, relative; NaN without ground.
+        rejection_reason: Why it is not to be believed; None if it is.
+    """
+
+    metres_per_unit: float
+    cues: tuple[str, ...]
+    ground: float | None
+    place: float | None
+    spread: float
+    rejection_reason: str | None = None
+
+    @classmethod
+    def of_person(cls) -> "MetricScale":
+        """The scale of a world without any path of the camera: the person's."""
+        return cls(
+            metres_per_unit=1.0, cues=("the person",), ground=None, place=None, spread=float("nan")
+        )
+
+
+def estimate_metric_scale(standing: PersonInCameras, floor: FloorPlane | None) -> MetricScale:
+    """Estimate the scale by all cues that hold; `floor` is None if it was not seen."""
+    contact = heights = np.zeros(0)
+    if floor is not None and floor.points and len(standing.centers) >= MIN_FRAMES:
+        heights = floor.heights_above(standing.centers)
+        turned = np.einsum("nab,nkb->nka", standing.world_from_camera, standing.soles)
+        contact = SOLE_THICKNESS_M - (turned @ floor.normal).min(axis=1)
+    ground, spread = _scale_from_ground(heights, contact)
+    seen = np.einsum("nab,nb->na", standing.world_from_camera, standing.pelvis_positions)
+    moves = (standing.centers - standing.centers.mean(axis=0)).ravel()
+    stays = -(seen - seen.mean(axis=0)).ravel()
+    place, wander = _scale_from_static_person(moves, stays)
+    if ground is not None and spread <= MAX_GROUND_SPREAD:
+        if place is None or abs(place - ground) > MAX_CUE_DIFFERENCE * ground:
+            scale, cues = ground, ("ground",)
+        else:
+            rows = np.concatenate([heights / SIGMA_GROUND_M, moves / SIGMA_PLACE_M])
+            right = np.concatenate([contact / SIGMA_GROUND_M, stays / SIGMA_PLACE_M])
+            scale = _fit_scale_huber(rows, right, 0.5 * (ground + place))
+            cues = ("ground", "in place")
+        return MetricScale(
+            metres_per_unit=scale, cues=cues, ground=ground, place=place, spread=spread
+        )
+    refused = None
+    if place is None or wander > MAX_WANDER_M:
+        refused = (
+            "nothing tells how large the room is: "
+            + ("the floor was not seen" if ground is None else "the feet are never on the floor")
+            + ", and the person does not stay in one place. Film so that the floor shows some "
+            "texture (a rug, planks), or give cameras with a size of their own (ARKit, Record3D)"
+        )
+    return MetricScale(
+        metres_per_unit=place or 1.0, cues=("in place",), ground=ground, place=place, spread=spread,
+        rejection_reason=refused,
+    )  # fmt: skip
+
+
+def _scale_from_ground(
+    heights: Float[np.ndarray, "frames"], contact: Float[np.ndarray, "frames"]
+) -> tuple[float | None, float]:
+    """The median over frames, and its relative spread."""
+    usable = (heights > 0.0) & (contact > 0.0)
+    if usable.sum() < MIN_FRAMES:
+        return None, float("nan")
+    each = contact[usable] / heights[usable]
+    middle = float(np.median(each))
+    return middle, 1.4826 * float(np.median(np.abs(each - middle))) / middle
+
+
+def _scale_from_static_person(
+    moves: Float[np.ndarray, "rows"], stays: Float[np.ndarray, "rows"]
+) -> tuple[float | None, float]:
+    """The scale for which the person moves least, and the r.m.s. distance from its place."""
+    square = float((moves**2).sum())
+    if len(moves) < 3 * MIN_FRAMES or square <= 0.0:
+        return None, float("inf")
+    scale = float((moves * stays).sum()) / square  # least squares: s = Σ a b / Σ a²
+    if scale <= 0.0 or scale * np.sqrt(3.0 * square / len(moves)) < MIN_CAMERA_PATH_M:
+        return None, float("inf")
+    return scale, float(np.sqrt(3.0 * ((moves * scale - stays) ** 2).mean()))
+
+
+def _fit_scale_huber(
+    rows: Float[np.ndarray, "rows"], right: Float[np.ndarray, "rows"], start: float
+) -> float:
+    """Least squares of rows · s = right, far ones weighing less (Huber 1964).
+
+    Iteratively reweighted: s = Σ w a b / Σ w a², w = min(1, threshold / |a s - b|).
+    """
+    scale = start
+    for _ in range(IRLS_ITERATIONS):
+        off = np.abs(rows * scale - right)
+        weights = np.minimum(1.0, HUBER_THRESHOLD / np.maximum(off, 1e-12))
+        scale = float((weights * rows * right).sum() / (weights * rows**2).sum())
+    return scale
 
 
 def upright_axes(
@@ -61,12 +305,6 @@ def to_metric_world(
     return rigid_transform(rotations, -np.einsum("cab,cb->ca", rotations, there))
 
 
-FOOT_JOINTS = (7, 8, 10, 11)
-"""Ankles and feet among SMPL's joints."""
-MAX_LEAN_DEG = 30.0
-"""Largest angle between up as the cameras are held and up as the person stands."""
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MetricPlacement:
     """A capture in a world of metres, y up, the floor at 0.
@@ -96,9 +334,14 @@ def place_in_metric_world(
             then they are taken to be right for the solved focal length.
     """
     lens = solved.lens(source.size_px)
-    if tracker_camera is not None:
-        motion = refocus_motion(motion, tracker_camera, lens, shaped)
-    frames = frame_indices_of_rows(motion, lens, source)
+    one = CameraTrack(cameras=(lens,), source="")
+    if tracker_camera is not None:  # as the solved lens sees them where the tracker's did
+        motion = replace(
+            motion, space="camera", intrinsic=tracker_camera.intrinsic, assumed_focal=None
+        )
+        motion = place_in_camera_world(motion, shaped, one, cameras_given=True)
+    numbers = np.nan_to_num(CaptureGeometry.of(motion, one, source).row_frames).round()
+    frames = numbers.astype(np.int64).clip(0, source.frames_in_file - 1)
     usable = motion.valid & (solved.frame_status[frames] >= PLACED)
     standing = _person_in_cameras(solved, motion, frames, np.flatnonzero(usable), shaped)
     assert solved.model is not None
@@ -112,7 +355,12 @@ def place_in_metric_world(
         raise InputError(f"The cameras were solved, but {scale.rejection_reason}.")
     turned = np.einsum("nab,nb->na", standing.world_from_camera, standing.pelvis_positions)
     person = np.median(turned / scale.metres_per_unit + standing.centers, axis=0)
-    ground = floor or _floor_below_soles(standing, scale.metres_per_unit, up)
+    ground = floor
+    if ground is None:  # the level plane on which the lowest sole of most frames stands
+        soles = np.einsum("nab,nkb->nka", standing.world_from_camera, standing.soles) @ up
+        lowest = (soles.min(axis=1) - SOLE_THICKNESS_M) / scale.metres_per_unit
+        offset = -float(np.median(lowest + standing.centers @ up))
+        ground = FloorPlane(normal=up, offset=offset, points=0)
     transforms = to_metric_world(solved.camera_from_solved, scale.metres_per_unit, ground, person)
     cameras = CameraTrack(
         cameras=tuple(replace(lens, camera_from_world=transform) for transform in transforms),
@@ -126,24 +374,6 @@ def place_in_metric_world(
         scale=scale,
         floor_points=ground.points,
     )
-
-
-def refocus_motion(
-    motion: Motion, tracker_camera: Camera, lens: Camera, shaped: ShapedBody
-) -> Motion:
-    """Camera-frame poses as another lens sees them where the first one did."""
-    there = replace(motion, space="camera", intrinsic=tracker_camera.intrinsic, assumed_focal=None)
-    one = CameraTrack(cameras=(lens,), source="")
-    return place_in_camera_world(there, shaped, one, cameras_given=True)
-
-
-def frame_indices_of_rows(
-    motion: Motion, camera: Camera, source: FrameSource
-) -> Int[np.ndarray, "poses"]:
-    """The frame that each row belongs to."""
-    claim = CaptureGeometry.of(motion, CameraTrack(cameras=(camera,), source=""), source)
-    numbers = np.nan_to_num(claim.row_frames).round().astype(np.int64)
-    return numbers.clip(0, source.frames_in_file - 1)
 
 
 def _person_in_cameras(
@@ -186,15 +416,6 @@ def _estimate_up(
     if length < 0.5 or up @ held < length * np.cos(np.radians(MAX_LEAN_DEG)):
         return held
     return up / length
-
-
-def _floor_below_soles(
-    standing: PersonInCameras, scale: float, up: Float[np.ndarray, "3"]
-) -> FloorPlane:
-    """The level plane on which the lowest sole of most frames stands."""
-    turned = np.einsum("nab,nkb->nka", standing.world_from_camera, standing.soles)
-    lowest = ((turned @ up).min(axis=1) - SOLE_THICKNESS_M) / scale + standing.centers @ up
-    return FloorPlane(normal=up, offset=-float(np.median(lowest)), points=0)
 
 
 def solution_report(

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from scipy.sparse import coo_array
 from scipy.spatial.transform import Rotation
 
+from preprocess.body.kinematics import cross_matrices
 from preprocess.sfm.camera_solution import SparseModel
 from preprocess.sfm.colmap_mapping import STATED_FOCAL_TOLERANCE, SfmKeyframe
 from preprocess.sfm.point_tracking import INLIER_PX, detect_corners, track_points
@@ -86,7 +87,8 @@ def _follow_corners(keys: list[SfmKeyframe]) -> list[_Track]:
             rows, last = np.arange(len(corners)), corners
             for view in views:
                 last, is_same = track_points(start.gray, keys[view].gray, corners[rows], last)
-                is_same[is_same] = ~_is_person(keys[view], last[is_same])
+                column, row = last[is_same].astype(int).T
+                is_same[is_same] = ~keys[view].person_mask[row, column]
                 rows, last = rows[is_same], last[is_same]
                 if len(rows) < MIN_CORNERS:
                     break
@@ -101,11 +103,6 @@ def _follow_corners(keys: list[SfmKeyframe]) -> list[_Track]:
                     homography=plane,
                 ))  # fmt: skip
     return tracks
-
-
-def _is_person(key: SfmKeyframe, pixels: Float[np.ndarray, "points 2"]) -> np.ndarray:
-    column, row = pixels.astype(int).T
-    return key.person_mask[row, column]
 
 
 def _initial_turns(tracks: list[_Track], keys: int, longer_px: int) -> _Turns | None:
@@ -158,9 +155,8 @@ def _refine(turns: _Turns, tracks: list[_Track], *, holds_focal: bool = False) -
         slope[:, :, 2] = -plane / seen_rays[:, 2:]
         ray_slope = slope @ relative
         by_focal = plane - np.einsum("nab,nb->na", ray_slope[:, :, :2], rays[:, :2])
-        values = np.concatenate(
-            [-slope @ _cross(seen_rays), ray_slope @ _cross(rays), by_focal[:, :, None]], axis=2
-        )
+        by_view, by_anchor = -slope @ cross_matrices(seen_rays), ray_slope @ cross_matrices(rays)
+        values = np.concatenate([by_view, by_anchor, by_focal[:, :, None]], axis=2)
         rows = np.broadcast_to(np.arange(off.size).reshape(-1, 2, 1), values.shape)
         entry_columns = np.broadcast_to(columns[:, None], values.shape)
         entries = values.ravel(), (rows.ravel(), entry_columns.ravel())
@@ -174,13 +170,6 @@ def _refine(turns: _Turns, tracks: list[_Track], *, holds_focal: bool = False) -
             rotations=by_key @ turns.rotations, focal_px=turns.focal_px * float(np.exp(step[-1]))
         )
     return turns
-
-
-def _cross(vectors: Float[np.ndarray, "points 3"]) -> Float[np.ndarray, "points 3 3"]:
-    """The matrices that multiply by the cross product."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
 
 
 def _to_model(turns: _Turns, tracks: list[_Track], keys: list[SfmKeyframe]) -> SparseModel:

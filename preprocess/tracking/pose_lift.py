@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose, Motion
-from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
+from preprocess.body.kinematics import axis_angles_from_matrices, shortest_turn, unit_vectors
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.poses.motion_builder import fill_gaps, place_by_pixels
 from preprocess.tracking.keypoints import HIPS, MIN_PRESENCE, MIRRORED_POINTS, KeypointTrack
@@ -124,10 +124,12 @@ def lift_keypoints(track: KeypointTrack, shaped: ShapedBody, camera: Camera) -> 
     The camera is that of all frames, of their size, at the world's origin. The motion has a row for
     each frame with a person or in a short gap, and holds the key points and the camera's K.
     """
-    track = repair_swaps(track)
-    poses = [
-        _lift(track.image_px[row], track.world_m[row], shaped, camera) for row in range(len(track))
-    ]
+    track, poses = repair_swaps(track), list[BodyPose]()
+    for image_px, world_m in zip(track.image_px, track.world_m, strict=True):
+        pose = lift_pose(world_m, shaped)
+        joints = shaped.with_pose(pose).joints()[list(PLACED_JOINTS)]
+        place = place_by_pixels(joints, image_px[list(PLACED_POINTS)], camera)
+        poses.append(replace(pose, root_translation=place))
     motion = Motion(
         root_rotations=np.array([pose.root_rotation for pose in poses]).reshape(-1, 3),
         root_translations=np.array([pose.root_translation for pose in poses]).reshape(-1, 3),
@@ -143,18 +145,6 @@ def lift_keypoints(track: KeypointTrack, shaped: ShapedBody, camera: Camera) -> 
     return fill_gaps(motion)
 
 
-def _lift(
-    image_px: Float[np.ndarray, "33 2"],
-    world_m: Float[np.ndarray, "33 3"],
-    shaped: ShapedBody,
-    camera: Camera,
-) -> BodyPose:
-    pose = lift_pose(world_m, shaped)
-    joints = shaped.with_pose(pose).joints()[list(PLACED_JOINTS)]
-    place = place_by_pixels(joints, image_px[list(PLACED_POINTS)], camera)
-    return replace(pose, root_translation=place)
-
-
 def lift_pose(world_m: Float[np.ndarray, "33 3"], shaped: ShapedBody) -> BodyPose:
     """First guess of a pose by the shoulders, hips and limbs among the key points, unplaced."""
     rest, local = shaped.joints, np.tile(np.eye(3), (24, 1, 1))
@@ -165,7 +155,7 @@ def lift_pose(world_m: Float[np.ndarray, "33 3"], shaped: ShapedBody) -> BodyPos
         # the trunk's other joints and the collars rest: a limb's parent turns as the root does
         local[upper] = local[0].T @ turned
         bent = turned.T @ second
-        local[middle] = _swing(rest[lower] - rest[middle], bent)
+        local[middle] = shortest_turn(rest[lower] - rest[middle], bent)
     vectors = axis_angles_from_matrices(local)
     return BodyPose(
         root_rotation=vectors[0], root_translation=np.zeros(3), joint_rotations=vectors[1:]
@@ -194,26 +184,12 @@ def _limb_turn(
     world rotation of what it hangs on; `first` and `second` are the limb's bones as they were
     found.
     """
-    along, further = _unit(first), _unit(second)
-    unbent = parent @ _swing(rest, parent.T @ first)
+    along, further = unit_vectors(first), unit_vectors(second)
+    unbent = parent @ shortest_turn(rest, parent.T @ first)
     axis = np.cross(along, further) + STRAIGHT * (unbent @ hinge)
-    axis = _unit(axis - (axis @ along) * along)
-    start, side = _unit(rest), _unit(hinge - (hinge @ _unit(rest)) * _unit(rest))
+    axis = unit_vectors(axis - (axis @ along) * along)
+    start = unit_vectors(rest)
+    side = unit_vectors(hinge - (hinge @ start) * start)
     there = np.column_stack([along, axis, np.cross(along, axis)])
     here = np.column_stack([start, side, np.cross(start, side)])
     return there @ here.T
-
-
-def _swing(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """The smallest rotation that takes direction a to direction b."""
-    a, b = _unit(a), _unit(b)
-    axis = np.cross(a, b)
-    sine = float(np.linalg.norm(axis))
-    if sine < 1e-8:
-        axis = np.cross(a, np.eye(3)[np.abs(a).argmin()])
-        return rotation_matrices(_unit(axis) * (0.0 if a @ b > 0.0 else np.pi))
-    return rotation_matrices(axis / sine * np.arctan2(sine, a @ b))
-
-
-def _unit(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    return vector / max(float(np.linalg.norm(vector)), 1e-12)

@@ -4,8 +4,7 @@ Networks run on one thread; masks are refined and written on another, so two cor
 in which borders of the image or other persons make the track doubtful are marked.
 """
 
-import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -17,7 +16,7 @@ import numpy as np
 from jaxtyping import Float32, Int
 
 from capture.input_error import InputError
-from capture.source import FrameSource, RgbImage
+from capture.source import Frame, FrameSource, RgbImage
 from preprocess.plugins import PersonTracker
 from preprocess.tracking.keypoints import CroppedMask, KeypointTrack, PersonKeypoints
 
@@ -152,59 +151,88 @@ class TrackedVideo:
     interrupted: bool
 
 
-def track_video(
-    source: FrameSource,
-    tracker: PersonTracker,
-    refine: MaskRefinement,
-    mask_folder: Path | None,
-    *,
-    advance: Callable[[int], None] = lambda done: None,
-    stop: threading.Event | None = None,
-    before: TrackedVideo | None = None,
-) -> TrackedVideo:
-    """Find the person in each wanted frame of a recording.
+@final
+class VideoTracking:
+    """Finds the person in each wanted frame of a recording."""
 
-    Args:
-        mask_folder: Existing folder for a mask of every frame, an empty one where the person was
-            not found; None writes none.
-        advance: Called with the number of frames done.
-        stop: Ends tracking early once it is set; what was found until then is returned.
-        before: Result for the frames before those of `source`; it is returned with the rest.
-    """
-    frames, problems = list[int](), list[int]()
-    found: list[PersonKeypoints] = []
-    finder, times = ProblemFinder(), dict[int, float]()
-    waiting: list[Future[None]] = []
-    interrupted = False
-    with ThreadPoolExecutor(max_workers=1, thread_name_prefix="masks") as pool:
-        for frame in source.frames():
-            if stop is not None and stop.is_set():
-                interrupted = True
-                break
-            person = None if "corrupt" in frame.flags else tracker(frame.rgb)
-            times[frame.index] = frame.time_s
-            seen = finder.problems(person, source.size_px)
-            if person is not None:
-                frames.append(frame.index)
-                found.append(person)
-                problems.append(sum(PROBLEM_BITS[each] for each in seen))
-            if mask_folder is not None:
-                path = _mask_path(mask_folder, frame.index)
-                waiting.append(pool.submit(_write_mask, path, frame.rgb, person, refine))
-            while len(waiting) > QUEUED_MASKS or (waiting and waiting[0].done()):
-                waiting.pop(0).result()
-            advance(len(times))
-        for each in waiting:
+    def __init__(
+        self,
+        source: FrameSource,
+        tracker: PersonTracker,
+        refine: MaskRefinement,
+        mask_folder: Path | None,
+        before: TrackedVideo | None = None,
+    ) -> None:
+        """Read nothing yet.
+
+        Args:
+            mask_folder: Existing folder for a mask of every frame, an empty one where the person
+                was not found; None writes none.
+            before: Result for the frames before those of `source`; it is returned with the rest.
+        """
+        self._source, self._tracker, self._refine = source, tracker, refine
+        self._mask_folder, self._before = mask_folder, before
+        self._found, self._problems = dict[int, PersonKeypoints](), list[int]()
+        self._times_s = {} if before is None else dict(before.frame_times_s)
+        self._writing: list[Future[None]] = []
+        self._is_complete = False
+
+    def run(self) -> Generator[int, None, None]:
+        """Go through the frames; yields how many are done, and may be left early."""
+        finder, size_px = ProblemFinder(), self._source.size_px
+        with ThreadPoolExecutor(max_workers=1, thread_name_prefix="masks") as pool:
+            for frame in self._source.frames():
+                person = None if "corrupt" in frame.flags else self._tracker(frame.rgb)
+                self._times_s[frame.index] = frame.time_s
+                seen = finder.problems(person, size_px)
+                if person is not None:
+                    self._found[frame.index] = person
+                    self._problems.append(sum(PROBLEM_BITS[each] for each in seen))
+                if self._mask_folder is not None:
+                    self._writing.append(pool.submit(self._write_mask, frame, person))
+                while len(self._writing) > QUEUED_MASKS or (
+                    self._writing and self._writing[0].done()
+                ):
+                    self._writing.pop(0).result()
+                yield len(self._times_s)
+        if self._mask_folder is not None:
+            self._refine_again()
+        self._is_complete = True
+
+    def result(self) -> TrackedVideo:
+        """What was found until now; an `InputError` if the person was in too few frames."""
+        for each in self._writing:
             each.result()
-    if mask_folder is not None and not interrupted:
-        first = dict(zip(frames[:FRAMES_REFINED_AGAIN], found, strict=False))
-        _refine_again(source, first, refine, mask_folder)
-    track = KeypointTrack.of(frames, found, source.size_px, [times[number] for number in frames])
-    track = replace(track, problems=_mark_approach(np.array(problems, dtype=np.int64)))
-    if before is not None:
-        track, times = before.keypoints.join(track), before.frame_times_s | times
-    _require_person(source, len(track), len(times))
-    return TrackedVideo(keypoints=track, frame_times_s=times, interrupted=interrupted)
+        times_s, frames = self._times_s, list(self._found)
+        track = KeypointTrack.of(
+            frames, list(self._found.values()), self._source.size_px, [times_s[n] for n in frames]
+        )
+        track = replace(track, problems=_mark_approach(np.array(self._problems, dtype=np.int64)))
+        if self._before is not None:
+            track = self._before.keypoints.join(track)
+        _require_person(self._source, len(track), len(times_s))
+        return TrackedVideo(
+            keypoints=track, frame_times_s=times_s, interrupted=not self._is_complete
+        )
+
+    def _refine_again(self) -> None:
+        """Make the masks of the first frames again, by what later frames have shown."""
+        left = set(list(self._found)[:FRAMES_REFINED_AGAIN])
+        for frame in self._source.frames() if left else ():
+            if frame.index in left:
+                self._write_mask(frame, self._found[frame.index])
+                left.remove(frame.index)
+            if not left:
+                return
+
+    def _write_mask(self, frame: Frame, person: PersonKeypoints | None) -> None:
+        assert self._mask_folder is not None
+        mask = np.zeros(frame.rgb.shape[:2], dtype=np.uint8)
+        if person is not None:
+            alpha = self._refine(frame.rgb, person.mask, frame.size_px)
+            mask = (alpha * 255.0 + 0.5).astype(np.uint8)
+        _, code = cv2.imencode(".png", mask, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        (self._mask_folder / f"{frame.index:06d}.png").write_bytes(code.tobytes())
 
 
 def _mark_approach(problems: Int[np.ndarray, "rows"]) -> Int[np.ndarray, "rows"]:
@@ -212,37 +240,6 @@ def _mark_approach(problems: Int[np.ndarray, "rows"]) -> Int[np.ndarray, "rows"]
     crowded = (problems & PROBLEM_BITS[TrackingProblem.CROWDED]) > 0
     near = [crowded[row : row + APPROACH_FRAMES + 1].any() for row in range(len(crowded))]
     return problems | np.array(near, dtype=np.int64) * PROBLEM_BITS[TrackingProblem.CROWDED]
-
-
-def _refine_again(
-    source: FrameSource,
-    found: Mapping[int, PersonKeypoints],
-    refine: MaskRefinement,
-    mask_folder: Path,
-) -> None:
-    """Make the masks of some frames again, by what later frames have shown."""
-    left = set(found)
-    for frame in source.frames():
-        if frame.index in left:
-            _write_mask(_mask_path(mask_folder, frame.index), frame.rgb, found[frame.index], refine)
-            left.remove(frame.index)
-        if not left:
-            return
-
-
-def _mask_path(folder: Path, index: int) -> Path:
-    return folder / f"{index:06d}.png"
-
-
-def _write_mask(
-    path: Path, rgb: RgbImage, person: PersonKeypoints | None, refine: MaskRefinement
-) -> None:
-    height, width = rgb.shape[:2]
-    mask = np.zeros((height, width), dtype=np.uint8)
-    if person is not None:
-        mask = (refine(rgb, person.mask, (width, height)) * 255.0 + 0.5).astype(np.uint8)
-    _, code = cv2.imencode(".png", mask, [cv2.IMWRITE_PNG_COMPRESSION, 1])
-    path.write_bytes(code.tobytes())
 
 
 def reason_left_out(track: KeypointTrack, frame: int) -> str:

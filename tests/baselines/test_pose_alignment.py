@@ -7,8 +7,7 @@ import pytest
 
 from baselines.systems.pose_alignment import align_pose
 from instant_avatar.studio.actor import Actor
-from preprocess.fitting.capture_fit import correct_pose
-from preprocess.fitting.clip_poses import POSE_SIGMA
+from preprocess.fitting.clip_poses import POSE_SIGMA, ClipPoses
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +37,8 @@ def joint_error_px(actor, one, other):
 
 def test_a_wrong_pose_is_found_again(actor, clip, draws):
     true, noise = clip.novel, 0.5 * POSE_SIGMA * np.random.default_rng(1).standard_normal(75)
-    begin = replace(true, pose=correct_pose(true.pose, noise, true.camera.camera_from_world))
+    view = true.camera.camera_from_world[None, :3, :3]
+    begin = replace(true, pose=ClipPoses.stack([true.pose]).moved(noise[None], view)[0])
     render, asked = draws
     found = align_pose(render, begin, actor.shaped)
     assert len(asked) == 6

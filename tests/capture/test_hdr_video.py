@@ -4,8 +4,8 @@ import av
 import numpy as np
 import pytest
 
-from capture.hdr_tone_mapping import HLG, PEAK_NITS, PQ, WHITE_NITS, tone_map_hdr
 from capture.source_opening import open_source
+from capture.video import HLG, PEAK_NITS, PQ, WHITE_NITS, tone_map_hdr
 
 
 def code_of(nits: float, curve: int) -> int:

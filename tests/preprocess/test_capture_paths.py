@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from capture.input_error import InputError
-from preprocess.capture_paths import find_capture_paths
+from preprocess.capture_inputs import find_capture_paths
 
 
 @pytest.fixture

@@ -16,8 +16,7 @@ from preprocess import tracked_stream
 from preprocess.body.body_surface import splat_silhouette
 from preprocess.body.parametric_body import load_body_model
 from preprocess.cameras.camera_file import CameraTrack, assume_camera, write_cameras
-from preprocess.capture_inputs import CaptureInputs
-from preprocess.capture_paths import CapturePaths
+from preprocess.capture_inputs import CaptureInputs, CapturePaths
 from preprocess.capture_session import Capture
 from preprocess.fitting.tracked_frames import LAG_FRAMES, EarlierPoses
 from preprocess.masks.mask_sources import EstimatedMasks

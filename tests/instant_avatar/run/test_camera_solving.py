@@ -17,7 +17,7 @@ from preprocess.capture_inputs import CaptureInputs
 from preprocess.open_capture import open_capture
 from preprocess.poses.pose_format_registry import read_poses
 from preprocess.sfm.camera_solution import CameraSolution
-from preprocess.sfm.capture_solving import (
+from preprocess.sfm.camera_solver import (
     apply_camera_solution,
     make_person_mask,
     solve_capture_cameras,

@@ -9,7 +9,7 @@ from capture.source import PacingClock
 from capture.source_opening import open_source
 from instant_avatar import ingest
 from instant_avatar.run.ingest_arguments import IngestArguments
-from preprocess import observation_source
+from preprocess import capture_session
 
 
 @pytest.fixture
@@ -51,7 +51,7 @@ def waits(monkeypatch):
     """What is waited for frames from now on, seconds; time stands still but in these waits."""
     found, began = [], time.perf_counter()
     pace = PacingClock(clock=lambda: began + sum(found), wait=found.append)
-    monkeypatch.setattr(observation_source, "PacingClock", lambda: pace)
+    monkeypatch.setattr(capture_session, "PacingClock", lambda: pace)
     return found
 
 

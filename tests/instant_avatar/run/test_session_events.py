@@ -23,8 +23,8 @@ from instant_avatar.run.run_folder import RunFolder
 from instant_avatar.run.session_events import PackageWritten, Scored, SessionEvent
 from instant_avatar.run.training_session import TrainingSession
 from preprocess.capture_inputs import CaptureInputs
+from preprocess.capture_session import RecordedObservations
 from preprocess.observation import DroppedFrame
-from preprocess.observation_source import RecordedObservations
 from preprocess.open_capture import open_capture
 
 

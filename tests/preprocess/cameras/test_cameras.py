@@ -16,7 +16,7 @@ from capture.input_error import InputError
 from capture.source import FrameSource
 from capture.source_opening import open_source
 from preprocess.cameras.camera_file import read_cameras
-from preprocess.cameras.camera_registry import read_named_cameras
+from preprocess.cameras.camera_formats import read_named_cameras
 
 SIZE = (640, 480)
 COUNT = 5

@@ -10,7 +10,7 @@ import pytest
 from capture.input_error import InputError
 from capture.source_opening import open_source
 from preprocess.cameras.camera_file import read_cameras
-from preprocess.cameras.camera_registry import read_named_cameras
+from preprocess.cameras.camera_formats import read_named_cameras
 
 POSES = [np.diag([1.0, 1, 1, 1]) + np.outer([0, 0, 1, 0], [0, 0, 0, n]) for n in range(3)]
 

@@ -11,7 +11,7 @@ from capture.camera import Camera
 from capture.input_error import InputError
 from capture.source_opening import open_source
 from preprocess.cameras.camera_file import read_cameras
-from preprocess.cameras.multi_view_cameras import (
+from preprocess.cameras.camera_formats import (
     find_multi_view_cameras,
     read_multi_view_camera,
 )

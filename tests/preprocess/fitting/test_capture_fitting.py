@@ -171,5 +171,5 @@ def test_key_points_bring_coarse_poses_nearer_to_the_truth(coarse, monkeypatch):
 
 
 def test_no_key_points_are_looked_for_where_given_poses_are_exact(capture, monkeypatch):
-    monkeypatch.delattr(capture_fitting, "weigh_keypoint_poses")
+    monkeypatch.delattr(capture_fitting, "_find_keypoints")
     assert fit_capture(capture).share == 0.0

@@ -61,9 +61,13 @@ def outlines(space: ProportionSpace, coefficients, motion: Motion) -> list[ClipF
         for pose in motion_poses(motion)
     ]
     return [
-        ClipFrame(row=row, number=float(row), camera=CAMERA, mask=OutlineDistances.of(mask, CAMERA))
+        ClipFrame(number=float(row), camera=CAMERA, mask=OutlineDistances.of(mask, CAMERA))
         for row, mask in enumerate(masks)
     ]
+
+
+def fitter_of(motion: Motion, space: ProportionSpace, frames: list[ClipFrame]) -> ClipFitter:
+    return ClipFitter(ClipPoses.of(motion, range(len(frames))), space, frames)
 
 
 def motion_poses(motion: Motion) -> list[BodyPose]:
@@ -75,7 +79,7 @@ def joint_error_cm(fitter: ClipFitter, person, truth: Motion) -> float:
     shaped = fitter.model.space.shape(fitter.coefficients)
     found = []
     for row in range(len(truth)):
-        ours = shaped.with_pose(fitter.pose(row)).joints()
+        ours = shaped.with_pose(fitter.poses[row]).joints()
         theirs = person.with_pose(truth[row]).joints()
         found.append(np.linalg.norm((ours - ours[0]) - (theirs - theirs[0]), axis=1))
     return 100.0 * float(np.mean(found))
@@ -86,7 +90,7 @@ def turn_error_deg(fitter: ClipFitter, truth: Motion) -> float:
     some = [0, 1, 15, 16]
     angles = [
         (
-            Rotation.from_rotvec(fitter.pose(row).joint_rotations[some])
+            Rotation.from_rotvec(fitter.poses[row].joint_rotations[some])
             * Rotation.from_rotvec(truth[row].joint_rotations[some]).inv()
         ).magnitude()
         for row in range(len(truth))
@@ -98,7 +102,7 @@ def test_poses_and_proportions_come_back(space):
     coefficients = np.zeros(space.count)
     coefficients[[11, 17, 20, 25]] = 1.5, -1.5, 1.5, 1.0  # thighs, forearms, girths
     truth, person = turning_motion(), space.shape(coefficients)
-    fitter = ClipFitter(err_like_a_tracker(truth), space, outlines(space, coefficients, truth))
+    fitter = fitter_of(err_like_a_tracker(truth), space, outlines(space, coefficients, truth))
     off, turned = joint_error_cm(fitter, person, truth), turn_error_deg(fitter, truth)
     errors_px = [fitter.iterate() for _ in range(9)]
     assert errors_px[-1] < 0.4 * errors_px[0]
@@ -108,7 +112,7 @@ def test_poses_and_proportions_come_back(space):
 
 def test_what_is_not_fitted_stays(space):
     truth = turning_motion()
-    fitter = ClipFitter(
+    fitter = fitter_of(
         err_like_a_tracker(truth), space, outlines(space, np.zeros(space.count), truth)
     )
     fitter.iterate(FitParameters(poses=True, proportions=False, focal=False))
@@ -119,7 +123,7 @@ def test_what_is_not_fitted_stays(space):
 
 def test_exact_poses_hardly_move(space):
     truth = turning_motion()
-    fitter = ClipFitter(truth, space, outlines(space, np.zeros(space.count), truth))
+    fitter = fitter_of(truth, space, outlines(space, np.zeros(space.count), truth))
     for _ in range(3):
         fitter.iterate()
     assert np.degrees(np.abs(fitter.corrections[:, :72]).max()) < 2.0
@@ -145,7 +149,7 @@ def test_a_still_person_is_believed_no_more_the_longer_the_film(space):
     coefficients[17] = 3.0  # outlines of forearms 15 % too long
     for count in (4, 12):
         still = replace(turning_motion(), root_rotations=np.zeros((FRAMES, 3)))
-        fitter = ClipFitter(still, space, outlines(space, coefficients, still)[:count])
+        fitter = fitter_of(still, space, outlines(space, coefficients, still)[:count])
         for _ in range(6):
             fitter.iterate()
         found.append(fitter.coefficients[17])

@@ -11,7 +11,7 @@ from preprocess.body.body_surface import SkinPoints, splat_silhouette
 from preprocess.body.kinematics import joint_transforms, rotation_matrices
 from preprocess.body.parametric_body import load_body_model
 from preprocess.body.proportion_space import ProportionSpace
-from preprocess.fitting.capture_fit import correct_pose
+from preprocess.fitting.clip_poses import ClipPoses
 from preprocess.fitting.outlines import OUTLINE_SKIN_POINTS, OutlineDistances, OutlineModel
 
 VIEW = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -87,11 +87,12 @@ def test_the_jacobian_of_a_pose_is_that_of_projected_skin(model, parameter):
     jacobian = linearise_at(model, pose, chosen, normals).pose_jacobian
     change = np.zeros(75)
     change[parameter] = step
+    view = CAMERA.camera_from_world[None, :3, :3]
     weights, rest = model._weights.astype(float), model._rest.astype(float)
     ends = [
         project_rows(
             model, chosen, weights, rest,
-            correct_pose(pose, sign * change, CAMERA.camera_from_world), CAMERA,
+            ClipPoses.stack([pose]).moved(sign * change[None], view)[0], CAMERA,
         )
         for sign in (1.0, -1.0)
     ]  # fmt: skip

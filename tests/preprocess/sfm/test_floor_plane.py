@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from preprocess.sfm.metric_scale import FloorPlane, fit_floor_plane, mean_camera_up
-from preprocess.sfm.metric_world import to_metric_world, upright_axes
+from preprocess.sfm.metric_world import (
+    FloorPlane,
+    fit_floor_plane,
+    mean_camera_up,
+    to_metric_world,
+    upright_axes,
+)
 
 UP = np.array([0.0, 1.0, 0.0])
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from preprocess.sfm.metric_scale import (
+from preprocess.sfm.metric_world import (
     SOLE_THICKNESS_M,
     FloorPlane,
     PersonInCameras,

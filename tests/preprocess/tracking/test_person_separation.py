@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from preprocess.tracking.blazepose import LIMBS, TRUNK, separate_mask
 from preprocess.tracking.keypoints import CroppedMask, PersonKeypoints
-from preprocess.tracking.person_separation import LIMBS, TRUNK, separate_mask
 
 SIZE = 64
 

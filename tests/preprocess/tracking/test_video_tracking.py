@@ -1,7 +1,5 @@
 """Tracking of a recording: every frame gets a mask, and missing frames are reported."""
 
-import threading
-
 import cv2
 import numpy as np
 import pytest
@@ -10,7 +8,7 @@ from capture.input_error import InputError
 from capture.source_opening import open_source
 from preprocess.tracking import video_tracking
 from preprocess.tracking.keypoints import CroppedMask, PersonKeypoints
-from preprocess.tracking.video_tracking import track_video
+from preprocess.tracking.video_tracking import VideoTracking
 
 COUNT = 12
 
@@ -49,10 +47,16 @@ def plain(rgb, mask, size_px):
     return mask.resample((rgb.shape[1], rgb.shape[0]), size_px)
 
 
+def track(pictures, tracker, refine=plain, masks=None):
+    tracking = VideoTracking(pictures, tracker, refine, masks)
+    assert list(tracking.run()) == list(range(1, COUNT + 1))
+    return tracking.result()
+
+
 def test_each_frame_has_a_mask_and_found_ones_have_key_points(pictures, tmp_path):
     masks = tmp_path / "masks"
     masks.mkdir()
-    found = track_video(pictures, FakeTracker(darkest=25), plain, masks)
+    found = track(pictures, FakeTracker(darkest=25), masks=masks)
     assert found.keypoints.frames.tolist() == list(range(3, COUNT))
     assert list(found.frame_times_s) == list(range(COUNT))
     assert found.keypoints.image_px[0, 0, 0] == 30.0
@@ -66,24 +70,22 @@ def test_each_frame_has_a_mask_and_found_ones_have_key_points(pictures, tmp_path
 
 def test_a_video_without_persons_is_bad_input(pictures):
     with pytest.raises(InputError, match="none of 12 frames"):
-        track_video(pictures, FakeTracker(darkest=200), plain, None)
+        track(pictures, FakeTracker(darkest=200))
 
 
 def test_a_stop_keeps_what_was_found(pictures):
-    stop = threading.Event()
-
-    def advance(done: int) -> None:
+    tracking = VideoTracking(pictures, FakeTracker(), plain, None)
+    for done in tracking.run():
         if done == 5:
-            stop.set()
-
-    found = track_video(pictures, FakeTracker(), plain, None, advance=advance, stop=stop)
+            break
+    found = tracking.result()
     assert found.interrupted
     assert len(found.keypoints) == 5
 
 
 def test_a_failing_mask_writer_is_not_swallowed(pictures, tmp_path):
     with pytest.raises(OSError, match="gone"):
-        track_video(pictures, FakeTracker(), plain, tmp_path / "gone")
+        track(pictures, FakeTracker(), masks=tmp_path / "gone")
 
 
 def test_first_masks_are_made_again_once_the_background_is_known(pictures, tmp_path, monkeypatch):
@@ -95,7 +97,7 @@ def test_first_masks_are_made_again_once_the_background_is_known(pictures, tmp_p
         share = 1.0 if len(refined) > COUNT else 0.5
         return np.full(size_px[::-1], share, dtype=np.float32)
 
-    track_video(pictures, FakeTracker(), refine, tmp_path)
+    track(pictures, FakeTracker(), refine, tmp_path)
     assert refined == [*range(COUNT), 0, 1]
     masks = [cv2.imread(str(file), 0).max() for file in sorted(tmp_path.glob("*.png"))]
     assert masks == [255, 255] + [128] * (COUNT - 2)
