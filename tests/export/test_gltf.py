@@ -21,8 +21,8 @@ from export.splat_colors import cameras_around
 from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import body_from_rest, rotation_matrices, world_from_body
 from preprocess.poses.pose_format_registry import read_poses
-from tests.export.test_isosurface import is_closed, volume
 from tests.export.test_mesh_texture import show_nothing
+from tests.export.test_splats import is_closed, volume
 
 TYPES = {5126: "<f4", 5125: "<u4", 5123: "<u2", 5121: "u1"}
 SIZES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}

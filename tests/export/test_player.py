@@ -10,6 +10,7 @@ import pytest
 from scipy import ndimage
 
 from avatar.evaluation.image_metrics import psnr
+from capture.camera import Camera
 from capture.input_error import InputError
 from export.bake import reference_player
 from export.bake.compositor import VoxelCodes, composite_segments
@@ -22,11 +23,12 @@ from export.bake.skinning_kernels import (
     skin_trilinear,
 )
 from export.graph.player_graph import build_graph
-from export.package.package_file import read_package
-from export.package.player_tables import RenderSettings
+from export.package.package_file import COARSE_GRAPH, read_package
+from export.package.player_tables import QUALITY_TIERS, RenderSettings
 from export.player import PictureDifference, Player, compare_golden_frames, premultiply
 from export.player_inputs import subdivided_skinning_nodes
 from export.skinned_mesh import LevelSet, extract_mesh, skinning_weights
+from export.warm_up_package import write_warm_up_package
 from preprocess.body.body_pose import BodyPose
 
 
@@ -414,3 +416,20 @@ def test_onnxruntime_keeps_no_record_of_who_plays_what(module, tmp_path):
     )  # fmt: skip
     assert done.stdout == "1\n"
     assert not list(tmp_path.iterdir())
+
+
+def test_a_package_of_two_points_runs_every_graph_and_is_small(tmp_path):
+    path = tmp_path / "avatar.iavatar"
+    write_warm_up_package(path)
+    assert path.stat().st_size < 200_000
+    assert set(read_package(path, tier=None).graphs) == {*QUALITY_TIERS, COARSE_GRAPH}
+    camera = Camera(
+        focal_px=(64.0, 64.0), center_px=(32.0, 32.0), size_px=(64, 64),
+        camera_from_world=np.array(
+            [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 3], [0, 0, 0, 1]], float
+        ),
+    )  # fmt: skip
+    for tier in QUALITY_TIERS:
+        drawn = Player.load(path, tier=tier).render(BodyPose.rest(), camera)
+        assert drawn.shape == (64, 64, 4)
+        assert not drawn[..., 3].any()  # its brick is empty

@@ -1,11 +1,128 @@
-"""Which pose a picture shows."""
+"""Driving motions, and the camera that follows them from a viewpoint."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from instant_avatar.animation.driving_motion import ResampledMotion
-from preprocess.body.body_pose import Motion
+from capture.input_error import InputError
+from export.player import Player
+from instant_avatar.animation.driving_motion import (
+    DISTANCE_HEIGHTS,
+    FollowingCamera,
+    ResampledMotion,
+    canonical_pose_of,
+    demo_motion,
+)
+from instant_avatar.animation.play_arguments import CLOSE_UP_ZOOM, Viewpoint
+from preprocess.body.body_pose import BodyPose, Motion
+from preprocess.body.kinematics import rotation_matrices
+
+
+@pytest.fixture(scope="module")
+def player(run):
+    return Player.load(run / "avatar.iavatar")
+
+
+@pytest.fixture
+def following(player):
+    """A camera about the standing avatar, which faces the world's z."""
+
+    def of(size=96, **wishes):
+        return FollowingCamera.of(player, demo_motion(2), size, Viewpoint(**wishes))
+
+    return of
+
+
+def middle(following, pose):
+    """Where the camera looks at, in the world."""
+    camera, away = following.camera_for(pose), DISTANCE_HEIGHTS * following.height_m
+    return camera.center_world + away * camera.camera_from_world[2, :3]
+
+
+@pytest.mark.parametrize(
+    ("wishes", "direction"),
+    [
+        ({}, (0, 0, 1)),
+        ({"orbit_deg": 90.0}, (1, 0, 0)),
+        ({"orbit_deg": 180.0}, (0, 0, -1)),
+        ({"orbit_deg": -90.0}, (-1, 0, 0)),
+        ({"elevation_deg": 90.0}, (0, 1, 0)),
+        ({"elevation_deg": -30.0}, (0, -0.5, np.sqrt(0.75))),
+        ({"orbit_deg": 90.0, "elevation_deg": 30.0}, (np.sqrt(0.75), 0.5, 0)),
+    ],
+)
+def test_the_camera_stands_where_its_angles_say(player, following, wishes, direction):
+    pose, camera = canonical_pose_of(player), following(**wishes)
+    pelvis = player.manifest.rest_joints[0]
+    at = pelvis + camera.center_above_pelvis_m * np.array([0.0, 1.0, 0.0])
+    place = camera.camera_for(pose).center_world
+    away = DISTANCE_HEIGHTS * camera.height_m
+    np.testing.assert_allclose(place - at, away * np.array(direction), atol=1e-9)
+
+
+def test_the_person_s_middle_stays_in_the_picture_s_middle_from_all_sides(player, following):
+    pose = canonical_pose_of(player)
+    at = middle(following(), pose)
+    for wishes in ({"orbit_deg": 77.0}, {"elevation_deg": 50.0}):
+        np.testing.assert_allclose(middle(following(**wishes), pose), at, atol=1e-9)
+        assert following(**wishes).camera_for(pose).project(at) == pytest.approx([48.0, 48.0])
+
+
+def test_a_turntable_goes_round_once_in_its_time(player, following):
+    pose = canonical_pose_of(player)
+    turning = following(turn_period_s=8.0)
+    for seconds, degrees in ((0.0, 0.0), (2.0, 90.0), (5.0, 225.0), (8.0, 0.0)):
+        np.testing.assert_allclose(
+            turning.camera_for(pose, seconds).camera_from_world,
+            following(orbit_deg=degrees).camera_for(pose).camera_from_world,
+            atol=1e-9,
+        )
+    backwards = following(turn_period_s=-8.0).camera_for(pose, 2.0)
+    np.testing.assert_allclose(
+        backwards.camera_from_world,
+        following(orbit_deg=-90.0).camera_for(pose).camera_from_world,
+        atol=1e-9,
+    )
+
+
+def test_a_close_up_keeps_its_joint_in_the_middle(player, following, bent_arm):
+    left = following(joint="left_hand")
+    at, elbow = middle(left, bent_arm), middle(following(joint="left_elbow"), bent_arm)
+    rest = player.manifest.rest_joints
+    # the forearm points forward, out of the chest, by its own length
+    assert at - elbow == pytest.approx(
+        rotation_matrices(bent_arm.joint_rotations[17]) @ (rest[22] - rest[18]), abs=1e-9
+    )
+    whole, close = following().camera_for(bent_arm), left.camera_for(bent_arm)
+    assert close.focal_px[0] == pytest.approx(CLOSE_UP_ZOOM * whole.focal_px[0])
+
+
+@pytest.fixture
+def bent_arm():
+    """The T-pose with the left forearm forward."""
+    joints = np.zeros((23, 3))
+    joints[17, 1] = -np.pi / 2.0
+    return BodyPose(
+        root_rotation=np.zeros(3),
+        root_translation=np.array([1.0, 2.0, 3.0]),
+        joint_rotations=joints,
+    )
+
+
+@pytest.mark.parametrize("size", [(160, 90), (90, 160), (120, 120)])
+def test_the_whole_person_fits_into_every_shape(player, following, size):
+    pose = canonical_pose_of(player)
+    alpha = player.render(pose, following(size).camera_for(pose))[..., 3]
+    assert alpha.shape == size[::-1]
+    border = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])
+    assert not border.any()
+    assert (alpha > 127).any(axis=1).sum() > 0.6 * min(size)
+
+
+def test_wishes_that_cannot_be_are_named():
+    for wishes in ({"orbit_deg": np.inf}, {"elevation_deg": np.nan}):
+        with pytest.raises(InputError, match="--"):
+            Viewpoint(**wishes)
 
 
 def motion_of(rate, count, rng, *, valid=None):

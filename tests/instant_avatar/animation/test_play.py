@@ -9,8 +9,10 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+import onnx
 import onnxruntime
 import pytest
+from onnx import TensorProto, helper
 from PIL import Image
 
 from capture.atomic_files import LIST_NAME as LIST
@@ -18,6 +20,8 @@ from export import player_page
 from export.package.package_file import read_package, write_package
 from export.player import Player
 from instant_avatar.animation.driving_motion import FollowingCamera, demo_motion
+from instant_avatar.animation.player_checks import REFERENCE_GRAPH
+from instant_avatar.animation.sample_motions import sample_motions
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import rotation_matrices
 from preprocess.poses.pose_format_registry import read_poses
@@ -309,3 +313,38 @@ def test_playing_needs_no_torch(package, novel, tmp_path):
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
+
+
+def reference_model() -> onnx.ModelProto:
+    """GatherElements, MatMul and ScatterElements of fixed sizes."""
+    nodes = [
+        helper.make_node("GatherElements", ["table", "places"], ["taken"], axis=0),
+        helper.make_node("MatMul", ["taken", "matrix"], ["product"]),
+        helper.make_node(
+            "ScatterElements", ["table", "places", "product"], ["out"], axis=0, reduction="min"
+        ),
+    ]
+    shapes = {"table": [1 << 15, 16], "matrix": [16, 16]}
+    inputs = [helper.make_tensor_value_info(n, TensorProto.FLOAT, s) for n, s in shapes.items()]
+    inputs.append(helper.make_tensor_value_info("places", TensorProto.INT64, [1 << 15, 16]))
+    outputs = [helper.make_tensor_value_info("out", TensorProto.FLOAT, [1 << 15, 16])]
+    graph = helper.make_graph(nodes, "reference", inputs, outputs)
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+
+
+def test_the_stored_graph_is_the_one_described_here():
+    assert onnx.load(REFERENCE_GRAPH) == reference_model()
+
+
+if __name__ == "__main__":
+    REFERENCE_GRAPH.write_bytes(reference_model().SerializeToString())
+
+
+@pytest.mark.parametrize("name", list(sample_motions()))
+def test_a_sample_motion_begins_again_without_a_jump(name):
+    motion = sample_motions()[name]
+    rotations = np.concatenate([motion.root_rotations[:, None], motion.joint_rotations], axis=1)
+    turned = rotation_matrices(rotations.reshape(-1, 3)).reshape(len(motion), 24, 3, 3)
+    steps = np.abs(np.diff(turned, axis=0, append=turned[:1])).max(axis=(1, 2, 3))
+    assert steps.max() > 0.02  # it moves
+    assert steps[-1] <= 1.1 * steps[:-1].max()

@@ -1,11 +1,16 @@
-"""How commands end, and files that appear whole or not at all."""
+"""How commands end, their help, and files that appear whole or not at all."""
 
 import errno
+import importlib
 import io
 import os
 import signal
 import subprocess
 import sys
+import tomllib
+from importlib.metadata import version
+from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +19,7 @@ from rich.console import Console as RichConsole
 from capture.image_folder import read_image
 from capture.input_error import InputError
 from instant_avatar.animation.clip_file import background_compositor
+from instant_avatar.cli import command_line
 from instant_avatar.cli.command_line import CommandExit, run_command, stop_on_interrupt
 from instant_avatar.cli.console import MAX_PRINTED_WARNINGS, Console
 
@@ -184,3 +190,70 @@ def test_colors_and_images_serve_as_backgrounds(tmp_path, rng):
     on_wall = background_compositor(str(path))(rgba)
     np.testing.assert_array_equal(on_wall[0], read_image(path)[0][0, 6:14])
     np.testing.assert_array_equal(on_wall[1], rgba[1, :, :3])
+
+
+ROOT = Path(__file__).parents[3]
+SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+COMMANDS = {
+    **SCRIPTS,
+    "python -m instant_avatar.animation.web_server": "instant_avatar.animation.web_server:main",
+}
+
+
+def answered(program, words, capsys):
+    """What a command says before it does anything."""
+    module, function = COMMANDS[program].split(":")
+    with pytest.raises(SystemExit) as end:
+        getattr(importlib.import_module(module), function)(words)
+    assert end.value.code == 0
+    said = capsys.readouterr()
+    assert said.err == ""
+    return said.out
+
+
+@pytest.mark.parametrize("program", COMMANDS)
+def test_every_command_knows_its_version(program, capsys):
+    distribution = command_line.DISTRIBUTION
+    told = f"{program} ({distribution}) {version(distribution)}\n"
+    assert answered(program, ["--version"], capsys) == told
+
+
+@pytest.mark.parametrize("width", [80, 100])
+@pytest.mark.parametrize("program", COMMANDS)
+def test_help_is_paragraphs_that_fill_the_terminal(program, width, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", str(width))
+    text = answered(program, ["--help"], capsys)
+    assert f"usage: {program} [-h]" in text
+    assert "Exit codes: 0 " in text
+    assert "None" not in text
+    assert max(map(len, text.splitlines())) <= width
+    about, options = text.split("\nusage: ")
+    for above, below in pairwise(about.splitlines()):
+        assert above[:4] != "    " or not below or below.startswith("    ia-"), "a wrapped example"
+        if above[:1].strip() and below:
+            assert len(above.rstrip()) + 1 + len(below.split()[0]) > width, above
+    boxed = [line[2:-2] for line in options.splitlines() if line[:2] in ("│ ", "  ")]
+    column = next(line.index("show this") for line in boxed if "show this" in line)
+    for above, below in pairwise(boxed):
+        if below.strip() and not below[:column].strip() and above[column - 2 : column] == "  ":
+            assert len(above.rstrip()) + 1 + len(below.split()[0]) > width - 4, above
+
+
+def test_a_checkout_has_a_version_without_installation(capsys, monkeypatch):
+    monkeypatch.setattr(command_line, "DISTRIBUTION", "a-package-that-is-not-installed")
+    assert "not installed" in answered("ia-play", ["--version"], capsys)
+
+
+def test_words_that_make_no_sense_are_bad_input(capsys):
+    with pytest.raises(SystemExit) as end:
+        importlib.import_module("instant_avatar.animation.web_server").main(["--bogus"])
+    assert end.value.code == 2
+    assert "--bogus" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("program", ["ia-check", "ia-ingest"])
+def test_masks_cannot_be_dark_and_bright(program, capsys):
+    module, function = COMMANDS[program].split(":")
+    words = ["capture", "--mask-invert", "--no-mask-invert"]
+    assert getattr(importlib.import_module(module), function)(words) == 2
+    assert "mutually exclusive" in capsys.readouterr().err

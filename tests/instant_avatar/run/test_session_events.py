@@ -1,10 +1,10 @@
-"""A run as a stream of events: their order, readers of them, and Ctrl-C after the package."""
+"""A run as a stream of events: their order, readers, checkpoints, and Ctrl-C."""
 
 import json
 import signal
 import threading
 from collections import Counter
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 
 import numpy as np
@@ -12,18 +12,23 @@ import pytest
 
 from avatar.evaluation.coverage import Coverage
 from avatar.events import FrameArrived, FrameLeftOut, Stepped
+from avatar.training import checkpoint
 from avatar.training.frame_stream import separate_held_out
 from avatar.training.trainer import Trainer
 from export.bake.bake_tables import ExportRefused
 from export.build import ExportReport
 from instant_avatar import train
+from instant_avatar.cli.console import Console
 from instant_avatar.report import report_writer
 from instant_avatar.run import snapshot_writer
 from instant_avatar.run.run_folder import RunFolder
 from instant_avatar.run.session_events import PackageWritten, Scored, SessionEvent
+from instant_avatar.run.session_start import _announce_coverage
+from instant_avatar.run.snapshot_writer import CheckpointWriter
 from instant_avatar.run.training_session import TrainingSession
+from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.capture_inputs import CaptureInputs
-from preprocess.capture_session import RecordedObservations
+from preprocess.capture_session import Capture, RecordedObservations
 from preprocess.observation import DroppedFrame
 from preprocess.open_capture import open_capture
 
@@ -177,3 +182,91 @@ def test_the_newest_frame_is_shown_and_coverage_counts_those_that_are_learnt(fil
         if not isinstance(item, DroppedFrame) and item.frame.index not in (9, 19):
             alone.add(item)
     assert np.array_equal(session.coverage.cosines, alone.cosines)
+
+
+TRAINER = Trainer.__new__(Trainer)
+TRAINER.steps = 7
+
+
+@pytest.fixture
+def writer(tmp_path, monkeypatch) -> CheckpointWriter:
+    monkeypatch.setattr(checkpoint, "detached_state", lambda trainer, notes: dict(notes))
+    monkeypatch.setattr(snapshot_writer, "write_shaped_body", lambda path, shaped: None)
+    monkeypatch.setattr(snapshot_writer, "CHECKPOINT_INTERVAL_S", 0.0)
+    capture = Capture.__new__(Capture)
+    object.__setattr__(capture, "shaped", None)
+    return CheckpointWriter(RunFolder(path=tmp_path), capture)
+
+
+def test_training_goes_on_while_a_checkpoint_is_written(writer, monkeypatch):
+    gate, written = threading.Event(), []
+
+    def slow(state, folder):
+        assert gate.wait(10.0)
+        written.append((state, threading.current_thread()))
+
+    monkeypatch.setattr(checkpoint, "write_state", slow)
+    monkeypatch.setattr(snapshot_writer, "CHECKPOINT_COST_SHARE", 1e9)
+    assert writer.is_due()
+    writer.begin(TRAINER, {"step": 1})
+    assert not writer.is_due()  # the first is not yet written
+    assert writer.take_saved() == []
+    gate.set()
+    writer.settle()
+    assert writer.is_due()
+    assert writer.take_saved() == [7]
+    ((kept, thread),) = written
+    assert kept == {"step": 1}
+    assert thread is not threading.main_thread()
+
+
+def test_checkpoints_that_cost_much_are_rare(writer, monkeypatch):
+    monkeypatch.setattr(checkpoint, "write_state", lambda state, folder: sum(range(100_000)))
+    monkeypatch.setattr(snapshot_writer, "CHECKPOINT_COST_SHARE", 1e-9)
+    writer.begin(TRAINER, {})
+    writer.settle()
+    assert not writer.is_due()
+
+
+@pytest.mark.parametrize("how", ["is_due", "wait"])
+def test_a_full_disk_is_reported_to_the_thread_that_trains(writer, monkeypatch, how):
+    def full(state, folder):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(checkpoint, "write_state", full)
+    writer.begin(TRAINER, {})
+    writer.settle()  # does not raise
+    with pytest.raises(OSError, match="No space"):
+        getattr(writer, how)()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("announced") / "capture"
+    film_capture(folder, ShootConfig(frames=24, size=64, turns=1.0))
+    return folder
+
+
+def announced(capture) -> list[str]:
+    console = Console()
+    _announce_coverage(capture, console)
+    return console.warnings
+
+
+def test_a_whole_turn_gives_no_warning(folder):
+    assert not announced(open_capture(CaptureInputs(video=folder)))
+
+
+def test_the_front_of_a_turn_warns_of_unseen_skin(folder):
+    (warning,) = announced(open_capture(CaptureInputs(video=folder, frames=slice(0, 3))))
+    assert "of the person's skin" in warning
+    assert "back" in warning
+
+
+def test_poses_without_a_frame_do_not_count(folder):
+    capture = open_capture(CaptureInputs(video=folder, frames=slice(0, 3)))
+    numbers = np.arange(24.0)
+    numbers[5:] = np.nan
+    strays = replace(capture.geometry(), row_frames=numbers)
+    object.__setattr__(capture, "geometry", lambda: strays)
+    assert len(announced(capture)) == 1

@@ -1,4 +1,4 @@
-"""Poses from the key points of a known motion."""
+"""The lift of key points, and stretches with left and right exchanged."""
 
 from dataclasses import replace
 
@@ -7,7 +7,102 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from preprocess.body.body_pose import Motion
-from preprocess.tracking.pose_lift import lift_keypoints
+from preprocess.tracking.keypoints import KeypointTrack
+from preprocess.tracking.pose_lift import find_swaps, lift_keypoints, repair_swaps
+
+LEFT, RIGHT = [1, 2, 3, *range(7, 33, 2)], [4, 5, 6, *range(8, 33, 2)]
+
+
+def turning_track(count: int, degrees_per_frame: float, frame_step: int = 1) -> KeypointTrack:
+    """Points of a person who turns about the y axis."""
+    generator = np.random.default_rng(0)
+    rest = generator.normal(size=(33, 3))
+    rest[LEFT, 0], rest[RIGHT, 0] = 0.2, -0.2
+    rest[LEFT, 1:] = rest[RIGHT, 1:]
+    angle = np.deg2rad(degrees_per_frame) * np.arange(count)
+    turn = np.zeros((count, 3, 3))
+    turn[:, 1, 1] = 1.0
+    turn[:, 0, 0] = turn[:, 2, 2] = np.cos(angle)
+    turn[:, 0, 2], turn[:, 2, 0] = np.sin(angle), -np.sin(angle)
+    world = rest @ turn.swapaxes(1, 2)
+    return KeypointTrack(
+        frames=frame_step * np.arange(count), image_px=200.0 + 100.0 * world[..., :2],
+        world_m=world, visibility=np.ones((count, 33)), presence=np.ones(count),
+        size_px=(400, 400),
+    )  # fmt: skip
+
+
+def swap(track: KeypointTrack, rows: slice) -> KeypointTrack:
+    image, world = track.image_px.copy(), track.world_m.copy()
+    for array in (image, world):
+        array[rows] = array[rows][:, _mirrored()]
+    return replace(track, image_px=image, world_m=world)
+
+
+def _mirrored() -> np.ndarray:
+    order = np.arange(33)
+    order[LEFT], order[RIGHT] = RIGHT, LEFT
+    return order
+
+
+@pytest.mark.parametrize("stretch", [slice(20, 21), slice(20, 55), slice(52, 56), slice(0, 25)])
+def test_the_shorter_part_is_exchanged_back(stretch):
+    whole = turning_track(80, 4.0)
+    swapped = swap(whole, stretch)
+    repaired = repair_swaps(swapped)
+    assert np.flatnonzero(find_swaps(swapped)).tolist() == list(range(stretch.start, stretch.stop))
+    np.testing.assert_allclose(repaired.image_px, whole.image_px)
+    np.testing.assert_allclose(repaired.world_m, whole.world_m)
+
+
+def test_the_last_frames_before_a_gap_are_exchanged_back():
+    """A person who fades out is turned round."""
+    whole = turning_track(80, 4.0)
+    whole = replace(whole, frames=whole.frames + 16 * (whole.frames >= 50))
+    repaired = repair_swaps(swap(whole, slice(48, 50)))
+    np.testing.assert_allclose(repaired.world_m, whole.world_m)
+
+
+def test_key_points_between_two_guesses_hide_no_exchange():
+    """On the way from one guess to another, both sides lie in the middle."""
+    whole = turning_track(80, 4.0)
+    swapped = swap(whole, slice(30, 60))
+    middle = 0.5 * (whole.world_m[60] + whole.world_m[60][_mirrored()])
+    swapped.world_m[60] = middle + 0.2 * (swapped.world_m[59] - middle)
+    assert np.flatnonzero(find_swaps(swapped)).tolist() == list(range(30, 61))
+
+
+def test_a_cut_to_the_other_side_is_no_exchange():
+    front = turning_track(80, 1.0)
+    back = swap(front, slice(0, 80))
+    shift = np.where(np.arange(80) >= 60, 30.0, 0.0)[:, None, None]
+    film = replace(
+        front,
+        image_px=np.concatenate([front.image_px[:60], back.image_px[60:]]) + shift,
+        world_m=np.concatenate([front.world_m[:60], back.world_m[60:]]),
+    )
+    assert not find_swaps(film).any()
+    assert find_swaps(replace(film, image_px=film.image_px - shift)).any()
+
+
+def test_two_stretches_are_exchanged_back():
+    whole = turning_track(80, 4.0)
+    repaired = repair_swaps(swap(swap(whole, slice(10, 12)), slice(40, 49)))
+    np.testing.assert_allclose(repaired.world_m, whole.world_m)
+
+
+@pytest.mark.parametrize(
+    "track",
+    [
+        turning_track(30, 20.0),  # fast, but right
+        turning_track(8, 45.0),  # photographs
+        swap(turning_track(12, 10.0, 10), slice(5, 6)),  # too far apart in time to tell
+        swap(turning_track(60, 4.0), slice(30, 60)),  # which half is wrong?
+    ],
+)
+def test_nothing_else_is_touched(track):
+    assert not find_swaps(track).any()
+    np.testing.assert_array_equal(repair_swaps(track).world_m, track.world_m)
 
 
 @pytest.fixture

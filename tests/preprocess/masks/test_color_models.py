@@ -1,9 +1,9 @@
-"""The background plate: known after two frames, at any exposure, until the camera moves."""
+"""The background plate at any exposure, until the camera moves; dark films."""
 
 import numpy as np
 import pytest
 
-from preprocess.masks.color_models import BackgroundPlate
+from preprocess.masks.color_models import BRIGHT_LEVEL, BackgroundPlate, DarkFilmBrightener
 
 SIZE = 40, 60
 FREE = np.ones(SIZE, dtype=bool)
@@ -94,3 +94,30 @@ def test_a_black_background_is_learnt_and_a_black_frame_is_not() -> None:
         plate.align(_wall(), FREE)
         plate.update(_wall(), FREE)
     assert plate.within(ALL).mean == pytest.approx(_wall(), abs=1.0)
+
+
+def picture(level: int) -> np.ndarray:
+    """A horizontal ramp up to a level."""
+    ramp = np.linspace(0, level, 64).astype(np.uint8)
+    return np.broadcast_to(ramp[None, :, None], (48, 64, 3)).copy()
+
+
+def test_films_in_light_are_left_as_they_are():
+    brighten = DarkFilmBrightener()
+    for level in (200, 20):  # a dark frame of a film whose first was bright
+        rgb = picture(level)
+        assert brighten(rgb) is rgb
+
+
+def test_dark_films_are_brightened_all_frames_alike():
+    brighten = DarkFilmBrightener()
+    first, second = brighten(picture(20)), brighten(picture(10))
+    assert first.max() > 0.9 * BRIGHT_LEVEL
+    np.testing.assert_allclose(second.max(), first.max() / 2, atol=6)
+
+
+def test_a_film_that_fades_in_is_not_overexposed():
+    brighten = DarkFilmBrightener()
+    brighten(picture(0))
+    rgb = picture(200)
+    assert brighten(rgb) is rgb
