@@ -41,9 +41,13 @@ def evaluate(arguments: EvaluateArguments, console: Console) -> int:
         from avatar.evaluation.perceptual import Lpips
         from capture.atomic_files import write_text_atomically
         from instant_avatar.cli.command_line import stop_on_interrupt
-        from instant_avatar.evaluation.evaluation_card import evaluation_conditions, evaluation_page
         from instant_avatar.evaluation.evaluation_session import EvaluationSession
-        from instant_avatar.evaluation.score_table import evaluations_to_json, markdown_table
+        from instant_avatar.evaluation.score_table import (
+            evaluation_conditions,
+            evaluation_page,
+            evaluations_to_json,
+            markdown_table,
+        )
 
     lpips = Lpips(arguments.lpips, arguments.lpips_weights)
     scored: list[AvatarEvaluation] = []

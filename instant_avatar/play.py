@@ -21,7 +21,7 @@ from instant_avatar.cli.console import Console
 
 if TYPE_CHECKING:  # onnxruntime is loaded after --help has been answered
     from export.player import Player
-    from instant_avatar.animation.clip_rendering import Shot
+    from instant_avatar.animation.clip_file import Shot
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -52,9 +52,9 @@ def _render_clip(arguments: PlayArguments, console: Console) -> int:
         background_compositor,
         check_clip_path,
         clip_format,
+        plan_render,
         write_clip,
     )
-    from instant_avatar.animation.clip_rendering import plan_render
     from instant_avatar.cli.command_line import stop_on_interrupt
 
     out = arguments.output_path
@@ -114,7 +114,7 @@ def _print_package_warnings(player: "Player", console: Console) -> None:
 def _run_benchmark(arguments: PlayArguments, console: Console) -> int:
     from capture.atomic_files import write_text_atomically
     from export.player import Player
-    from instant_avatar.animation.clip_rendering import plan_render
+    from instant_avatar.animation.clip_file import plan_render
     from instant_avatar.animation.player_checks import benchmark_player
 
     started = time.perf_counter()

@@ -12,7 +12,7 @@ from avatar.events import FrameArrived, Stepped, WaitingForFrame
 from avatar.rig import canonical_rotations
 from instant_avatar.phone.film_queue import Film
 from instant_avatar.report.page_rendering import webp_data_uri
-from instant_avatar.report.report_figures import CoverageMap
+from instant_avatar.report.report_page import CoverageMap
 from instant_avatar.run.live_viewer import (
     CENTER_ABOVE_PELVIS_M,
     INITIAL_DISTANCE_M,

@@ -23,8 +23,7 @@ from instant_avatar.cli.command_line import DONE, INTERRUPTED, NO_AVATAR, Comman
 from instant_avatar.cli.console import Console
 from instant_avatar.cli.shared_options import capture_name, option_words
 from instant_avatar.report.page_rendering import data_uri, encode_webp, to_uint8, webp_data_uri
-from instant_avatar.report.report_figures import CoverageMap
-from instant_avatar.report.report_page import ComparisonPair, report_page
+from instant_avatar.report.report_page import ComparisonPair, CoverageMap, report_page
 from instant_avatar.report.report_schema import (
     CoverageStats,
     FrameStats,
