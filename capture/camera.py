@@ -45,6 +45,27 @@ class Camera:
             distortion=tuple(float(k) for k in distortion),
         )
 
+    @classmethod
+    def at(
+        cls,
+        eye: Float[np.ndarray, "3"],
+        axes: Float[np.ndarray, "3 3"],
+        focal_px: float,
+        size_px: tuple[int, int],
+    ) -> "Camera":
+        """A camera at a place, metres, with its right, down and forward axes in the world as rows.
+
+        Its principal point is the image's middle.
+        """
+        camera_from_world = np.eye(4)
+        camera_from_world[:3, :3], camera_from_world[:3, 3] = axes, -axes @ eye
+        return cls(
+            focal_px=(focal_px, focal_px),
+            center_px=(0.5 * size_px[0], 0.5 * size_px[1]),
+            size_px=size_px,
+            camera_from_world=camera_from_world,
+        )
+
     @property
     def intrinsic(self) -> Float[np.ndarray, "3 3"]:
         """The 3x3 matrix K."""

@@ -233,17 +233,7 @@ class FollowingCamera:
         # similar triangles: person_px / focal = height_m / away
         focal = person_px * away / self.height_m * zoom
         axes = self.viewpoint.rotation_at(seconds) @ self.level_axes
-        camera_from_world = np.eye(4)
-        camera_from_world[:3, :3] = axes
-        # x_camera = R (x - target) + (0, 0, away)
-        camera_from_world[:3, 3] = -axes @ self._look_at_point(pose)
-        camera_from_world[2, 3] += away
-        return Camera(
-            focal_px=(focal, focal),
-            center_px=(width / 2.0, height / 2.0),
-            size_px=self.size_px,
-            camera_from_world=camera_from_world,
-        )
+        return Camera.at(self._look_at_point(pose) - away * axes[2], axes, focal, self.size_px)
 
     def _look_at_point(self, pose: BodyPose) -> Float[np.ndarray, "3"]:
         """Return the world point in the center of the image."""

@@ -34,12 +34,15 @@ from instant_avatar.studio.outfit import (
     TROUSERS,
     BodyProportions,
     Outfit,
+    Palette,
+    PerVertex,
+    Vertices,
 )
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.body_surface import vertex_normals
 from preprocess.body.parametric_body import BodyModel, ShapedBody, load_body_model
 
-ThicknessFunction = Callable[[Float[np.ndarray, "vertices 3"]], Float[np.ndarray, "vertices"]]
+ThicknessFunction = Callable[[Vertices], PerVertex]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -54,21 +57,16 @@ class ClothingLayer:
     """
 
     material: int
-    rest_vertices: Float[np.ndarray, "vertices 3"]
-    template_points: Float[np.ndarray, "vertices 3"]
+    rest_vertices: Vertices
+    template_points: Vertices
     body_vertices: Int32[np.ndarray, "vertices"]
     faces: Int32[np.ndarray, "faces 3"]
 
 
 def build_layers(body: BodyModel, outfit: Outfit) -> list[ClothingLayer]:
     """All layers of the person in `outfit`, the skin first."""
-    layers = [
-        *_skin_and_eyes(body),
-        _shirt(body, outfit),
-        _trousers(body, outfit),
-        _hair(body, outfit),
-    ]
-    layers += [_shoe(body, side) for side in (1.0, -1.0)]
+    layers = [*_skin_and_eyes(body), _shirt(body, outfit), _trousers(body, outfit)]
+    layers += [_hair(body, outfit), *(_shoe(body, side) for side in (1.0, -1.0))]
     if outfit.bun:
         layers.append(_bun(body))
     return layers
@@ -111,8 +109,8 @@ def _subdivide(layer: ClothingLayer) -> ClothingLayer:
     a, b, c = layer.faces.T
     ab, bc, ca = middle.T
     faces = np.concatenate([np.stack(t, 1) for t in ((a, ab, ca), (ab, b, bc), (ca, bc, c))])
-    return ClothingLayer(
-        material=layer.material,
+    return replace(
+        layer,
         rest_vertices=np.concatenate(
             [layer.rest_vertices, layer.rest_vertices[unique].mean(axis=1)]
         ),
@@ -141,13 +139,8 @@ def _drape(
     for _ in range(3):
         sunk = np.maximum(sunk, average @ sunk)
     lifted = rest + normals * (thickness(layer.template_points) + sunk)[:, None]
-    return ClothingLayer(
-        material=layer.material,
-        rest_vertices=lifted,
-        template_points=rest if smooth_place else layer.template_points,
-        body_vertices=layer.body_vertices,
-        faces=layer.faces,
-    )
+    places = rest if smooth_place else layer.template_points
+    return replace(layer, rest_vertices=lifted, template_points=places)
 
 
 def _neighbor_mean_operator(
@@ -210,7 +203,7 @@ def _bun(body: BodyModel) -> ClothingLayer:
 def _attach_to_body(
     body: BodyModel,
     kind: int,
-    points: Float[np.ndarray, "vertices 3"],
+    points: Vertices,
     faces: Int[np.ndarray, "faces 3"],
     *,
     grown: float,
@@ -233,13 +226,8 @@ def _attach_to_body(
         rest = 0.5 * rest + 0.5 * (average @ rest)
     rest = rest + grown * vertex_normals(rest, layer.faces)
     _, nearest = KDTree(body.template[among]).query(layer.rest_vertices)
-    return ClothingLayer(
-        material=kind,
-        rest_vertices=rest,
-        template_points=rest,
-        body_vertices=among[nearest].astype(np.int32),
-        faces=layer.faces,
-    )
+    hung = among[nearest].astype(np.int32)
+    return replace(layer, rest_vertices=rest, template_points=rest, body_vertices=hung)
 
 
 A_POSE = np.zeros(69)
@@ -263,13 +251,13 @@ class Actor:
     betas: Float[np.ndarray, "10"]
     shaped: ShapedBody
     outfit: Outfit
-    rest_vertices: Float[np.ndarray, "vertices 3"]
+    rest_vertices: Vertices
     template_points: Float32[np.ndarray, "vertices 3"]
     body_vertices: Int32[np.ndarray, "vertices"]
     faces: Int32[np.ndarray, "faces 3"]
     materials: Int32[np.ndarray, "faces"]
     baked_light: Float32[np.ndarray, "vertices 3"]
-    palette: Float32[np.ndarray, "colors 3"]
+    palette: Palette
 
     @classmethod
     def of(

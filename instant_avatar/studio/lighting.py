@@ -18,7 +18,7 @@ from jaxtyping import Float, Float32, Int32
 from avatar.kernels.kernel_compiler import compile_kernel
 from capture.camera import Camera
 from capture.source import AlphaMask, RgbImage
-from instant_avatar.studio.outfit import is_visible
+from instant_avatar.studio.outfit import Measures, Palette, PerVertex, Vertices, is_visible
 from instant_avatar.studio.procedural_albedo import albedo_at
 
 RenderedFrame = tuple[RgbImage, AlphaMask]
@@ -34,7 +34,7 @@ class ClothingCut(NamedTuple):
 
     template_points: Float32[np.ndarray, "vertices 3"]
     materials: Int32[np.ndarray, "faces"]
-    measures: Float32[np.ndarray, "cuts"]
+    measures: Measures
 
 
 UNCUT = ClothingCut(
@@ -62,7 +62,7 @@ class ZBuffer:
 
 
 def rasterize(
-    points_world: Float[np.ndarray, "vertices 3"],
+    points_world: Vertices,
     faces: Int32[np.ndarray, "faces 3"],
     camera: Camera,
     *,
@@ -96,7 +96,7 @@ def _rasterize_faces(
     faces: Int32[np.ndarray, "faces 3"],
     texture: Float32[np.ndarray, "places 3"],
     kinds: Int32[np.ndarray, "kinds"],
-    cut: Float32[np.ndarray, "cuts"],
+    cut: Measures,
     face_out: Int32[np.ndarray, "rows columns"],
     share_out: Float32[np.ndarray, "rows columns 2"],
     depth_out: Float32[np.ndarray, "rows columns"],
@@ -159,8 +159,8 @@ SHADOW_BIAS_M = 0.02
 
 
 def bake_light(
-    points: Float[np.ndarray, "vertices 3"],
-    normals: Float[np.ndarray, "vertices 3"],
+    points: Vertices,
+    normals: Vertices,
     faces: Int32[np.ndarray, "faces 3"],
     cut: ClothingCut,
     *,
@@ -184,11 +184,11 @@ def bake_light(
 
 
 def lamp_visibility(
-    points: Float[np.ndarray, "vertices 3"],
+    points: Vertices,
     faces: Int32[np.ndarray, "faces 3"],
     toward: Float[np.ndarray, "3"],
     cut: ClothingCut,
-) -> Float[np.ndarray, "vertices"]:
+) -> PerVertex:
     """Return the light of a lamp far away that reaches each vertex past the others, in [0, 1].
 
     `toward` is the unit vector to the lamp.
@@ -206,30 +206,19 @@ def fibonacci_directions(count: int) -> Float[np.ndarray, "directions 3"]:
     return np.stack([ring * np.cos(angle), height, ring * np.sin(angle)], axis=1)
 
 
-def _directional_camera(
-    points: Float[np.ndarray, "vertices 3"], toward: Float[np.ndarray, "3"]
-) -> Camera:
+def _directional_camera(points: Vertices, toward: Float[np.ndarray, "3"]) -> Camera:
     """A camera 40 m away in the direction `toward` that sees all points in 256 pixels."""
     middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
     reach = float(np.linalg.norm(points - middle, axis=1).max())
     forward = -toward
     right = np.cross(forward, [0.0, 1.0, 0.0] if abs(toward[1]) < 0.9 else [1.0, 0.0, 0.0])
     right /= np.linalg.norm(right)
-    camera_from_world = np.eye(4)
-    camera_from_world[:3, :3] = [right, np.cross(forward, right), forward]
-    camera_from_world[:3, 3] = -camera_from_world[:3, :3] @ (middle + 40.0 * toward)
-    focal = 126.0 * 40.0 / (reach + 0.01)
-    return Camera(
-        focal_px=(focal, focal),
-        center_px=(128.0, 128.0),
-        size_px=(256, 256),
-        camera_from_world=camera_from_world,
-    )
+    axes = np.stack([right, np.cross(forward, right), forward])
+    focal_px = 126.0 * 40.0 / (reach + 0.01)
+    return Camera.at(middle + 40.0 * toward, axes, focal_px, (256, 256))
 
 
-def _visibility(
-    points: Float[np.ndarray, "vertices 3"], camera: Camera, depth_seen: AlphaMask
-) -> Float[np.ndarray, "vertices"]:
+def _visibility(points: Vertices, camera: Camera, depth_seen: AlphaMask) -> PerVertex:
     """Return the light that reaches each point, in [0, 1], softened over 4 pixels."""
     forward, away = camera.camera_from_world[2, :3], camera.camera_from_world[2, 3]
     depth = points @ forward + away
@@ -248,7 +237,7 @@ def shade_pixels(
     faces: Int32[np.ndarray, "faces 3"],
     cut: ClothingCut,
     light: Float32[np.ndarray, "vertices 3"],
-    palette: Float32[np.ndarray, "colors 3"],
+    palette: Palette,
     checked: bool,
 ) -> tuple[Float32[np.ndarray, "height width 3"], AlphaMask]:
     """Return the color of each pixel's covered part (sRGB in [0, 1]) and the covered fraction.
@@ -286,8 +275,8 @@ def _shade(
     kinds: Int32[np.ndarray, "kinds"],
     place: Float32[np.ndarray, "vertices 3"],
     light: Float32[np.ndarray, "vertices 3"],
-    palette: Float32[np.ndarray, "colors 3"],
-    cut: Float32[np.ndarray, "cuts"],
+    palette: Palette,
+    cut: Measures,
     checked: bool,
     rgb: Float32[np.ndarray, "height width 3"],
     alpha: AlphaMask,

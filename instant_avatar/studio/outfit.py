@@ -21,6 +21,12 @@ SLEEVE, HEM, CUFF, NECK_DEPTH, NAPE, EARS_COVERED, FRINGE = 0, 1, 2, 3, 4, 5, 6
 
 BELT_Y = -0.15
 """Trousers end here; the shirt hangs over it."""
+Measures = Float32[np.ndarray, "cuts"]
+"""The tailor's measures, in the order of `SLEEVE` and the others."""
+Palette = Float32[np.ndarray, "colors 3"]
+"""An outfit's colors, sRGB in [0, 1]."""
+Vertices = Float[np.ndarray, "vertices 3"]
+PerVertex = Float[np.ndarray, "vertices"]
 
 
 @compile_kernel(nogil=True, forceinline=True)
@@ -31,7 +37,7 @@ def smoothstep(value: float, low: float, high: float) -> float:
 
 
 @compile_kernel(nogil=True, forceinline=True)
-def neckline(x: float, z: float, measures: Float32[np.ndarray, "cuts"]) -> float:
+def neckline(x: float, z: float, measures: Measures) -> float:
     """Height of the collar's edge: a scoop, deeper in front, that ends on the shoulders."""
     front = smoothstep(z, 0.01, 0.09)
     side = abs(x + 0.002)
@@ -44,9 +50,7 @@ def neckline(x: float, z: float, measures: Float32[np.ndarray, "cuts"]) -> float
 
 
 @compile_kernel(nogil=True, forceinline=True)
-def height_above_hairline(
-    x: float, y: float, z: float, measures: Float32[np.ndarray, "cuts"]
-) -> float:
+def height_above_hairline(x: float, y: float, z: float, measures: Measures) -> float:
     """Height of a place of the head above the hairline, metres (negative: bare)."""
     side = abs(x + 0.002)
     edge = measures[NAPE] + (0.478 - measures[NAPE]) * smoothstep(z, 0.02, 0.075)
@@ -60,9 +64,7 @@ def height_above_hairline(
 
 
 @compile_kernel(nogil=True)
-def is_visible(
-    material: int, x: float, y: float, z: float, measures: Float32[np.ndarray, "cuts"]
-) -> bool:
+def is_visible(material: int, x: float, y: float, z: float, measures: Measures) -> bool:
     """Tell whether a place of a garment is there, or a place of the skin is bare."""
     side = abs(x)
     if material == SHIRT:
@@ -110,15 +112,13 @@ class Outfit:
     looseness: float = 1.0
 
     @property
-    def measures(self) -> Float32[np.ndarray, "cuts"]:
+    def measures(self) -> Measures:
         """Measures in the order of `SLEEVE` and the others."""
         ears = float(self.ears_covered)
         measures = (self.sleeve, self.hem, self.cuff, self.neck_depth, self.nape, ears, self.fringe)
         return np.array(measures, dtype=np.float32)
 
-    def shirt_thickness(
-        self, place: Float[np.ndarray, "vertices 3"]
-    ) -> Float[np.ndarray, "vertices"]:
+    def shirt_thickness(self, place: Vertices) -> PerVertex:
         """Distance of the shirt from the body: small at the shoulders, 3-4 cm at hem and sleeve."""
         x, y, z = place.T
         side = np.abs(x)
@@ -131,9 +131,7 @@ class Outfit:
         thickness = (1.0 - on_sleeve) * torso + on_sleeve * sleeve + folds + creases
         return self.looseness * thickness
 
-    def trouser_thickness(
-        self, place: Float[np.ndarray, "vertices 3"]
-    ) -> Float[np.ndarray, "vertices"]:
+    def trouser_thickness(self, place: Vertices) -> PerVertex:
         """Distance of the trousers from the body: 7 mm at the hip, 2 cm at the cuff."""
         x, y, z = place.T
         down = _smoothstep_array(-y, -BELT_Y, 1.1)
@@ -141,9 +139,7 @@ class Outfit:
         creases = 0.0035 * np.sin(y * 95.0 + 14.0 * np.abs(x) + 20.0 * z) * knee
         return self.looseness * (0.007 + 0.014 * down + creases)
 
-    def hair_thickness(
-        self, place: Float[np.ndarray, "vertices 3"]
-    ) -> Float[np.ndarray, "vertices"]:
+    def hair_thickness(self, place: Vertices) -> PerVertex:
         """Thickness of the hair: fullest on the crown, thin at the nape."""
         _, y, z = place.T
         crown = _smoothstep_array(y, 0.45, 0.60)
@@ -152,9 +148,7 @@ class Outfit:
         return full + (0.0 if self.bun else tuft)
 
 
-def _smoothstep_array(
-    value: Float[np.ndarray, "vertices"], low: float, high: float
-) -> Float[np.ndarray, "vertices"]:
+def _smoothstep_array(value: PerVertex, low: float, high: float) -> PerVertex:
     share = np.clip((value - low) / (high - low), 0.0, 1.0)
     return share * share * (3.0 - 2.0 * share)
 
@@ -287,10 +281,10 @@ class BodyProportions:
 
     def move_vertices(
         self,
-        vertices: Float[np.ndarray, "vertices 3"],
+        vertices: Vertices,
         weights: Float[np.ndarray, "vertices 24"],
         joints: Float[np.ndarray, "24 3"],
-    ) -> Float[np.ndarray, "vertices 3"]:
+    ) -> Vertices:
         """Move rest vertices of the body or its clothes: each blends the stretches of its joints.
 
         `joints` are the body's before it is stretched, metres.

@@ -8,14 +8,15 @@ from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32
 
 from capture.camera import Camera
+from capture.source import AlphaMask, RgbImage
 from instant_avatar.studio import painted_surfaces
 from instant_avatar.studio.actor import Actor
 from instant_avatar.studio.input_errors import smooth_noise
 from instant_avatar.studio.lighting import LAMP_RGB, RenderedFrame, composite_over, lamp_visibility
-from instant_avatar.studio.outfit import SHIRT, TROUSERS
+from instant_avatar.studio.outfit import SHIRT, TROUSERS, PerVertex, Vertices
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.body_surface import vertex_normals
 from preprocess.body.kinematics import slerp
@@ -39,13 +40,13 @@ class MovingCloth:
         self._phases = place @ wave_vectors + generator.uniform(0.0, 2.0 * np.pi, WAVES)
         self._turns_per_s = generator.uniform(0.3, 0.9, WAVES)
 
-    def displacement_m(self, time_s: float) -> Float[np.ndarray, "vertices 3"]:
+    def displacement_m(self, time_s: float) -> Vertices:
         """Displacement of each rest vertex along its normal; zero for skin, hair and shoes."""
         waves = np.sin(self._phases + 2.0 * np.pi * self._turns_per_s * time_s).mean(axis=1)
         return (self._reach * np.clip(1.6 * waves, -1.0, 1.0))[:, None] * self._normals
 
 
-def _looseness_m(actor: Actor) -> Float[np.ndarray, "vertices"]:
+def _looseness_m(actor: Actor) -> PerVertex:
     """Return vertices' largest displacement: none where a garment is held, most at loose ends."""
     x, y, _ = actor.template_points.T.astype(np.float64)
     down = np.clip((0.25 - y) / 0.45, 0.0, 1.0)
@@ -126,7 +127,7 @@ class PhoneScene:
 
     actor: Actor
     camera: Camera
-    background: UInt8[np.ndarray, "height width 3"]
+    background: RgbImage
     light: RoomLight
     cloth: MovingCloth | None
     fps: float
@@ -152,7 +153,7 @@ class PhoneScene:
 
     def _draw_moment(
         self, pose: BodyPose, time_s: float, supersampling: int
-    ) -> tuple[Float32[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]]:
+    ) -> tuple[Float32[np.ndarray, "height width 3"], AlphaMask]:
         actor = self.actor
         if self.cloth is not None:
             moved = actor.rest_vertices + self.cloth.displacement_m(time_s)
@@ -160,16 +161,14 @@ class PhoneScene:
         actor = replace(actor, baked_light=self.light.on(actor, pose))
         return actor.render_rgb_alpha(pose, self.camera, supersampling)
 
-    def _behind(self, pose: BodyPose) -> UInt8[np.ndarray, "height width 3"]:
+    def _behind(self, pose: BodyPose) -> RgbImage:
         feet = self.actor.shaped.with_pose(pose).joints()[[10, 11]]
         return painted_surfaces.add_foot_shadows(self.background, feet, self.camera)
 
 
 def expose(
-    rgb: UInt8[np.ndarray, "height width 3"],
-    gains: Float[np.ndarray, "3"],
-    generator: np.random.Generator,
-) -> UInt8[np.ndarray, "height width 3"]:
+    rgb: RgbImage, gains: Float[np.ndarray, "3"], generator: np.random.Generator
+) -> RgbImage:
     """Return a neutrally exposed image as the phone stores it: exposed, noisy and compressed."""
     noise = SENSOR_NOISE * generator.standard_normal(rgb.shape, dtype=np.float32)
     exposed = np.clip(rgb * gains + noise + 0.5, 0.0, 255.0).astype(np.uint8)

@@ -5,7 +5,6 @@ to the body in every pose and are as sharp as the picture can show.
 """
 
 import numpy as np
-from jaxtyping import Float32
 
 from avatar.kernels.kernel_compiler import compile_kernel
 from instant_avatar.studio.outfit import (
@@ -18,6 +17,8 @@ from instant_avatar.studio.outfit import (
     SHOE,
     SLEEVE,
     TROUSERS,
+    Measures,
+    Palette,
     neckline,
     smoothstep,
 )
@@ -79,7 +80,7 @@ def _scale(a: SrgbColor, factor: float) -> SrgbColor:
 
 
 @compile_kernel(nogil=True, forceinline=True)
-def _swatch(palette: Float32[np.ndarray, "colors 3"], row: int) -> SrgbColor:
+def _swatch(palette: Palette, row: int) -> SrgbColor:
     return palette[row, 0], palette[row, 1], palette[row, 2]
 
 
@@ -93,12 +94,7 @@ def _stripe_wave(value: float, width: float, blur: float) -> float:
 
 @compile_kernel(nogil=True)
 def _shirt(
-    x: float,
-    y: float,
-    z: float,
-    palette: Float32[np.ndarray, "colors 3"],
-    cut: Float32[np.ndarray, "cuts"],
-    checked: bool,
+    x: float, y: float, z: float, palette: Palette, cut: Measures, checked: bool
 ) -> SrgbColor:
     side = abs(x - SYMMETRY_PLANE_X)
     on_sleeve = side > 0.172 and y > 0.08
@@ -134,13 +130,7 @@ def _shirt(
 
 
 @compile_kernel(nogil=True)
-def _trousers(
-    x: float,
-    y: float,
-    z: float,
-    palette: Float32[np.ndarray, "colors 3"],
-    cut: Float32[np.ndarray, "cuts"],
-) -> SrgbColor:
+def _trousers(x: float, y: float, z: float, palette: Palette, cut: Measures) -> SrgbColor:
     side = abs(x - SYMMETRY_PLANE_X)
     axis_x = 0.118 + 0.040 * smoothstep(-y, 0.25, 1.1)
     axis_z = 0.020 - 0.055 * smoothstep(-y, 0.3, 1.1)
@@ -163,7 +153,7 @@ def _trousers(
 
 
 @compile_kernel(nogil=True)
-def _skin(x: float, y: float, z: float, palette: Float32[np.ndarray, "colors 3"]) -> SrgbColor:
+def _skin(x: float, y: float, z: float, palette: Palette) -> SrgbColor:
     tone = _swatch(palette, TONE)
     side = abs(x - SYMMETRY_PLANE_X)
     warm = 0.0
@@ -197,9 +187,7 @@ def _skin(x: float, y: float, z: float, palette: Float32[np.ndarray, "colors 3"]
 
 
 @compile_kernel(nogil=True)
-def _mouth(
-    color: SrgbColor, side: float, y: float, palette: Float32[np.ndarray, "colors 3"]
-) -> SrgbColor:
+def _mouth(color: SrgbColor, side: float, y: float, palette: Palette) -> SrgbColor:
     share = side / 0.027
     if share >= 1.0:
         return color
@@ -215,9 +203,7 @@ def _mouth(
 
 
 @compile_kernel(nogil=True)
-def _brow_and_lashes(
-    color: SrgbColor, side: float, y: float, palette: Float32[np.ndarray, "colors 3"]
-) -> SrgbColor:
+def _brow_and_lashes(color: SrgbColor, side: float, y: float, palette: Palette) -> SrgbColor:
     dark = _scale(_swatch(palette, HAIR_TONE), 0.75)
     along = (side - 0.012) / 0.042
     if 0.0 < along < 1.0:
@@ -232,7 +218,7 @@ def _brow_and_lashes(
 
 
 @compile_kernel(nogil=True)
-def _eye(x: float, y: float, palette: Float32[np.ndarray, "colors 3"]) -> SrgbColor:
+def _eye(x: float, y: float, palette: Palette) -> SrgbColor:
     from_iris = np.hypot(abs(x - SYMMETRY_PLANE_X) - 0.0300, y - 0.5035)
     iris = _scale(_swatch(palette, IRIS), 0.75 + 40.0 * from_iris)
     color = _lerp(iris, (0.94, 0.93, 0.90), smoothstep(from_iris, 0.0058, 0.0068))
@@ -242,7 +228,7 @@ def _eye(x: float, y: float, palette: Float32[np.ndarray, "colors 3"]) -> SrgbCo
 
 
 @compile_kernel(nogil=True)
-def _hair(x: float, y: float, z: float, palette: Float32[np.ndarray, "colors 3"]) -> SrgbColor:
+def _hair(x: float, y: float, z: float, palette: Palette) -> SrgbColor:
     along = np.arctan2(x - SYMMETRY_PLANE_X, z - 0.05)
     strand = value_noise(along * 0.30, 0.25 * y, 0.1 * z, 0.012, np.uint32(7))
     strand += 0.6 * value_noise(along * 0.30, 0.25 * y, 0.1 * z, 0.005, np.uint32(8))
@@ -250,7 +236,7 @@ def _hair(x: float, y: float, z: float, palette: Float32[np.ndarray, "colors 3"]
 
 
 @compile_kernel(nogil=True)
-def _shoe(x: float, y: float, z: float, palette: Float32[np.ndarray, "colors 3"]) -> SrgbColor:
+def _shoe(x: float, y: float, z: float, palette: Palette) -> SrgbColor:
     side = abs(abs(x - SYMMETRY_PLANE_X) - 0.162)
     upper = _swatch(palette, UPPER)
     lace = (
@@ -267,13 +253,7 @@ def _shoe(x: float, y: float, z: float, palette: Float32[np.ndarray, "colors 3"]
 
 @compile_kernel(nogil=True)
 def albedo_at(
-    material: int,
-    x: float,
-    y: float,
-    z: float,
-    palette: Float32[np.ndarray, "colors 3"],
-    measures: Float32[np.ndarray, "cuts"],
-    checked: bool,
+    material: int, x: float, y: float, z: float, palette: Palette, measures: Measures, checked: bool
 ) -> SrgbColor:
     """sRGB color of a place before any light falls on it; may leave [0, 1] by a little."""
     if material == SHIRT:

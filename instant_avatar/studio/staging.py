@@ -269,15 +269,8 @@ def _aim_camera(size_px: tuple[int, int], focal: float, target: float) -> Camera
     forward = np.array([0.0, target, 0.0]) - eye
     forward /= np.linalg.norm(forward)
     right = np.array([1.0, 0.0, 0.0])
-    camera_from_world = np.eye(4)
-    camera_from_world[:3, :3] = [right, np.cross(forward, right), forward]
-    camera_from_world[:3, 3] = -camera_from_world[:3, :3] @ eye
-    return Camera(
-        focal_px=(focal, focal),
-        center_px=(0.5 * size_px[0], 0.5 * size_px[1]),
-        size_px=size_px,
-        camera_from_world=camera_from_world,
-    )
+    axes = np.stack([right, np.cross(forward, right), forward])
+    return Camera.at(eye, axes, focal, size_px)
 
 
 WALK_ASPECT = (16, 9)
@@ -362,16 +355,8 @@ def _aim_handheld_camera(
     down = np.cross(forward, right)
     cosine, sine = np.cos(shake_rotation[2]), np.sin(shake_rotation[2])
     axes = np.stack([cosine * right + sine * down, cosine * down - sine * right, forward])
-    camera_from_world = np.eye(4)
-    camera_from_world[:3, :3] = axes
-    camera_from_world[:3, 3] = -axes @ eye
-    width, height = size, max(1, round(size * WALK_ASPECT[1] / WALK_ASPECT[0]))
-    return Camera(
-        focal_px=(FOCAL_SHARE * width, FOCAL_SHARE * width),
-        center_px=(0.5 * width, 0.5 * height),
-        size_px=(width, height),
-        camera_from_world=camera_from_world,
-    )
+    height = max(1, round(size * WALK_ASPECT[1] / WALK_ASPECT[0]))
+    return Camera.at(eye, axes, FOCAL_SHARE * size, (size, height))
 
 
 def _smooth_gaussian_noise(

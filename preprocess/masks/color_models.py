@@ -10,10 +10,17 @@ from typing import NamedTuple, final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, UInt8
 
 from capture.source import RgbImage
 
+Plane = Float32[np.ndarray, "height width"]
+Channels = Float32[np.ndarray, "3 height width"]
+PixelMask = Bool[np.ndarray, "height width"]
+Pixels = Float32[np.ndarray, "pixels"]
+FullImage = UInt8[np.ndarray, "rows columns 3"]
+FullPlane = Float32[np.ndarray, "rows columns"]
+"""Planes and channels of a working image, some of its pixels, and a frame of full size."""
 REFERENCE_SPREAD = 16.0
 """Standard deviation, in levels, at whose peak a density is 1."""
 UNSEEN_BACKGROUND = 0.00025
@@ -49,8 +56,6 @@ MAX_UNLIKE_FRACTION = 0.2
 """Largest squared difference from the plate in a window, relative to the plate's own variance."""
 MIN_KNOWN_FRACTION = 0.7
 """Least fraction of a window that must be known."""
-Pixels = Float32[np.ndarray, "pixels"]
-PixelMask = Bool[np.ndarray, "height width"]
 DARK_LEVEL, BRIGHT_LEVEL = 80.0, 180.0
 """Level of the brightest pixels (2 %) below which a film is brightened, and the level after it."""
 NOISE_BLUR_PX = 1.0
@@ -74,10 +79,10 @@ class PlateColors(NamedTuple):
     """
 
     known: PixelMask
-    mean: Float32[np.ndarray, "3 height width"]
-    variance: Float32[np.ndarray, "height width"]
+    mean: Channels
+    variance: Plane
 
-    def in_sight(self, image: Float32[np.ndarray, "3 height width"]) -> PixelMask:
+    def in_sight(self, image: Channels) -> PixelMask:
         """Pixels that show the background's texture: no person is before them.
 
         A flat background of a sleeve's color says little, leaves and books say nearly everything.
@@ -132,11 +137,7 @@ class BackgroundPlate:
         self._variance = self._frames = np.zeros((0, 0), np.float32)
         self._gain = np.ones(3, np.float32)
 
-    def align(
-        self,
-        image: Float32[np.ndarray, "3 height width"],
-        background: Bool[np.ndarray, "height width"],
-    ) -> None:
+    def align(self, image: Channels, background: PixelMask) -> None:
         """Estimate gains from a frame's sure background; forget everything if the camera has moved.
 
         The image's channels are in levels; another size than before rescales the plate.
@@ -170,11 +171,7 @@ class BackgroundPlate:
         mean = self._mean[:, part[0], part[1]] * self._gain[:, None, None]
         return PlateColors(frames >= MIN_SEEN_FRAMES, mean, variance)
 
-    def update(
-        self,
-        image: Float32[np.ndarray, "3 height width"],
-        background: Bool[np.ndarray, "height width"],
-    ) -> None:
+    def update(self, image: Channels, background: PixelMask) -> None:
         """Average the sure background of the aligned frame into the plate."""
         self._frames += background
         share = background / np.clip(self._frames, np.float32(1.0), np.float32(MEMORY_FRAMES))

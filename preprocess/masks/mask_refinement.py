@@ -18,12 +18,18 @@ from typing import NamedTuple, final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Int, UInt8
+from jaxtyping import Float32, Int
 
 from capture.source import RgbImage
 from preprocess.masks.color_models import (
     BackgroundPlate,
+    Channels,
     DarkFilmBrightener,
+    FullImage,
+    FullPlane,
+    PixelMask,
+    Pixels,
+    Plane,
     PlateColors,
     plate_density,
 )
@@ -66,10 +72,6 @@ FILTER_TOLERANCE = 5.0
 """Standard deviation of colors, in levels, that the guided filter does not follow."""
 PERSON_FREE_ALPHA = 0.05
 """Alpha below which a pixel enters the background plate."""
-Plane = Float32[np.ndarray, "height width"]
-Channels = Float32[np.ndarray, "3 height width"]
-PixelMask = Bool[np.ndarray, "height width"]
-Pixels = Float32[np.ndarray, "pixels"]
 COMPARED_FRAMES = 10
 """Frames whose borders are compared; what they say holds for all others."""
 MIN_EDGE_RATIO = 1.15
@@ -116,10 +118,7 @@ class MaskRefiner:
         self._histograms = np.zeros((2, 16**3), np.float32)
 
     def __call__(
-        self,
-        rgb: UInt8[np.ndarray, "rows columns 3"],
-        mask: CroppedMask,
-        size_px: tuple[int, int] | None = None,
+        self, rgb: FullImage, mask: CroppedMask, size_px: tuple[int, int] | None = None
     ) -> Plane:
         """Refine the next frame's mask, in [0, 1], at `size_px` (width, height) or the frame's."""
         alpha = self._refine(self._brighten(rgb), mask)
@@ -128,7 +127,7 @@ class MaskRefiner:
         way = cv2.INTER_AREA if size_px[0] < self._frame_px[0] else cv2.INTER_LINEAR
         return np.asarray(cv2.resize(alpha, size_px, interpolation=way), np.float32)
 
-    def _refine(self, rgb: UInt8[np.ndarray, "rows columns 3"], mask: CroppedMask) -> Plane:
+    def _refine(self, rgb: FullImage, mask: CroppedMask) -> Plane:
         square_px = float(np.hypot(*mask.image_from_crop[:, 0]))
         best = square_px / WORKING_SCALE
         if abs(self._reduction - best) > 0.5 + RESCALE_MARGIN or not self._reduction:
@@ -285,12 +284,7 @@ class GivenMaskRefiner:
         decided = not self._enabled or len(self._ratios) >= COMPARED_FRAMES
         return decided and not self.is_needed
 
-    def __call__(
-        self,
-        rgb: UInt8[np.ndarray, "rows columns 3"],
-        alpha: Float32[np.ndarray, "rows columns"],
-        size_px: tuple[int, int],
-    ) -> Float32[np.ndarray, "height width"]:
+    def __call__(self, rgb: FullImage, alpha: FullPlane, size_px: tuple[int, int]) -> Plane:
         """Refine the next frame's mask, unless the given one is as good; scaled to `size_px`."""
         found = alpha
         if not self.keeps_given_masks and (alpha > 0.5).any():
@@ -303,16 +297,14 @@ class GivenMaskRefiner:
             return found
         return np.asarray(cv2.resize(found, size_px, interpolation=cv2.INTER_AREA), np.float32)
 
-    def _refine(
-        self, rgb: UInt8[np.ndarray, "rows columns 3"], alpha: Float32[np.ndarray, "rows columns"]
-    ) -> Float32[np.ndarray, "rows columns"]:
+    def _refine(self, rgb: FullImage, alpha: FullPlane) -> FullPlane:
         size_px = rgb.shape[1], rgb.shape[0]
         if self._refiner is None or size_px != self._size_px:
             self._refiner, self._size_px = MaskRefiner(size_px), size_px
         return self._refiner(rgb, _crop(alpha))
 
 
-def edge_strength(rgb: RgbImage, alpha: Float32[np.ndarray, "height width"]) -> float:
+def edge_strength(rgb: RgbImage, alpha: Plane) -> float:
     """Change of color across a mask's border, levels per pixel.
 
     It is the mean over the border, weighted by the gradient of alpha.
@@ -330,7 +322,7 @@ def _gradient(plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return x, y
 
 
-def _crop(alpha: Float32[np.ndarray, "height width"]) -> CroppedMask:
+def _crop(alpha: Plane) -> CroppedMask:
     """The square around the person, as a tracker would cut it out."""
     rows, columns = np.nonzero(alpha > 0.5)
     low = np.array([columns.min(), rows.min()], np.float64)

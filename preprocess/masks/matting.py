@@ -9,10 +9,16 @@ those of the guided filter with a color guide (He et al. 2013, Guided image filt
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Shaped, UInt8
+from jaxtyping import Float32, Shaped
 
 from preprocess.body.body_surface import signed_distance_px
-from preprocess.masks.color_models import PlateColors
+from preprocess.masks.color_models import (
+    Channels,
+    FullImage,
+    FullPlane,
+    Plane,
+    PlateColors,
+)
 
 BORDER_SIGMA_PX = 0.35
 """Standard deviation of a mask's border error, px."""
@@ -41,15 +47,14 @@ NEARBY_PX = 3
 """Edge of the window in which it does, in twice the working image's pixels."""
 NEARBY_SPREAD = 14.0
 """Standard deviation of a color that the window's mean misses, in levels."""
-Plane = Float32[np.ndarray, "height width"]
 
 
 def refine_border(
     rgb: Shaped[np.ndarray, "height width 3"],
-    alpha: Float32[np.ndarray, "height width"],
-    background: tuple[Float32[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]],
-    foreground: tuple[Float32[np.ndarray, "height width 3"], Float32[np.ndarray, "height width"]],
-) -> Float32[np.ndarray, "height width"]:
+    alpha: Plane,
+    background: tuple[Float32[np.ndarray, "height width 3"], Plane],
+    foreground: tuple[Float32[np.ndarray, "height width 3"], Plane],
+) -> Plane:
     """Move a mask's border to where the colors change from person to background.
 
     Args:
@@ -93,9 +98,7 @@ def _color_likelihood(
     return np.exp(-0.5 * squared / variance) * (np.float32(16.0) / variance) ** np.float32(1.5)
 
 
-def border_distance_px(
-    alpha: Float32[np.ndarray, "height width"],
-) -> Float32[np.ndarray, "height width"]:
+def border_distance_px(alpha: Plane) -> Plane:
     """Sub-pixel distance of each pixel's center from the mask's border, positive outside, px."""
     steps = signed_distance_px(alpha > 0.5)
     mixed = (np.abs(alpha - 0.5) < 0.47) & (np.abs(steps) < 1.2)
@@ -108,10 +111,7 @@ fast."""
 
 
 def guided_coefficients(
-    guide: Float32[np.ndarray, "3 height width"],
-    alpha: Float32[np.ndarray, "height width"],
-    radius_px: int,
-    tolerance: float,
+    guide: Channels, alpha: Plane, radius_px: int, tolerance: float
 ) -> Float32[np.ndarray, "4 height width"]:
     """Fit alpha = a · color + b in the window around each pixel, and average (a, b) over windows.
 
@@ -176,9 +176,8 @@ def _fit_windows(
 
 
 def apply_coefficients(
-    guide: Float32[np.ndarray, "3 height width"],
-    coefficients: Float32[np.ndarray, "4 height width"],
-) -> Float32[np.ndarray, "height width"]:
+    guide: Channels, coefficients: Float32[np.ndarray, "4 height width"]
+) -> Plane:
     """a · color + b at each pixel."""
     found = coefficients[3].copy()
     for color, slope in zip(guide, coefficients, strict=False):
@@ -192,9 +191,7 @@ def steepen(alpha: Plane) -> Plane:
     return np.clip(steep, np.float32(0.0), np.float32(1.0))
 
 
-def move_border(
-    image: Float32[np.ndarray, "3 height width"], alpha: Plane, plate: PlateColors
-) -> Plane:
+def move_border(image: Channels, alpha: Plane, plate: PlateColors) -> Plane:
     """Change of alpha near a mask's border, by colors between the person's and the background's."""
     sure = cv2.erode((alpha > SURE_ALPHA).astype(np.uint8), np.ones((3, 3), np.uint8))
     size_px, window = alpha.shape[::-1], (NEARBY_PX, NEARBY_PX)
@@ -218,15 +215,12 @@ def move_border(
 
 
 def enlarge_alpha(
-    rgb: UInt8[np.ndarray, "rows columns 3"],
-    coefficients: Float32[np.ndarray, "4 height width"],
-    times: int,
-    moved: Plane,
-) -> Float32[np.ndarray, "rows columns"]:
+    rgb: FullImage, coefficients: Float32[np.ndarray, "4 height width"], times: int, moved: Plane
+) -> FullPlane:
     """The mask at full size: the filter's coefficients, enlarged and applied, and moved."""
     size_px = rgb.shape[1], rgb.shape[0]
 
-    def full(plane: Plane) -> Float32[np.ndarray, "rows columns"]:
+    def full(plane: Plane) -> FullPlane:
         return plane if times == 1 else cv2.resize(plane, size_px)
 
     alpha = full(coefficients[3])
