@@ -9,7 +9,7 @@ from pathlib import Path
 
 import psutil
 
-from instant_avatar.cli.hardware import processor_name, usable_cores
+from capture.hardware import processor_name, usable_cores
 
 ROOT = Path(__file__).resolve().parents[1]
 LIBRARIES = ("numpy", "numba", "torch", "onnxruntime")

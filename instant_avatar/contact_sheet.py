@@ -11,6 +11,7 @@ from capture.camera import same_aspect_ratio
 from capture.input_error import InputError
 from capture.source import AlphaMask, RgbImage
 from instant_avatar.capture_validation import CaptureValidation
+from instant_avatar.tracked_video import BODY_COLOR, MASK_COLOR, draw_outline
 from preprocess.alignment.capture_geometry import FULL_WINDOW, CaptureGeometry
 from preprocess.alignment.keypoint_objective import TrackedImage
 from preprocess.alignment.silhouette_objective import components_touching, spaced_indices
@@ -19,7 +20,6 @@ from preprocess.masks.mask_sources import StoredMasks
 
 COLUMNS = 6
 """Frames per row."""
-MASK_COLOR, BODY_COLOR = (255, 255, 255), (255, 120, 0)
 KEYPOINT_COLOR, PAPER_COLOR, INK_COLOR = (0, 220, 220), (245, 245, 245), (40, 40, 40)
 """RGB colors of the sheet."""
 LABEL_PX = 26
@@ -93,7 +93,7 @@ def _draw_cell(
         label += ": no pose"
     elif same_aspect_ratio(size, seen.size_px):
         drawn = body.draw_pose(seen.motion[row], seen.camera_at(image.index, size))
-        _draw_outline(picture, drawn.astype(np.float32), BODY_COLOR)
+        draw_outline(picture, drawn.astype(np.float32), BODY_COLOR, width_px=2)
     if mask_of is not None and video.window == FULL_WINDOW:
         try:
             alpha = mask_of(video.first_frame + image.index, size)
@@ -103,16 +103,10 @@ def _draw_cell(
         alpha = np.float32(1.0) - alpha if geometry.masks_inverted else alpha
         if geometry.keeps_person_only and drawn is not None:
             alpha = components_touching(alpha, drawn)
-        _draw_outline(picture, alpha, MASK_COLOR)
+        draw_outline(picture, alpha, MASK_COLOR, width_px=2)
         label += "" if drawn is None else f": {soft_iou(drawn, alpha):.2f}"
     _draw_text(picture, label, 4)
     return picture
-
-
-def _draw_outline(picture: RgbImage, alpha: AlphaMask, color: tuple[int, int, int]) -> None:
-    shape = (alpha > 0.5).astype(np.uint8)
-    outlines, _ = cv2.findContours(shape, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(picture, outlines, -1, color, 2, cv2.LINE_AA)
 
 
 def _draw_text(picture: RgbImage, text: str, x: int) -> None:

@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
+from capture.hardware import usable_cores
 from instant_avatar.cli.command_line import (
     INTERRUPTED,
     exit_on_interrupt,
@@ -17,7 +18,6 @@ from instant_avatar.cli.command_line import (
     without_garbage_collection,
 )
 from instant_avatar.cli.console import Console
-from instant_avatar.cli.hardware import usable_cores
 from instant_avatar.cli.shared_options import open_recording
 from instant_avatar.run.ingest_arguments import PROGRAM, VIEW_PORT, IngestArguments
 from instant_avatar.run.run_folder import RunFolder

@@ -8,9 +8,8 @@ import cv2
 import numpy as np
 
 from capture.atomic_files import atomic_file
-from capture.source import RgbImage
+from capture.source import AlphaMask, RgbImage
 from capture.video_writer import H264, write_video
-from instant_avatar.contact_sheet import BODY_COLOR, MASK_COLOR
 from preprocess.body.body_surface import SkinPoints, splat_silhouette
 from preprocess.capture_session import Capture
 from preprocess.observation import Observation, shrink_to_longer_side
@@ -23,6 +22,8 @@ LETTER_PX, LINE_PX = 7, 16
 """Width of a letter and height of a line of text, px."""
 SILHOUETTE_PX = 256
 """Longer side of the images in which the body's outline is found, px."""
+MASK_COLOR, BODY_COLOR = (255, 255, 255), (255, 120, 0)
+"""RGB colors of the outlines of mask and body."""
 LEFT_COLOR, RIGHT_COLOR, MIDDLE_COLOR = (255, 150, 40), (60, 190, 255), (240, 240, 240)
 """RGB colors of the person's left and right limbs, and of trunk and head."""
 DOUBT_COLOR = (255, 60, 60)
@@ -53,8 +54,8 @@ def _draw_frames(capture: Capture, doubts: Mapping[int, str]) -> Iterator[RgbIma
         camera = item.camera.resize(size_px)
         small = item.camera.resize(shrink_to_longer_side(item.camera.size_px, SILHOUETTE_PX))
         drawn = splat_silhouette(skin.posed(item.pose), small).astype(np.float32)
-        _draw_outline(image, cv2.resize(item.alpha, size_px) > 0.5, MASK_COLOR)
-        _draw_outline(image, cv2.resize(drawn, size_px) > 0.5, BODY_COLOR)
+        draw_outline(image, cv2.resize(item.alpha, size_px), MASK_COLOR, width_px=1)
+        draw_outline(image, cv2.resize(drawn, size_px), BODY_COLOR, width_px=1)
         pixels = camera.project(capture.shaped.with_pose(item.pose).joints())
         for joint, parent in enumerate(capture.shaped.body.parents):
             if parent >= 0:
@@ -86,9 +87,13 @@ def _draw_bone(
     cv2.line(image, ends[0], ends[1], color, 3, cv2.LINE_AA, shift=4)
 
 
-def _draw_outline(image: RgbImage, inside: np.ndarray, color: tuple[int, int, int]) -> None:
-    found, _ = cv2.findContours(inside.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(image, found, -1, color, 1, cv2.LINE_AA)
+def draw_outline(
+    image: RgbImage, alpha: AlphaMask, color: tuple[int, int, int], *, width_px: int
+) -> None:
+    """Draw the outline of a mask of the image's size."""
+    inside = (alpha > 0.5).astype(np.uint8)
+    found, _ = cv2.findContours(inside, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(image, found, -1, color, width_px, cv2.LINE_AA)
 
 
 def _draw_text(image: RgbImage, text: str, doubtful: bool) -> None:

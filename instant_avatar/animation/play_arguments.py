@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float
 from tyro.conf import Positional, arg
 
+from capture.hardware import usable_cores
 from capture.input_error import InputError
-from instant_avatar.cli.hardware import usable_cores
 from instant_avatar.cli.shared_options import Flag, check_output_file
 from preprocess.body.kinematics import JOINT_NAMES, rotation_matrices
 

@@ -20,9 +20,8 @@ from capture.input_error import InputError
 from export import player_page
 from instant_avatar.cli.command_line import DONE, parse_arguments, run_command, stop_on_interrupt
 from instant_avatar.cli.console import Console
+from instant_avatar.cli.shared_options import HOST
 
-HOST = "127.0.0.1"
-"""Loopback address: only browsers of this machine reach the page."""
 PORTS_TRIED = 20
 """Consecutive ports to try."""
 MIME_TYPES = {

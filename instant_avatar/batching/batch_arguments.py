@@ -7,10 +7,10 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from capture.hardware import usable_cores
 from capture.input_error import InputError
 from instant_avatar.batching.capture_discovery import BatchCapture, parse_options
 from instant_avatar.batching.remote_files import is_url
-from instant_avatar.cli.hardware import usable_cores
 from instant_avatar.cli.shared_options import Flag, check_disjoint_from_inputs, check_writable
 
 RAY_LOCAL = "local"

@@ -15,7 +15,7 @@ from typing import Any, TextIO
 
 from rich.console import Console as RichConsole
 
-from capture.process_metrics import peak_memory_mb
+from capture.hardware import describe_machine, peak_memory_mb
 from instant_avatar.batching.batch_arguments import BatchArguments
 from instant_avatar.batching.capture_discovery import BatchCapture
 from instant_avatar.batching.remote_files import fetch_files, is_url
@@ -28,7 +28,6 @@ from instant_avatar.cli.command_line import (
     parse_arguments,
 )
 from instant_avatar.cli.console import Console
-from instant_avatar.cli.hardware import describe_machine
 from instant_avatar.run.ingest_arguments import IngestArguments
 
 LOG_NAME = "ingest.log"

@@ -7,6 +7,7 @@ from collections.abc import Generator, Iterable
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from capture.hardware import usable_cores
 from capture.input_error import InputError
 from instant_avatar.batching.batch_arguments import RAY_LOCAL, BatchArguments
 from instant_avatar.batching.capture_discovery import BatchCapture
@@ -17,7 +18,6 @@ from instant_avatar.batching.ingest_attempt import (
     learn_capture,
     record_of,
 )
-from instant_avatar.cli.hardware import usable_cores
 
 OBJECT_STORE_BYTES = 200_000_000
 """Memory for what attempts bring back (about 5 MB each), where this machine alone is used."""

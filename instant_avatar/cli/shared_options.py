@@ -19,6 +19,8 @@ from preprocess.capture_inputs import CaptureInputs
 
 Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
 """A flag without its opposite."""
+HOST = "127.0.0.1"
+"""Loopback address: only browsers of this machine reach what a command serves."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from avatar.evaluation.image_metrics import SharpnessVerdict, overall_verdict
 from avatar.evaluation.perceptual import LPIPS_CONVENTIONS, Lpips
-from instant_avatar.cli.hardware import describe_machine
+from capture.hardware import describe_machine
 from instant_avatar.evaluation.frame_scoring import (
     LARGEST_SHOWN_ERROR,
     METRICS,

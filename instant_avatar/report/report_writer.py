@@ -14,9 +14,9 @@ from avatar.evaluation.image_metrics import (
     overall_verdict,
 )
 from capture.atomic_files import atomic_file, write_text_atomically
+from capture.hardware import peak_memory_mb
 from capture.input_error import quote_command
 from capture.live_sources import camera_address
-from capture.process_metrics import peak_memory_mb
 from export.player import Player
 from instant_avatar.animation.driving_motion import FollowingCamera, ResampledMotion, demo_motion
 from instant_avatar.cli.command_line import DONE, INTERRUPTED, NO_AVATAR, CommandExit

@@ -25,9 +25,9 @@ from capture.camera import Camera
 from capture.source import RgbImage
 from export.bake.bake_tables import ExportRefused
 from instant_avatar.animation.driving_motion import demo_motion, pose_rate
-from instant_avatar.animation.web_server import HOST
 from instant_avatar.cli.command_line import stop_on_interrupt
 from instant_avatar.cli.console import Console
+from instant_avatar.cli.shared_options import HOST
 from instant_avatar.report.report_schema import format_percent, format_psnr
 from instant_avatar.run.run_folder import RunFolder
 from instant_avatar.run.session_events import EventReader, SessionEvent

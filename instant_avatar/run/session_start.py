@@ -16,12 +16,12 @@ from avatar.evaluation.coverage import coverage_advice, expected_coverage
 from avatar.rig import Rig
 from avatar.training import checkpoint, train
 from avatar.training.trainer import Trainer
+from capture.hardware import usable_cores
 from capture.input_error import InputError
 from capture.live_sources import DONE_FILE_NAME
 from export.bake import proxy_surface
 from instant_avatar.cli.command_line import exit_on_interrupt, stop_on_interrupt
 from instant_avatar.cli.console import Console
-from instant_avatar.cli.hardware import usable_cores
 from instant_avatar.run.console_reader import ConsoleReader
 from instant_avatar.run.final_scoring import EarlierVideos
 from instant_avatar.run.ingest_arguments import PROGRAM, IngestArguments

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from capture.hardware import peak_memory_mb
 from capture.input_error import InputError
-from capture.process_metrics import peak_memory_mb
 from capture.source import Frame, FrameSource
 from preprocess.body.body_surface import MeshSilhouette
 from preprocess.cameras.camera_file import ASSUMED_CAMERA_SOURCE

@@ -3,9 +3,9 @@
 import subprocess
 import sys
 
-from capture.process_metrics import peak_memory_mb
+from capture.hardware import peak_memory_mb
 
-SAID = "from capture.process_metrics import peak_memory_mb as p; {}; print(p())"
+SAID = "from capture.hardware import peak_memory_mb as p; {}; print(p())"
 
 
 def said(held: str) -> float:
