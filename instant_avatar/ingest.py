@@ -56,8 +56,7 @@ def ingest(
     require_packages("torch", "numba", "onnx", *solver)
     arguments.validate()
     inputs = arguments.capture_inputs()
-    if inputs.kind is InputKind.POSED:
-        inputs.find_paths()  # refuse a wrong one before code is loaded
+    inputs.check_named()
     source = None if inputs.is_live else open_recording(inputs, console)
     run, read = arguments.run_folder(), inputs.input_paths()
     run.check_usable(read, resume=arguments.resume, overwrite=arguments.overwrite)

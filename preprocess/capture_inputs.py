@@ -8,7 +8,7 @@ from pathlib import Path
 
 from capture.input_error import InputError
 from capture.live_sources import IDLE_TIMEOUT_S, camera_address
-from preprocess.plugins import segmenter_name
+from preprocess.plugins import check_installed, segmenter_name
 
 POSE_FILE_NAMES = [
     "poses.npz",
@@ -208,13 +208,25 @@ class CaptureInputs:
 
     def input_paths(self) -> list[Path]:
         """Paths that no output may touch: those that were named, and those that may be found."""
+        video = [] if self.camera is not None else [self.video]
+        near = {path if path.is_dir() else path.parent for path in (self.video, self.poses) if path}
+        return [*self._named_parts(), *video, *find_parts(sorted(near))]
+
+    def check_named(self) -> None:
+        """Raise an InputError for a part of a recording that is named, but not there.
+
+        It reads and loads nothing, so that a slip in a name is found at once.
+        """
+        for path in [] if self.is_live else [self.video, *self._named_parts()]:
+            if not path.exists():
+                raise InputError(f"{path} does not exist; check the path.")
+        check_installed(self.tracker, segmenter_name(self.masks))
+
+    def _named_parts(self) -> list[Path]:
+        """The files and folders that were named, but for the video."""
         named = [self.poses, self.body]
-        if self.camera is None:
-            named.append(self.video)
         if segmenter_name(self.masks) is None:
             named.append(self.masks)
         if self.cameras not in (None, "static", "solve"):
             named.append(Path(self.cameras))
-        given = [path for path in named if path is not None]
-        near = {path if path.is_dir() else path.parent for path in (self.video, self.poses) if path}
-        return [*given, *find_parts(sorted(near))]
+        return [path for path in named if path is not None]

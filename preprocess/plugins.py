@@ -53,6 +53,14 @@ def segmenter_name(masks: object) -> str | None:
     return text.removeprefix(SEGMENTER_PREFIX) if text.startswith(SEGMENTER_PREFIX) else None
 
 
+def check_installed(tracker: str | None, segmenter: str | None) -> None:
+    """Raise an InputError for a tracker or a segmenter that is not installed; load nothing."""
+    if tracker not in (None, DEFAULT_TRACKER):
+        _find_registered("tracker", tracker)
+    if segmenter not in (None, DEFAULT_SEGMENTER):
+        _find_registered("segmenter", segmenter)
+
+
 def make_segmenter(name: str, shaped: ShapedBody) -> Segmenter:
     """Make this project's segmenter, or one of an installed package.
 
@@ -62,8 +70,7 @@ def make_segmenter(name: str, shaped: ShapedBody) -> Segmenter:
         from preprocess.tracking.blazepose import BlazePoseSegmenter
 
         return BlazePoseSegmenter(shaped)
-    option = f"--masks {SEGMENTER_PREFIX}{name}"
-    return _make_registered("segmenter", name, shaped, own=DEFAULT_SEGMENTER, option=option)
+    return _make_registered("segmenter", name, shaped)
 
 
 def make_tracker(name: str = DEFAULT_TRACKER, person: int | None = None) -> PersonTracker:
@@ -78,31 +85,34 @@ def make_tracker(name: str = DEFAULT_TRACKER, person: int | None = None) -> Pers
         from preprocess.tracking.blazepose import BlazePoseTracker
 
         return BlazePoseTracker(person=person)
-    return _make_registered(
-        "tracker", name, person, own=DEFAULT_TRACKER, option=f"--tracker {name}"
-    )
+    return _make_registered("tracker", name, person)
 
 
-def _make_registered(kind: str, name: str, *arguments: object, own: str, option: str) -> Any:
-    """Make a part that an installed package registers, or raise an InputError.
+OPTIONS = {"tracker": "--tracker ", "segmenter": f"--masks {SEGMENTER_PREFIX}"}
+"""The user's option for each kind of part, for messages."""
 
-    Its entry point NAME = "module:make" lies in the group `instant_avatar.KINDs`.
 
-    Args:
-        kind: "segmenter" or "tracker".
-        arguments: Those of `make`.
-        own: Name of this project's own part of that kind.
-        option: The user's option, for messages.
+def _make_registered(kind: str, name: str, *arguments: object) -> Any:
+    """Make a "segmenter" or "tracker" that an installed package registers, or raise an InputError.
+
+    `arguments` are those of its `make`.
     """
+    point = _find_registered(kind, name)
+    try:
+        return point.load()(*arguments)
+    except Exception as cause:  # code of another package
+        raise InputError(f"The {kind} {name!r} could not be loaded: {cause}.") from cause
+
+
+def _find_registered(kind: str, name: str) -> Any:
+    """The entry point NAME = "module:make" in the group `instant_avatar.KINDs`."""
     group = f"instant_avatar.{kind}s"
     registered = {point.name: point for point in entry_points(group=group)}
     if name not in registered:
+        own = DEFAULT_TRACKER if kind == "tracker" else DEFAULT_SEGMENTER
         raise InputError(
-            f"{option}: there is no such {kind}; installed are "
+            f"{OPTIONS[kind]}{name}: there is no such {kind}; installed are "
             f"{', '.join([own, *registered])}. Others come with packages that have "
             f"an entry point in the group {group!r} (docs/formats.md)."
         )
-    try:
-        return registered[name].load()(*arguments)
-    except Exception as cause:  # code of another package
-        raise InputError(f"The {kind} {name!r} could not be loaded: {cause}.") from cause
+    return registered[name]

@@ -7,14 +7,17 @@ back the fit, the person's rig, and what the masks' refinement has learnt from t
 """
 
 import gc
+import os
 import pickle
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
+import export
 from capture.source import FrameSource
 from preprocess.capture_inputs import CaptureInputs, InputKind, find_own_masks
 from preprocess.plugins import segmenter_name
@@ -27,6 +30,8 @@ if TYPE_CHECKING:  # the process that fits needs no console, and scipy only once
 
 COMPILE = "from instant_avatar.run.start_up import warm_up; warm_up()"
 """Program of the process that compiles."""
+KERNELS = Path(export.__file__).parent / "bake"
+"""Folder of the kernels that are compiled last."""
 FIT = "from instant_avatar.run.start_up import fit_for_parent; fit_for_parent()"
 """Program of the process that fits."""
 
@@ -43,6 +48,14 @@ def preparing_to_train(console: "Console") -> Iterator[Callable[[], None]]:
     compilers: list[subprocess.Popen[bytes]] = []
     has_ended = threading.Event()
 
+    def compile_beside() -> None:
+        nowhere = subprocess.DEVNULL
+        compilers.append(
+            subprocess.Popen(
+                [sys.executable, "-c", COMPILE], stdin=nowhere, stdout=nowhere, stderr=nowhere
+            )
+        )
+
     def load() -> None:
         with suppress(ImportError), without_garbage_collection():  # imported again, it is named
             import torch  # noqa: F401
@@ -53,12 +66,16 @@ def preparing_to_train(console: "Console") -> Iterator[Callable[[], None]]:
             from export.bake.proxy_surface import visible_depth_steps  # compiled after the others
 
             cache: Any = getattr(getattr(visible_depth_steps, "_cache", None), "_cache_file", None)
-            if cache is not None and not cache._load_index() and not has_ended.is_set():
-                nowhere = subprocess.DEVNULL
-                process = subprocess.Popen(
-                    [sys.executable, "-c", COMPILE], stdin=nowhere, stdout=nowhere, stderr=nowhere
-                )
-                compilers.append(process)
+            is_missing = cache is not None and not cache._load_index()
+            if is_missing and not compilers and not has_ended.is_set():
+                compile_beside()
+
+    if is_first_run():
+        console.info(
+            "This is the first run: its kernels are compiled beside what follows, in about a "
+            "minute; training starts after that, and within seconds in later runs."
+        )
+        compile_beside()
 
     def wait() -> None:
         loading.join()
@@ -75,6 +92,13 @@ def preparing_to_train(console: "Console") -> Iterator[Callable[[], None]]:
         for process in compilers:
             process.terminate()
             process.wait()
+
+
+def is_first_run() -> bool:
+    """Whether no kernel was ever compiled here, as far as can be seen before numba is loaded."""
+    if "NUMBA_CACHE_DIR" in os.environ or not os.access(KERNELS, os.W_OK):
+        return False  # numba knows where they are
+    return not any(KERNELS.glob("__pycache__/*.nbi"))
 
 
 def warm_up() -> None:

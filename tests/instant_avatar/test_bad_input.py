@@ -43,6 +43,28 @@ def test_a_video_that_is_not_there(refused, tmp_path):
     refused(tmp_path / "none.mp4", "--poses", tmp_path / "none.npz", words=["none.mp4"])
 
 
+WITHOUT_HEAVY_CODE = """
+import sys
+from instant_avatar import ingest
+assert ingest.main(sys.argv[1:]) == 2
+assert not {"torch", "numba", "scipy", "onnxruntime"} & set(sys.modules)
+"""
+
+
+@pytest.mark.parametrize("option", ["poses", "masks", "cameras", "body", "tracker", "segmenter"])
+@pytest.mark.parametrize("is_posed", [True, False])
+def test_a_name_that_nothing_has_is_refused_before_heavy_code_is_loaded(
+    film, tmp_path, option, is_posed
+):
+    name = "missing" if option in ("tracker", "segmenter") else "missing.npz"
+    words = ["--masks", f"segmenter:{name}"] if option == "segmenter" else [f"--{option}", name]
+    video = [film if is_posed else film / "video.mp4", "--out", tmp_path / "run"]
+    command = [sys.executable, "-c", WITHOUT_HEAVY_CODE, *map(str, video), *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert name in done.stderr
+
+
 @pytest.mark.slow
 def test_a_video_that_cannot_be_tracked_well_leaves_what_was_tracked(
     call_ingest, capture, tmp_path

@@ -61,6 +61,27 @@ def test_missing_kernels_are_compiled_by_a_process_that_ends_with_the_block(star
     assert started[0].poll() is not None
 
 
+def test_a_first_run_is_announced_and_compiles_before_numba_is_loaded(
+    started, monkeypatch, tmp_path, capsys
+):
+    monkeypatch.setattr(start_up, "KERNELS", tmp_path)
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    with start_up.preparing_to_train(Console()):
+        assert len(started) == 1
+        assert "first run" in capsys.readouterr().err
+    assert started[0].poll() is not None
+    assert len(started) == 1
+    (tmp_path / "__pycache__").mkdir()
+    (tmp_path / "__pycache__" / "kernel-1.nbi").touch()
+    assert not start_up.is_first_run()
+
+
+def test_what_only_numba_knows_is_no_first_run(monkeypatch, tmp_path):
+    monkeypatch.setattr(start_up, "KERNELS", tmp_path)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    assert not start_up.is_first_run()
+
+
 def test_waiting_ends_once_the_kernels_are_compiled(started, monkeypatch):
     set_index(monkeypatch, {})
     monkeypatch.setattr(start_up, "COMPILE", "pass")
