@@ -29,8 +29,8 @@ class CaptureFit:
         error_after_cm: The same with the whole of the changes.
         share: Share of the changes that is made, in [0, 1], and how far the given poses are
             estimates: none where they are exact, 1 where they were made of key points.
-        keypoint_share: Weight of poses by the built-in tracker's key points beside the given ones,
-            in [0, 1]: 0 where given poses are exact, or were made of key points themselves.
+        keypoint_share: Mean weight of joints by the built-in tracker's key points beside the given
+            ones, in [0, 1]: 0 where given poses are exact, or were made of key points themselves.
         fits_body: Whether proportions could change; not those of a finished avatar's person.
     """
 

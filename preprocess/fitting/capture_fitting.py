@@ -7,7 +7,7 @@ exact poses, nearly all of those of a tracker's.
 Outlines do not show how far limbs turn about themselves; the built-in tracker's key points tell it
 in part, by depth. Both estimates of a pose err independently, so each counts by the inverse of its
 error's variance. The given poses' error is estimated by how far outlines turned them, the key
-points' by the rest of the disagreement between the two.
+points' by the rest of the disagreement between the two, joint by joint.
 """
 
 import math
@@ -80,8 +80,13 @@ ERROR_PER_TURN = 1.2
 """Error that outlines leave in given poses, per rotation by which they turned them: 0.9 to 1.3 in
 films of studio motions, 1.7 to 2.3 in real ones."""
 LEAST_ERROR_RAD = math.radians(5.0)
-"""Least error of poses by key points that is assumed: it is 3.5 degrees in films of studio motions,
-10 to 14 in real ones."""
+"""Least error of a joint by key points that is assumed: the mean is 3.5 degrees in films of studio
+motions, 10 to 14 in real ones."""
+LEAST_HEAD_ERROR_RAD = math.radians(14.0)
+"""The same of neck and head: key points are off by 2 cm, and a face's lie within 8 cm of the axis
+about which it turns, where those of a limb are 20 to 40 cm away."""
+HEAD_JOINTS = (12, 15)
+"""Neck and head."""
 
 
 def apply_fit(capture: Capture, fit: CaptureFit, *, height_m: float | None = None) -> Capture:
@@ -150,8 +155,8 @@ def fit_capture(capture: Capture, *, fit_body: bool = True) -> CaptureFit | None
 def _take_keypoints(capture: Capture, fitter: ClipFitter, share: float) -> float:
     """Fit given poses once more, near them and those by key points; return the latter's weight.
 
-    `share` of the fit's changes is no noise. The weight, in [0, 1], is 0 if the person is not
-    found, or if key points would count by less than a twentieth.
+    `share` of the fit's changes is no noise. The weight, the joints' mean, is 0 if the person is
+    not found, or if key points would count by less than a twentieth.
     """
     error2 = share * (ERROR_PER_TURN * _mean_turn(fitter.corrections)) ** 2
     count = round(MOST_TRACKED_FRAMES * error2 / (error2 + LEAST_ERROR_RAD**2))
@@ -172,14 +177,25 @@ def _take_keypoints(capture: Capture, fitter: ClipFitter, share: float) -> float
     beside.poses = fitter.poses.rows(rows)
     beside.iterate_stages(POSES_ALONE, *BESIDE_ITERATIONS)
     steps = beside.poses.steps_from(fitter.poses.rows(rows), beside.camera_rotations)
-    weight = error2 / max(_mean_turn(steps) ** 2, error2 + LEAST_ERROR_RAD**2)
+    weights = weigh_joints(steps, math.sqrt(error2))
+    each_weight = np.repeat(np.append(weights, weights[0]), 3)  # the root's place as it turns
     each_step = [np.interp(fitter.numbers, beside.numbers, each) for each in steps.T]
     turns, further = fitter.camera_rotations, np.column_stack(each_step)
     stated = fitter.as_stated(fitter.poses.moved(further, turns))
-    fitter.expect(fitter.given.moved(weight * stated.steps_from(fitter.given, turns), turns))
-    fitter.poses = fitter.poses.moved(weight * further, turns)
+    fitter.expect(fitter.given.moved(each_weight * stated.steps_from(fitter.given, turns), turns))
+    fitter.poses = fitter.poses.moved(each_weight * further, turns)
     fitter.iterate_stages(POSES_ALONE, 0, BLENDED_ITERATIONS)
-    return weight
+    return float(weights[1:22].mean())
+
+
+def weigh_joints(
+    steps: Float[np.ndarray, "frames 75"], given_error_rad: float
+) -> Float[np.ndarray, "24"]:
+    """Weight of each joint by key points, from given poses that err so far to these by `steps`."""
+    least = np.full(24, LEAST_ERROR_RAD)
+    least[list(HEAD_JOINTS)] = LEAST_HEAD_ERROR_RAD
+    apart2 = (steps[:, :72].reshape(-1, 24, 3) ** 2).sum(axis=2).mean(axis=0)
+    return given_error_rad**2 / np.maximum(apart2, given_error_rad**2 + least**2)
 
 
 def share_beyond_noise(corrections: Float[np.ndarray, "frames 75"], error_cm: float) -> float:

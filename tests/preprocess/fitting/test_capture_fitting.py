@@ -14,10 +14,12 @@ from preprocess.capture_inputs import CaptureInputs
 from preprocess.fitting import capture_fitting
 from preprocess.fitting.capture_fit import CaptureFit
 from preprocess.fitting.capture_fitting import (
+    HEAD_JOINTS,
     NOISE_DEG_PER_CM,
     apply_fit,
     fit_capture,
     share_beyond_noise,
+    weigh_joints,
 )
 from preprocess.open_capture import open_capture
 from preprocess.poses.pose_format_registry import read_poses
@@ -160,7 +162,7 @@ def error_deg(motion, truth) -> float:
 def test_key_points_bring_coarse_poses_nearer_to_the_truth(coarse, monkeypatch):
     capture, truth = coarse
     with_keypoints = fit_capture(capture)
-    monkeypatch.setattr(capture_fitting, "weigh_keypoint_poses", lambda *evidence: None)
+    monkeypatch.setattr(capture_fitting, "_take_keypoints", lambda *evidence: 0.0)
     without = fit_capture(capture)
     assert with_keypoints.keypoint_share > 0.3
     assert without.keypoint_share == 0.0
@@ -173,3 +175,33 @@ def test_key_points_bring_coarse_poses_nearer_to_the_truth(coarse, monkeypatch):
 def test_no_key_points_are_looked_for_where_given_poses_are_exact(capture, monkeypatch):
     monkeypatch.delattr(capture_fitting, "_find_keypoints")
     assert fit_capture(capture).share == 0.0
+
+
+LIMBS = [1, 2, 4, 5, 16, 17, 18, 19]
+
+
+def steps_apart(joint_deg) -> np.ndarray:
+    """Steps of eight frames whose joints turn so far, about any axis, degrees (24)."""
+    axes = np.random.default_rng(0).normal(size=(8, 24, 3))
+    axes *= np.radians(joint_deg)[:, None] / np.linalg.norm(axes, axis=2, keepdims=True)
+    return np.column_stack([axes.reshape(8, 72), np.zeros((8, 3))])
+
+
+def test_two_estimates_of_a_pose_that_err_alike_count_alike():
+    """Of errors of 10 degrees each, independent, the disagreement is 14."""
+    weights = weigh_joints(steps_apart(np.full(24, 200.0**0.5)), np.radians(10.0))
+    np.testing.assert_allclose(weights[LIMBS], 0.5, atol=1e-6)
+
+
+def test_a_joint_counts_the_less_the_farther_its_two_estimates_lie_apart():
+    turned = np.full(24, 8.0)
+    turned[16] = 16.0
+    weights = weigh_joints(steps_apart(turned), np.radians(4.0))
+    assert weights[16] == pytest.approx(weights[17] / 4.0)
+    assert ((weights > 0.0) & (weights < 1.0)).all()
+    assert not weigh_joints(steps_apart(turned), 0.0).any()
+
+
+def test_key_points_of_a_face_hardly_tell_how_a_head_is_turned():
+    weights = weigh_joints(steps_apart(np.full(24, 4.0)), np.radians(3.5))
+    assert (weights[list(HEAD_JOINTS)] < 0.25 * weights[LIMBS].min()).all()
