@@ -37,9 +37,6 @@ def compile_kernel(
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Decorates a kernel: `numba.njit(**options)` with the machine code cached on disk.
 
-    A parallel region calls one kernel for each of its turns: numba compiles the statements of a
-    region twice, and slowly, and a kernel that it calls once.
-
     Shape-checking hooks wrap every function of a module under test, and numba cannot compile the
     wrapper, so the function is unwrapped first. Numba invalidates its cache when the function's own
     file changes, but not when a kernel that it calls does; the cache is therefore stamped with the

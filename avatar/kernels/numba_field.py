@@ -13,7 +13,6 @@ is the same in every run with as many threads, and differs by rounding between n
 """
 
 import numpy as np
-from numba import prange
 
 from avatar.kernels.kernel_compiler import (
     FAST_MATH,
@@ -99,9 +98,9 @@ def forward_block(
         _write_outputs(hidden, number, output_weights, output_bias, raw, first)
 
 
-@compile_kernel(parallel=True, **FAST_MATH)
+@compile_kernel(**FAST_MATH)
 def forward(
-    points, low, cells_per_m, counts, dense, offsets, table,
+    thread, threads, points, low, cells_per_m, counts, dense, offsets, table,
     weights, bias, output_weights, output_bias, features, raw,
 ):  # fmt: skip
     """Features and raw outputs of points.
@@ -113,9 +112,10 @@ def forward(
         features, raw: (points, width) and (points, 4); written. `features` has as many rows as the
             next multiple of four.
     """
-    for block in prange((points.shape[0] + POINTS_PER_BLOCK - 1) // POINTS_PER_BLOCK):
+    blocks = (points.shape[0] + POINTS_PER_BLOCK - 1) // POINTS_PER_BLOCK
+    for block in range(thread, blocks, threads):
         forward_block(
-            np.int64(block), points, low, cells_per_m, counts, dense, offsets, table, weights,
+            block, points, low, cells_per_m, counts, dense, offsets, table, weights,
             bias, output_weights, output_bias, features, raw,
         )  # fmt: skip
 
@@ -261,9 +261,9 @@ def backward_passes(
                 store4(grad_features, first + p, k, load4(grad_f, p, k))
 
 
-@compile_kernel(parallel=True, **FAST_MATH)
+@compile_kernel(**FAST_MATH)
 def backward(
-    features, rows, grad_raw, weights, bias, output_weights, transposed,
+    thread, threads, features, rows, grad_raw, weights, bias, output_weights, transposed,
     grad_features, weight_sums, output_sums, bias_sums,
 ):  # fmt: skip
     """Gradients of the network's features, weights and biases.
@@ -279,10 +279,7 @@ def backward(
             4, hidden) and, of b₁ and of b₂, (threads, 2, hidden); zero before. Without rows, the
             gradients of a frozen network are left out.
     """
-    threads = weight_sums.shape[0]
-    for thread in prange(threads):
-        backward_passes(
-            np.int64(thread), threads, features, rows, grad_raw, weights, bias, output_weights,
-            transposed, grad_features, weight_sums[thread], output_sums[thread],
-            bias_sums[thread],
-        )  # fmt: skip
+    backward_passes(
+        thread, threads, features, rows, grad_raw, weights, bias, output_weights, transposed,
+        grad_features, weight_sums[thread], output_sums[thread], bias_sums[thread],
+    )  # fmt: skip

@@ -7,7 +7,6 @@ write to one place: no atomics, and the same sums for any number of threads.
 """
 
 import numpy as np
-from numba import prange
 
 from avatar.kernels.kernel_compiler import (
     FAST_MATH,
@@ -114,21 +113,30 @@ def encode_block(points, start, stop, low, cells_per_m, counts, dense, offsets, 
             store4(features, start + i, level * FEATURES_PER_LEVEL, total)
 
 
-@compile_kernel(parallel=True, **FAST_MATH)
-def encode(points, low, cells_per_m, counts, dense, offsets, table, features):
+@compile_kernel(**FAST_MATH)
+def encode(
+    thread, threads, points, low, cells_per_m, counts, dense, offsets, table, features
+):  # fmt: skip
     """Trilinear features of all levels; points outside the box extrapolate from its border."""
-    for block in prange((points.shape[0] + POINTS_PER_BLOCK - 1) // POINTS_PER_BLOCK):
+    blocks = (points.shape[0] + POINTS_PER_BLOCK - 1) // POINTS_PER_BLOCK
+    for block in range(thread, blocks, threads):
         start = block * POINTS_PER_BLOCK
         stop = min(start + POINTS_PER_BLOCK, points.shape[0])
         encode_block(points, start, stop, low, cells_per_m, counts, dense, offsets, table, features)
 
 
 @compile_kernel(**FAST_MATH)
-def _add_level_gradients(
-    thread, points, rows, runs, low, cells_per_m, counts, dense, offsets, grad_features,
-    grad_table, threads,
+def encode_backward(
+    thread, threads, points, rows, runs, low, cells_per_m, counts, dense, offsets, grad_features,
+    grad_table,
 ):  # fmt: skip
-    """Adds the gradients of the levels of one thread."""
+    """Adds the gradient of `encode`, by its table, to `grad_table`, each thread on its levels.
+
+    Args:
+        points: All points.
+        rows, grad_features: Those with a gradient, and the gradients of their features.
+        runs: First place in these lists and length of each run that counts (runs, 2).
+    """
     places, within = np.empty((3, POINTS_PER_BLOCK), F32), np.empty((3, POINTS_PER_BLOCK), F32)
     cells = np.empty((3, POINTS_PER_BLOCK), I32)
     entries, weights = (
@@ -151,24 +159,6 @@ def _add_level_gradients(
                         entry = entries[corner, i]
                         added = scale4(weights[corner, i], grad)
                         store4(grad_table, entry, 0, add4(load4(grad_table, entry, 0), added))
-
-
-@compile_kernel(parallel=True, **FAST_MATH)
-def encode_backward(
-    points, rows, runs, low, cells_per_m, counts, dense, offsets, grad_features, grad_table, threads
-):
-    """Adds the gradient of `encode`, by its table, to `grad_table`, each thread on its levels.
-
-    Args:
-        points: All points.
-        rows, grad_features: Those with a gradient, and the gradients of their features.
-        runs: First place in these lists and length of each run that counts (runs, 2).
-    """
-    for thread in prange(threads):
-        _add_level_gradients(
-            np.int64(thread), points, rows, runs, low, cells_per_m, counts, dense, offsets,
-            grad_features, grad_table, threads,
-        )  # fmt: skip
 
 
 @compile_kernel(**INLINED)
@@ -243,15 +233,16 @@ def _adam_block(g, m, v, p, rates):
         g[i] = F32(0)
 
 
-@compile_kernel(parallel=True, **FAST_MATH)
-def adam_step(grad, mean, square, parameter, rates):
+@compile_kernel(**FAST_MATH)
+def adam_step(thread, threads, grad, mean, square, parameter, rates):
     """Adam's step on flat arrays; the gradient is zeroed in the same pass over the memory.
 
     Blocks are slices, because LLVM vectorises only loops that begin at 0. `rates` are the learning
     rate, the shares of the new gradient and of its square in their means, the scale of the squares'
     root, and epsilon.
     """
-    for block in prange((parameter.shape[0] + ENTRIES_PER_BLOCK - 1) // ENTRIES_PER_BLOCK):
+    blocks = (parameter.shape[0] + ENTRIES_PER_BLOCK - 1) // ENTRIES_PER_BLOCK
+    for block in range(thread, blocks, threads):
         part = slice(block * ENTRIES_PER_BLOCK, (block + 1) * ENTRIES_PER_BLOCK)
         _adam_block(grad[part], mean[part], square[part], parameter[part], rates)
 

@@ -12,7 +12,6 @@ by one in numpy, since each waits for memory that the training step has replaced
 import math
 
 import numpy as np
-from numba import prange
 
 from avatar.kernels.kernel_compiler import (
     FAST_MATH,
@@ -189,28 +188,50 @@ def _update_slab(
                     roots[n, 2] = z + dz
 
 
-@compile_kernel(parallel=True, **FAST_MATH)
+@compile_kernel(**FAST_MATH)
 def update_roots(
-    packed_cells, cells, grid_low, cell_m, roots, weights, shape, low, nodes_per_m, bones
-):
+    thread, threads, packed_cells, cells, grid_low, cell_m, roots, weights, shape, low, nodes_per_m,
+    bones,
+):  # fmt: skip
     """Moves a frame's roots to follow its pose, by one chord step towards the cell's center.
 
     Cells are flat; their grid has the shape `cells`. Roots are updated in place, inverse Jacobians
     and second-order terms stay. `bones` are the new pose's matrices (24, 12).
     """
-    for i in prange(cells[0]):
+    for i in range(thread, cells[0], threads):
         _update_slab(
-            np.int64(i), packed_cells, cells, grid_low, cell_m, roots, weights, shape, low,
+            i, packed_cells, cells, grid_low, cell_m, roots, weights, shape, low,
             nodes_per_m, bones,
         )  # fmt: skip
 
 
 @compile_kernel(**FAST_MATH)
-def _add_rays_of_thread(
-    thread, slots, wrenches, loss, min_loss, scale, room, parents, turns, places, root_turns,
-    counts, gradients, curvatures, moments, powers, threads,
+def add_rays(
+    thread, threads, slots, wrenches, loss, min_loss, scale, room, parents, turns, places,
+    root_turns, counts, gradients, curvatures, moments, powers,
 ):  # fmt: skip
-    """Adds the rays of the slots of one thread."""
+    """Adds rays to the normal equations of their slots' poses, in units of the prior's sigmas.
+
+    By virtual work: a joint at c that rotates by ω moves every bone below it, so that
+    dL/dω = -Σ (M - c × F) over these bones' wrenches (F, M), in body-frame axes. It is expressed in
+    the axes of the joint, in which the corrections are. The root's shift is in the given body
+    frame, the forces are in the corrected one. Each ray's loss ℓ is half of a square, ℓ = ρ²/2, so
+    that its curvature is ∇ℓ ∇ℓᵀ / 2ℓ. Each thread adds to slots of its own.
+
+    Args:
+        wrenches: Of each ray's bones (rays, 24, 6).
+        min_loss: Added to the loss in the curvature.
+        scale: Sigma of a rotation, radians, and of the root's shift, metres.
+        room: Most rays of each slot; rays beyond are left out.
+        parents: Parent of each joint, before its children.
+        turns, places: Rotation and place of each slot's joints in the body frame.
+        root_turns: Correction of each slot's root rotation.
+        counts: Rays of each slot so far; these and the following are updated.
+        gradients: Sums of gradients (slots, `PADDED`).
+        curvatures: Sums of curvatures (slots, 75, `PADDED`).
+        moments: Sums of ∇ℓ ∇ℓᵀ, alike; of zero slots if they are not needed.
+        powers: Sums of |∇ℓ|² and of |∇ℓ|² / 2ℓ (slots, 2).
+    """
     total, g = np.empty((JOINTS, 6), F32), np.zeros(PADDED, F32)
     for ray in range(slots.shape[0]):
         slot = slots[ray]
@@ -256,40 +277,6 @@ def _add_rays_of_thread(
                     moments[slot, i, k] += g[i] * g[k]
         powers[slot, 0] += power
         powers[slot, 1] += weight * power
-
-
-@compile_kernel(parallel=True, **FAST_MATH)
-def add_rays(
-    slots, wrenches, loss, min_loss, scale, room, parents, turns, places, root_turns,
-    counts, gradients, curvatures, moments, powers, threads,
-):  # fmt: skip
-    """Adds rays to the normal equations of their slots' poses, in units of the prior's sigmas.
-
-    By virtual work: a joint at c that rotates by ω moves every bone below it, so that
-    dL/dω = -Σ (M - c × F) over these bones' wrenches (F, M), in body-frame axes. It is expressed in
-    the axes of the joint, in which the corrections are. The root's shift is in the given body
-    frame, the forces are in the corrected one. Each ray's loss ℓ is half of a square, ℓ = ρ²/2, so
-    that its curvature is ∇ℓ ∇ℓᵀ / 2ℓ. Each of `threads` threads adds to slots of its own.
-
-    Args:
-        wrenches: Of each ray's bones (rays, 24, 6).
-        min_loss: Added to the loss in the curvature.
-        scale: Sigma of a rotation, radians, and of the root's shift, metres.
-        room: Most rays of each slot; rays beyond are left out.
-        parents: Parent of each joint, before its children.
-        turns, places: Rotation and place of each slot's joints in the body frame.
-        root_turns: Correction of each slot's root rotation.
-        counts: Rays of each slot so far; these and the following are updated.
-        gradients: Sums of gradients (slots, `PADDED`).
-        curvatures: Sums of curvatures (slots, 75, `PADDED`).
-        moments: Sums of ∇ℓ ∇ℓᵀ, alike; of zero slots if they are not needed.
-        powers: Sums of |∇ℓ|² and of |∇ℓ|² / 2ℓ (slots, 2).
-    """
-    for thread in prange(threads):
-        _add_rays_of_thread(
-            np.int64(thread), slots, wrenches, loss, min_loss, scale, room, parents, turns,
-            places, root_turns, counts, gradients, curvatures, moments, powers, threads,
-        )  # fmt: skip
 
 
 @compile_kernel(**FAST_MATH)

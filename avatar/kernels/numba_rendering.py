@@ -3,10 +3,8 @@
 import math
 
 import numpy as np
-from numba import prange
 
 from avatar.kernels.kernel_compiler import (
-    FAST_MATH,
     INLINED,
     NO_ALLOCATION,
     compile_kernel,
@@ -229,9 +227,9 @@ def _march_block(
         next_steps[ray] = I32(step)
 
 
-@compile_kernel(parallel=True, **NO_ALLOCATION)
+@compile_kernel(**NO_ALLOCATION)
 def march(
-    origins, directions, slots, jitter, sample_step_m,
+    thread, threads, origins, directions, slots, jitter, sample_step_m,
     cell_index, cell_roots, cell_low, cell_shape, cell_m,
     occupied, density, low, cells_per_m, opaque_margin_steps, most_samples, points, rows, counts,
     next_steps,
@@ -245,9 +243,10 @@ def march(
     continues it. `points` and `rows` have room for as many samples of each ray; those of a block of
     rays lie together.
     """
-    for block in prange((origins.shape[0] + RAYS_PER_BLOCK - 1) // RAYS_PER_BLOCK):
+    blocks = (origins.shape[0] + RAYS_PER_BLOCK - 1) // RAYS_PER_BLOCK
+    for block in range(thread, blocks, threads):
         _march_block(
-            np.int64(block), origins, directions, slots, jitter, sample_step_m,
+            block, origins, directions, slots, jitter, sample_step_m,
             cell_index, cell_roots, cell_low, cell_shape, cell_m,
             occupied, density, low, cells_per_m, opaque_margin_steps, most_samples,
             points, rows, counts, next_steps,
@@ -298,7 +297,7 @@ def _sigmoid(x):
     return F32(1) / (F32(1) + np.exp(-x))
 
 
-@compile_kernel(**NO_ALLOCATION)
+@compile_kernel(**INLINED)
 def _composite_ray(ray, raw, offsets, counts, sample_step_m, rendered):
     """One ray's color and alpha."""
     through = F32(1)
@@ -317,11 +316,12 @@ def _composite_ray(ray, raw, offsets, counts, sample_step_m, rendered):
     rendered[ray, 3] = F32(1) - through
 
 
-@compile_kernel(parallel=True, **FAST_MATH)
-def composite(raw, offsets, counts, sample_step_m, rendered):
+@compile_kernel(**NO_ALLOCATION)
+def composite(thread, threads, raw, offsets, counts, sample_step_m, rendered):
     """Premultiplied color and alpha of each ray from its samples, front to back."""
-    for ray in prange(offsets.shape[0]):
-        _composite_ray(np.int64(ray), raw, offsets, counts, sample_step_m, rendered)
+    rays = offsets.shape[0]
+    for ray in range(rays * thread // threads, rays * (thread + 1) // threads):
+        _composite_ray(ray, raw, offsets, counts, sample_step_m, rendered)
 
 
 @compile_kernel(**INLINED)

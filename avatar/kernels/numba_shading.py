@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-from numba import prange
 
 from avatar.kernels.kernel_compiler import (
     FAST_MATH,
@@ -67,15 +66,16 @@ def mean_normal(
     mean[ray, 0], mean[ray, 1], mean[ray, 2] = x, y, z
 
 
-@compile_kernel(parallel=True, **NO_ALLOCATION)
+@compile_kernel(**NO_ALLOCATION)
 def mean_normals(
-    raw, points, offsets, counts, rows, slots, cell_roots, sample_step_m,
+    thread, threads, raw, points, offsets, counts, rows, slots, cell_roots, sample_step_m,
     normals, low, cells_per_m, mean,
 ):  # fmt: skip
     """Normals at each ray's samples, in the body frame, composited front to back."""
-    for ray in prange(offsets.shape[0]):
+    rays = offsets.shape[0]
+    for ray in range(rays * thread // threads, rays * (thread + 1) // threads):
         mean_normal(
-            np.int64(ray), raw, points, offsets, counts, rows, slots, cell_roots, sample_step_m,
+            ray, raw, points, offsets, counts, rows, slots, cell_roots, sample_step_m,
             normals, low, cells_per_m, mean,
         )  # fmt: skip
 

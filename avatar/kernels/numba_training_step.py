@@ -1,4 +1,4 @@
-"""Forward and backward pass of a training step, compiled for the CPU: one parallel region.
+"""Forward and backward pass of a training step, compiled for the CPU: one kernel a thread.
 
 A block of rays, or the points of one prior, passes through the whole step while it is in a core's
 caches: field, light, composite and loss, the draw of the gradients to propagate, and backward
@@ -11,7 +11,6 @@ between numbers of threads.
 """
 
 import numpy as np
-from numba import prange
 
 from avatar.kernels import numba_priors
 from avatar.kernels.kernel_compiler import FAST_MATH, INLINED, compile_kernel
@@ -117,11 +116,54 @@ def _shade_rays(
 
 
 @compile_kernel(**FAST_MATH)
-def _learn_share(
+def _clear(rows):
+    """Sets all numbers to 0; a slice that is assigned takes numba far longer to compile."""
+    for row in range(rows.shape[0]):
+        for column in range(rows.shape[1]):
+            rows[row, column] = F32(0)
+
+
+@compile_kernel(**FAST_MATH)
+def _block_range(block, kind_count, ends, sample_offsets, sample_count):
+    """First and last point of a block, and its first ray; -1 if it has the points of a prior."""
+    if block < kind_count:
+        return ends[block], ends[block + 1], -1
+    ray = (block - kind_count) * RAYS_PER_BLOCK
+    after = ray + RAYS_PER_BLOCK
+    stop = sample_offsets[after] if after < sample_offsets.shape[0] else sample_count
+    return sample_offsets[ray], stop, ray
+
+
+@compile_kernel(**FAST_MATH)
+def learn(
     thread, threads, settings, samples, rays, surface, priors, field, levels, pose_levels, pose,
     outputs, backward, sums,
 ):  # fmt: skip
-    """Takes one thread's blocks through the step."""
+    """Renders rays and propagates the gradients of their mean loss and of the priors.
+
+    Args:
+        settings: Distance between samples, metres; weights of the losses of alpha and of the hard
+            surface; strength below which a gradient is drawn by chance, and a seed of the draw;
+            whether normals are needed.
+        samples: Canonical points, those of the rays and then those of the priors (points, 3); of
+            the rays' samples offsets, counts and root rows.
+        rays: Slots, pixels (rays, 4), world-from-body rotations (rays, 3, 3), and the roots of all
+            slots (slots, rows, 12).
+        surface: Normals of the skin's volume, its corner and resolution; coefficients of the light;
+            least length of a normal, and least and largest factor of the light.
+        priors: End of the samples, and of each kind of points (kinds + 1); weight of each source
+            pair; weights of each kind's terms (kinds, 2); largest slope of log density, 1/m.
+        field: Table, W₁, b₁ (1, hidden), W₂ᵀ, b₂ and padded W₁ᵀ, as in `numba_field`.
+        levels: As in `numba_hash_grid.encode`.
+        pose_levels: Number of levels whose gradient reaches the poses.
+        pose: Skinning weights (nodes, 24), their shape, corner and resolution; bones of all slots.
+        outputs: Raw outputs and their gradients (points, 4); of the rays shaded rendering, loss,
+            world normals, wrenches (rays, 24, 6); written. No wrenches are computed for zero rays.
+        backward: Points that have a gradient, the gradients of their features, and the first place
+            and number of those of each block (blocks, 2); written.
+        sums: Sums of the network's gradients as in `numba_field.backward`, zero before; sum of the
+            gradients' strengths of each block.
+    """
     points, sample_offsets, sample_counts, root_rows = samples
     slots, target, world_from_body, roots = rays
     skin, skin_low, skin_cells_per_m, light, min_length, least, most = surface
@@ -201,60 +243,3 @@ def _learn_share(
             )  # fmt: skip
         for n in range(kept):
             row_part[n] += start
-
-
-@compile_kernel(**FAST_MATH)
-def _clear(rows):
-    """Sets all numbers to 0; a slice that is assigned takes numba far longer to compile."""
-    for row in range(rows.shape[0]):
-        for column in range(rows.shape[1]):
-            rows[row, column] = F32(0)
-
-
-@compile_kernel(**FAST_MATH)
-def _block_range(block, kind_count, ends, sample_offsets, sample_count):
-    """First and last point of a block, and its first ray; -1 if it has the points of a prior."""
-    if block < kind_count:
-        return ends[block], ends[block + 1], -1
-    ray = (block - kind_count) * RAYS_PER_BLOCK
-    after = ray + RAYS_PER_BLOCK
-    stop = sample_offsets[after] if after < sample_offsets.shape[0] else sample_count
-    return sample_offsets[ray], stop, ray
-
-
-@compile_kernel(parallel=True, **FAST_MATH)
-def learn(
-    threads, settings, samples, rays, surface, priors, field, levels, pose_levels, pose, outputs,
-    backward, sums,
-):  # fmt: skip
-    """Renders rays and propagates the gradients of their mean loss and of the priors.
-
-    Args:
-        threads: Number of threads.
-        settings: Distance between samples, metres; weights of the losses of alpha and of the hard
-            surface; strength below which a gradient is drawn by chance, and a seed of the draw;
-            whether normals are needed.
-        samples: Canonical points, those of the rays and then those of the priors (points, 3); of
-            the rays' samples offsets, counts and root rows.
-        rays: Slots, pixels (rays, 4), world-from-body rotations (rays, 3, 3), and the roots of all
-            slots (slots, rows, 12).
-        surface: Normals of the skin's volume, its corner and resolution; coefficients of the light;
-            least length of a normal, and least and largest factor of the light.
-        priors: End of the samples, and of each kind of points (kinds + 1); weight of each source
-            pair; weights of each kind's terms (kinds, 2); largest slope of log density, 1/m.
-        field: Table, W₁, b₁ (1, hidden), W₂ᵀ, b₂ and padded W₁ᵀ, as in `numba_field`.
-        levels: As in `numba_hash_grid.encode`.
-        pose_levels: Number of levels whose gradient reaches the poses.
-        pose: Skinning weights (nodes, 24), their shape, corner and resolution; bones of all slots.
-        outputs: Raw outputs and their gradients (points, 4); of the rays shaded rendering, loss,
-            world normals, wrenches (rays, 24, 6); written. No wrenches are computed for zero rays.
-        backward: Points that have a gradient, the gradients of their features, and the first place
-            and number of those of each block (blocks, 2); written.
-        sums: Sums of the network's gradients as in `numba_field.backward`, zero before; sum of the
-            gradients' strengths of each block.
-    """
-    for thread in prange(threads):
-        _learn_share(
-            np.int64(thread), threads, settings, samples, rays, surface, priors, field, levels,
-            pose_levels, pose, outputs, backward, sums,
-        )  # fmt: skip

@@ -1,8 +1,7 @@
 """The operations of a training step: one function each, which runs a compiled kernel on the CPU.
 
 Shapes and meanings are stated here; the kernels (`numba_*`) take plain arrays. Kernels for a
-graphics card would be a second module of these functions. Only the trainer's thread may call them,
-except for the serial `solve_correspondences`. `baselines.torch_reference` and
+graphics card would be a second module of these functions. `baselines.torch_reference` and
 `baselines.torch_correspondence` say the same in plain torch, and a test compares both.
 """
 
@@ -47,6 +46,7 @@ from avatar.kernels.operands import (
     RaySamples,
     SkinningVolume,
 )
+from avatar.kernels.threads import run_threads
 from avatar.rig import Rig
 
 _SCRATCH = threading.local()
@@ -57,9 +57,10 @@ MAX_REUSED_SAMPLES = 1 << 20
 def encode(points: Points, table: HashTable, levels: HashLevels) -> Features:
     """Hash-grid features."""
     features = torch.empty(len(points), levels.feature_width)
-    numba_hash_grid.encode(
-        points.numpy(), *_level_arrays(levels), table.detach().numpy(), features.numpy()
-    )
+    run_threads(
+        numba_hash_grid.encode,
+        points.numpy(), *_level_arrays(levels), table.detach().numpy(), features.numpy(),
+    )  # fmt: skip
     return features
 
 
@@ -71,9 +72,9 @@ def encode_backward(
     grad_table: HashTable,
 ) -> None:
     """Adds the table's gradient to `grad_table`; `grad_features` are of the points in `rows`."""
-    numba_hash_grid.encode_backward(
-        points.numpy(), rows.numpy(), np.array([[0, len(rows)]]), *_level_arrays(levels),
-        grad_features.numpy(), grad_table.numpy(), numba.get_num_threads(),
+    run_threads(
+        numba_hash_grid.encode_backward, points.numpy(), rows.numpy(), np.array([[0, len(rows)]]),
+        *_level_arrays(levels), grad_features.numpy(), grad_table.numpy(),
     )  # fmt: skip
 
 
@@ -84,7 +85,8 @@ def field_forward(
     rows = -(-len(points) // 4) * 4
     features, raw = torch.empty(rows, levels.feature_width), torch.empty(len(points), 4)
     *layers, _ = _network_arrays(network)
-    numba_field.forward(
+    run_threads(
+        numba_field.forward,
         points.numpy(), *_level_arrays(levels), table.detach().numpy(), *layers,
         features.numpy(), raw.numpy(),
     )  # fmt: skip
@@ -130,8 +132,8 @@ def learn(
     rows, grad_features = np.empty(total, np.int64), np.empty((total, width), np.float32)
     runs, strengths = np.empty((blocks, 2), np.int64), np.empty(blocks, np.float32)
     sums = _network_sums(threads, width, is_frozen=is_frozen)
-    numba_training_step.learn(
-        threads,
+    run_threads(
+        numba_training_step.learn,
         (
             np.float32(how.sample_step_m), np.float32(how.alpha_weight),
             np.float32(how.hard_surface_weight), np.float32(how.faint), np.uint32(seed),
@@ -181,9 +183,9 @@ def _pose_arrays(poses: PosedBones | None) -> tuple[np.ndarray, ...]:
 def add_table_gradient(learnt: LearntRays, levels: HashLevels, grad_table: HashTable) -> None:
     """Adds the table's gradient of rays that were learnt to `grad_table`."""
     rows, grad_features, runs = learnt.features
-    numba_hash_grid.encode_backward(
-        learnt.points.numpy(), rows, runs, *_level_arrays(levels), grad_features,
-        grad_table.numpy(), _threads(),
+    run_threads(
+        numba_hash_grid.encode_backward, learnt.points.numpy(), rows, runs, *_level_arrays(levels),
+        grad_features, grad_table.numpy(),
     )  # fmt: skip
 
 
@@ -199,7 +201,8 @@ def network_backward(
     grad_features = torch.empty(len(rows), features.shape[1])
     sums = _network_sums(_threads(), features.shape[1], is_frozen=is_frozen)
     first, bias, second, _, transposed = _network_arrays(network)
-    numba_field.backward(
+    run_threads(
+        numba_field.backward,
         features.numpy(), rows.numpy(), grad_raw.numpy(), first, bias, second, transposed,
         grad_features.numpy(), *sums,
     )  # fmt: skip
@@ -265,7 +268,7 @@ def adam_step(how: AdamSettings, parameters: list[tuple[Tensor, Tensor, Tensor, 
     for parts in parameters:
         arrays = tuple(part.detach().view(-1).numpy() for part in parts)
         if len(arrays[0]) > numba_hash_grid.ENTRIES_PER_BLOCK:
-            numba_hash_grid.adam_step(*arrays, rates)
+            run_threads(numba_hash_grid.adam_step, *arrays, rates)
         else:
             small.append(arrays)
     if small:
@@ -300,7 +303,8 @@ def march_resumable(
     padded, padded_rows = _scratch_samples(len(rays.slots) * how.max_samples)
     count, reached = torch.empty(2, len(rays.slots), dtype=torch.int32)
     first = torch.empty(len(rays.slots), dtype=torch.int64)
-    numba_rendering.march(
+    run_threads(
+        numba_rendering.march,
         *(part.numpy() for part in rays), np.float32(how.sample_step_m),
         *(part.numpy() for part in cells[:4]), np.float32(cells.cell_m),
         *(part.numpy() for part in grid), how.opaque_margin_steps, how.max_samples, padded,
@@ -331,7 +335,8 @@ def _scratch_samples(
 def composite(raw: RawOutputs, samples: RaySamples, step_m: float) -> PremultipliedPixels:
     """Premultiplied color and alpha of each ray."""
     rendered = torch.empty(len(samples.counts), 4)
-    numba_rendering.composite(
+    run_threads(
+        numba_rendering.composite,
         raw.numpy(), samples.offsets.numpy(), samples.counts.numpy(), np.float32(step_m),
         rendered.numpy(),
     )  # fmt: skip
@@ -348,7 +353,8 @@ def mean_normals(
 ) -> Float32[Tensor, "rays 3"]:
     """Normals at the samples, in the body frame, composited like colors."""
     mean = torch.empty(len(slots), 3)
-    numba_shading.mean_normals(
+    run_threads(
+        numba_shading.mean_normals,
         raw.numpy(), samples.points.numpy(), samples.offsets.numpy(), samples.counts.numpy(),
         samples.root_rows.numpy(), slots.numpy(), cells.roots.numpy(), np.float32(step_m),
         *(part.numpy() for part in volume), mean.numpy(),
@@ -370,7 +376,8 @@ def update_roots(
     cells: CorrespondenceTables, slot: int, skin: SkinningVolume, bones: Float32[Tensor, "24 12"]
 ) -> None:
     """Moves a slot's roots, in place, to follow its changed pose."""
-    numba_pose.update_roots(
+    run_threads(
+        numba_pose.update_roots,
         cells.packed_cells[slot].numpy(), cells.shape[slot].numpy(), cells.low[slot].numpy(),
         np.float32(cells.cell_m), cells.roots[slot].numpy(),
         *_skinning_arrays(skin), bones.numpy(),

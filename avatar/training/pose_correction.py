@@ -15,12 +15,12 @@ import math
 from collections.abc import Mapping
 from typing import NamedTuple, final
 
-import numba
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
 
 from avatar.kernels import numba_pose
 from avatar.kernels.kernel_compiler import FAST_MATH, compile_kernel
+from avatar.kernels.threads import run_threads
 
 MIN_NEIGHBOR_TRIPLES = 12
 """Frames between two neighbors below which nothing is known about neighbors' errors."""
@@ -270,10 +270,11 @@ class RaySums:
         joints: JointFrames,
     ) -> None:
         """Adds rays by their bones' wrenches at the poses of `joints`, at most `room` of a slot."""
-        numba_pose.add_rays(
+        run_threads(
+            numba_pose.add_rays,
             slots, wrenches, loss, MIN_RAY_LOSS, (PRIOR_SIGMA_RAD, PRIOR_SIGMA_M), room,
             self._parents, *joints, self.counts, self._gradients, self._curvatures,
-            self._moments, self._powers, numba.get_num_threads(),
+            self._moments, self._powers,
         )  # fmt: skip
 
     def equations(self, slot: int) -> NormalEquations:
