@@ -15,7 +15,6 @@ import numba
 import torch
 
 _IN_USE = threading.Lock()
-_MODE = threading.local()
 _TEAMS = dict[tuple[int, int], "_Team"]()
 """Waiting threads, by process and number: a forked process has none of its parent's."""
 
@@ -24,31 +23,27 @@ def run_threads(kernel: Callable[..., Any], *arguments: Any) -> None:
     """Runs `kernel(thread, threads, *arguments)` for each thread, and waits for all.
 
     The kernel releases the GIL. There are `numba.get_num_threads()` threads; while another thread
-    of the program uses them, the shares are run one after the other, with the same result. From its
-    first kernel on, a thread takes numbers below 1e-38 for 0.
+    of the program uses them, the shares are run one after the other, with the same result.
+
+    Kernels take numbers below 1e-38 for 0: sums of them take ten times as long, and Adam's means
+    end there, an eighth of them at a time, where entries of the table have no gradient.
     """
-    _flush_denormals()
     threads = numba.get_num_threads()
-    if threads == 1 or not _IN_USE.acquire(blocking=False):
-        for thread in range(threads):
-            kernel(thread, threads, *arguments)
-        return
+    is_alone = threads == 1 or not _IN_USE.acquire(blocking=False)
+    torch.set_flush_denormal(True)
     try:
+        if is_alone:
+            for thread in range(threads):
+                kernel(thread, threads, *arguments)
+            return
         key = os.getpid(), threads
         if key not in _TEAMS:
             _TEAMS[key] = _Team(threads)
         _TEAMS[key].run(kernel, arguments)
     finally:
-        _IN_USE.release()
-
-
-def _flush_denormals() -> None:
-    """Lets this thread take denormal numbers for 0: a sum of them takes ten times as long.
-
-    The means of Adam end there, an eighth of them at a time, where entries have no gradient.
-    """
-    if not hasattr(_MODE, "flushes"):
-        _MODE.flushes = torch.set_flush_denormal(True)
+        torch.set_flush_denormal(False)
+        if not is_alone:
+            _IN_USE.release()
 
 
 @final
@@ -81,7 +76,7 @@ class _Team:
             raise self._error
 
     def _wait(self, place: int) -> None:
-        _flush_denormals()
+        torch.set_flush_denormal(True)
         while True:
             self._begin[place].acquire()
             try:
