@@ -90,12 +90,16 @@ def _draw_strong(grads, seed, first, faint, rows, drawn):
 
 
 @compile_kernel(**FAST_MATH)
-def _shade_rays(
+def _render_rays(
     first_ray, last_ray, raw, points, sample_offsets, sample_counts, root_rows, slots, roots,
     sample_step_m, skin, skin_low, skin_cells_per_m, world_from_body, light, min_length, least,
-    most, target, needs_normals, normals, lit, neutral,
+    most, target, alpha_weight, hard_weight, needs_normals, neutral, normals, rendered, loss,
+    grad_raw,
 ):  # fmt: skip
-    """Writes the normals and the light's factors of rays, and their pixels without the light."""
+    """Writes normals, shaded rendering and loss of rays, and the gradient of their raw outputs.
+
+    `neutral` is scratch: the pixels without the light.
+    """
     for ray in range(first_ray, last_ray):
         x, y, z = F32(0), F32(0), F32(0)
         if needs_normals:
@@ -109,10 +113,16 @@ def _shade_rays(
                 world_from_body[ray, i, 0] * x + world_from_body[ray, i, 1] * y
                 + world_from_body[ray, i, 2] * z
             )  # fmt: skip
-        lit[ray], _ = light_factor(normals, ray, light, min_length, (least, most))
+        factor, _ = light_factor(normals, ray, light, min_length, (least, most))
         for q in range(3):
-            neutral[ray, q] = target[ray, q] / lit[ray]
+            neutral[ray, q] = target[ray, q] / factor
         neutral[ray, 3] = target[ray, 3]
+        composite_ray_loss(
+            ray, raw, sample_offsets, sample_counts, sample_step_m, neutral, alpha_weight,
+            hard_weight, rendered, loss, grad_raw,
+        )  # fmt: skip
+        for q in range(3):
+            rendered[ray, q] *= factor
 
 
 @compile_kernel(**FAST_MATH)
@@ -185,7 +195,7 @@ def learn(
         longest = max(longest, stop - start)
     features = np.empty((longest + 4, table.shape[1] * cells_per_m.shape[0]), F32)
     drawn = np.empty((longest, 4), F32)
-    lit, neutral = np.empty(ray_count, F32), np.empty((ray_count, 4), F32)
+    neutral = np.empty((ray_count, 4), F32)
     grad_points = np.empty((sample_count if wrenches.shape[0] > 0 else 0, 3), F32)
     passed = 0
     for block in range(kind_count + ray_blocks):
@@ -209,18 +219,12 @@ def learn(
                 block, raw_part, part, pair_weights, weights, max_slope_per_m, grad_part
             )
         else:
-            _shade_rays(
+            _render_rays(
                 ray, last_ray, raw, points, sample_offsets, sample_counts, root_rows, slots,
                 roots, sample_step_m, skin, skin_low, skin_cells_per_m, world_from_body, light,
-                min_length, least, most, target, needs_normals, normals, lit, neutral,
+                min_length, least, most, target, alpha_weight, hard_weight, needs_normals,
+                neutral, normals, rendered, loss, grad_raw,
             )  # fmt: skip
-            for r in range(ray, last_ray):
-                composite_ray_loss(
-                    r, raw, sample_offsets, sample_counts, sample_step_m, neutral, alpha_weight,
-                    hard_weight, rendered, loss, grad_raw,
-                )  # fmt: skip
-                for q in range(3):
-                    rendered[r, q] *= lit[r]
         row_part, feature_part = rows[start:stop], grad_features[start:stop]
         kept, strength = _draw_strong(grad_part, seed, start, faint, row_part, drawn)
         strengths[block], runs[block, 0], runs[block, 1] = strength, start, kept
