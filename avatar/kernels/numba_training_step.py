@@ -189,7 +189,7 @@ def learn(
     ray_count, kind_count = slots.shape[0], weights.shape[0]
     ray_blocks = (ray_count + RAYS_PER_BLOCK - 1) // RAYS_PER_BLOCK
     sample_count = ends[0]
-    total, longest = points.shape[0] + RAY_COST * ray_count, 0
+    total, longest, passed = points.shape[0] + RAY_COST * ray_count, 0, 0
     for block in range(kind_count + ray_blocks):
         start, stop, _ = _block_range(block, kind_count, ends, sample_offsets, sample_count)
         longest = max(longest, stop - start)
@@ -197,11 +197,9 @@ def learn(
     drawn = np.empty((longest, 4), F32)
     neutral = np.empty((ray_count, 4), F32)
     grad_points = np.empty((sample_count if wrenches.shape[0] > 0 else 0, 3), F32)
-    passed = 0
     for block in range(kind_count + ray_blocks):
         start, stop, ray = _block_range(block, kind_count, ends, sample_offsets, sample_count)
-        last_ray = min(ray + RAYS_PER_BLOCK, ray_count)
-        count = stop - start
+        last_ray, count = min(ray + RAYS_PER_BLOCK, ray_count), stop - start
         cost = count if ray < 0 else count + RAY_COST * (last_ray - ray)
         owner = (passed + cost // 2) * threads // max(total, 1)
         passed += cost
