@@ -146,7 +146,10 @@ class FitProcess:
         sent = self._process.stdout.read()
         if self._process.wait() or not isinstance(capture.masks, GivenMasks):
             return fit_capture(capture)  # which says what is wrong
-        fit, capture.masks.refine, self.rig = pickle.loads(sent)
+        try:
+            fit, capture.masks.refine, self.rig = pickle.loads(sent)
+        except (pickle.UnpicklingError, EOFError):  # it was cut off
+            return fit_capture(capture)
         return fit
 
 
@@ -170,6 +173,8 @@ def fitting_beside(inputs: CaptureInputs, size_px: int) -> Iterator[FitProcess]:
 def fit_for_parent() -> None:
     """Fit the recording that standard input describes; write fit and rig to standard output."""
     gc.disable()  # the process is short
+    answer = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for whatever libraries print
     inputs, size_px = pickle.load(sys.stdin.buffer)
     from avatar.rig import Rig
     from preprocess.fitting.capture_fitting import apply_fit, fit_capture
@@ -181,4 +186,5 @@ def fit_for_parent() -> None:
     fit = fit_capture(capture)
     fitted = capture if fit is None else apply_fit(capture, fit, height_m=inputs.height_m)
     found = fit, capture.masks.refine, Rig.from_shaped_body(fitted.shaped)
-    sys.stdout.buffer.write(pickle.dumps(found))
+    with answer:
+        answer.write(pickle.dumps(found))
