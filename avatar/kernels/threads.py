@@ -36,10 +36,9 @@ def run_threads(kernel: Callable[..., Any], *arguments: Any) -> None:
             for thread in range(threads):
                 kernel(thread, threads, *arguments)
             return
-        key = os.getpid(), threads
-        if key not in _TEAMS:
-            _TEAMS[key] = _Team(threads)
-        _TEAMS[key].run(kernel, arguments)
+        team = _TEAMS.pop((os.getpid(), threads), None) or _Team(threads)
+        team.run(kernel, arguments)
+        _TEAMS[os.getpid(), threads] = team  # one that an interrupt left waiting is not used again
     finally:
         torch.set_flush_denormal(False)
         if not is_alone:
@@ -62,16 +61,14 @@ class _Team:
             threading.Thread(target=self._wait, args=(place,), daemon=True).start()
 
     def run(self, kernel: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
-        """Runs the kernel on all threads; an error of any of them is raised after the last."""
+        """Runs the kernel on all threads; an error of another thread is raised after the last."""
         self._work, self._error = (kernel, arguments), None
         for lock in self._begin:
             lock.release()
-        try:
-            kernel(0, self._threads, *arguments)
-        finally:
-            for lock in self._end:
-                lock.acquire()
-            self._work = None
+        kernel(0, self._threads, *arguments)
+        for lock in self._end:
+            lock.acquire()
+        self._work = None
         if self._error is not None:
             raise self._error
 
