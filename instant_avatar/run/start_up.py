@@ -167,7 +167,7 @@ def fitting_beside(inputs: CaptureInputs, size_px: int) -> Iterator[FitProcess]:
                 there.write(pickle.dumps((inputs, size_px)))
             yield FitProcess(process)
         finally:
-            process.kill()
+            process.terminate()
 
 
 def fit_for_parent() -> None:
