@@ -2,12 +2,12 @@
 
 A block of rays, or the points of one prior, passes through the whole step while it is in a core's
 caches: field, light, composite and loss, the draw of the gradients to propagate, and backward
-through the network, to the pulls on the samples and to the wrenches on the bones. Thirty regions,
-each waited for, gave a second core a quarter of its speed.
+through the network, to the gradients of the samples' positions and to the wrenches on the bones.
+Threads wait for one another once.
 
-Threads own runs of blocks of about as many points, and sums of their own, which are added in the
-threads' order: the result is the same in every run with as many threads, and differs by rounding
-between numbers of threads.
+Each thread has a run of blocks, with about as many points as any other's, and its own sums, which
+are added in the threads' order: runs with one number of threads are equal to the bit, and differ by
+rounding from those with another.
 """
 
 import numpy as np
@@ -61,7 +61,7 @@ def _add_prior_gradients(kind, raw, points, pair_weights, weights, max_slope_per
 def _chance(seed, number):
     """A random number in [0, 1): a hash of its number (Wellons' lowbias32) that depends on a seed.
 
-    As good as any for a draw, the same for any number of threads, and nothing to be filled before.
+    It does not depend on the number of threads, and no array of random numbers is filled before.
     """
     x = U32(U32(number) ^ U32(seed))
     x = U32(U32(x ^ (x >> U32(16))) * U32(0x7FEB352D))

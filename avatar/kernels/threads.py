@@ -1,9 +1,9 @@
 """Threads that run a kernel side by side, each on its share of the work.
 
 numba's own parallel regions compile whatever they call once more in three modules, which took a
-third of a machine's first run, and one of its thread pools ends the process where two threads
-enter a region. A kernel that releases the GIL needs neither, and waking a thread takes as long (80
-µs, and 70 µs with OpenMP, where threads sleep in between).
+third of a first run's compilation, and one of its thread pools ends the process if two threads
+enter a region at once. A kernel that releases the GIL needs neither. Waking a thread takes 80 µs,
+as with OpenMP (70 µs), where threads sleep in between.
 """
 
 import os

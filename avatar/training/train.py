@@ -347,7 +347,7 @@ WARM_THREADS = set[int]()
 def warm_up(trainer: Trainer) -> float:
     """Compiles, or loads from disk, every kernel that training and rendering use.
 
-    Must run on the thread that will train; a second time on one thread does nothing. The trainer
+    Runs on the thread that will train; a second time on one thread does nothing. The trainer
     itself is not changed. Returns the seconds that it took: tens on a machine's first run, about
     one later.
     """

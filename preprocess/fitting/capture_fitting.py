@@ -83,8 +83,8 @@ LEAST_ERROR_RAD = math.radians(5.0)
 """Least error of a joint by key points that is assumed: the mean is 3.5 degrees in films of studio
 motions, 10 to 14 in real ones."""
 LEAST_HEAD_ERROR_RAD = math.radians(14.0)
-"""The same of neck and head: key points are off by 2 cm, and a face's lie within 8 cm of the axis
-about which it turns, where those of a limb are 20 to 40 cm away."""
+"""Least error assumed of neck and head: key points are off by 2 cm, and a face's lie within 8 cm of
+the axis about which it turns, where those of a limb are 20 to 40 cm away."""
 HEAD_JOINTS = (12, 15)
 """Neck and head."""
 
