@@ -2,7 +2,8 @@
 
 (report,) = export_avatar(avatar, Path("avatar.iavatar"), views=[(pose, camera)], metrics={})
 
-The checks compare a package's player with its reference and with the volume renderer.
+The checks compare a package's player with its rays, composited by a compiled kernel, and with the
+volume renderer.
 """
 
 import io
@@ -24,6 +25,7 @@ from avatar.render import render
 from avatar.rig import Rig
 from capture.input_error import InputError
 from export.bake.bake_tables import BakeConfig, ExportRefused, bake_tables, sample_field
+from export.bake.compositor import draw_traced
 from export.bake.fine_tuning import (
     THICK_FIELD_PICTURES,
     ExportProgress,
@@ -35,7 +37,7 @@ from export.bake.fine_tuning import (
     is_below_target,
 )
 from export.bake.proxy_surface import FieldFunction
-from export.bake.reference_player import PlayerInputs, draw_reference
+from export.bake.traced_rays import RayTracer
 from export.graph.player_graph import build_graph
 from export.package.manifest import LICENCE_NOTE, MAX_GOLDEN_PX, GoldenFrame, Manifest, TierInfo
 from export.package.package_file import (
@@ -61,8 +63,8 @@ from export.player import (
 from export.player_inputs import fit_camera
 
 GRAPH_CHECK_PICTURES = {"hq": 2, "lite": 1}
-"""Golden frames on which each tier's graph is compared with its reference, 0.2 s each. They test
-the arithmetic of this machine's onnxruntime; further poses would test the same."""
+"""Golden frames on which each tier's graph is compared with its rays composited here. They test the
+arithmetic of this machine's onnxruntime; further poses would test the same."""
 SCORED_VIEWS = {"hq": None, "lite": 1}
 """Views on which each tier is compared with the renderer; None for all."""
 MAX_GOLDEN_FRAMES = 4
@@ -91,7 +93,8 @@ class ExportReport:
         psnr_to_renderer: Mean over the views, dB, by tier.
         fine_tuning_psnr: PSNR to the renderer before and after fine-tuning, dB, on pictures that it
             was not trained on; None without fine-tuning.
-        largest_difference: Between graph and reference, in 1/255.
+        largest_difference: Between the graph and its rays composited by the compiled kernel, in
+            1/255.
     """
 
     path: Path
@@ -332,12 +335,10 @@ def _checked_package(
 ) -> AvatarPackage:
     """Check every tier, its graph unless `difference` is known; add what is missing."""
     manifest = package.manifest
-    checks, scores = dict[str, list[Future[float]]](), dict[str, list[Future[float]]]()
+    checks, scores = dict[str, Future[float]](), dict[str, list[Future[float]]]()
     for tier, (_, player) in players.items():
-        frames = manifest.golden[: GRAPH_CHECK_PICTURES[tier]] if difference is None else ()
-        checks[tier] = [
-            executor.submit(check_graph, player, package, tier, frame) for frame in frames
-        ]
+        if difference is None:
+            checks[tier] = executor.submit(check_graph, player, package, tier)
         scores[tier] = [
             executor.submit(psnr_to_renderer, player, view, truth)
             for view, truth in list(zip(views, exact, strict=True))[: SCORED_VIEWS[tier]]
@@ -349,7 +350,7 @@ def _checked_package(
         tier: replace(
             info,
             psnr_to_renderer=float(np.mean([score.result() for score in scores[tier]])),
-            largest_difference=max((check.result() for check in checks[tier]), default=difference),
+            largest_difference=checks[tier].result() if difference is None else difference,
         )
         for tier, info in manifest.tiers.items()
     }
@@ -432,21 +433,25 @@ CHECK_PX = 256
 """Longer side of the pictures that are compared with the volume renderer, pixels."""
 
 
-def check_graph(player: Player, package: AvatarPackage, tier: str, frame: GoldenFrame) -> float:
-    """Return the largest difference of a tier's graph from its reference on a frame, in 1/255."""
+def check_graph(player: Player, package: AvatarPackage, tier: str) -> float:
+    """Return the largest difference of a tier's graph from its rays composited here, in 1/255."""
     tables, settings = package.tables[tier], package.manifest.tiers[tier].settings
-    camera = frame.camera
-    inputs = PlayerInputs.of(player.bones(frame.pose, camera), camera, settings.samples)
-    drawn = premultiply(player.render(frame.pose, camera))
-    difference = PictureDifference.of(drawn, draw_reference(tables, settings, inputs))
-    if not difference.matches:
-        raise ExportRefused(
-            f"In one view the player's graph ({tier}) is {difference.psnr:.1f} dB from its "
-            f"reference; at least {MIN_SAME_PSNR:.0f} dB are required. Nothing was written; the "
-            "checkpoint is kept. This is a fault of the program: please report it with the version "
-            "of onnxruntime."
+    tracer, largest = RayTracer(tables, settings), 0.0
+    for frame in package.manifest.golden[: GRAPH_CHECK_PICTURES[tier]]:
+        traced = tracer.trace(player.bones(frame.pose, frame.camera), frame.camera)
+        drawn = premultiply(player.render(frame.pose, frame.camera))
+        difference = PictureDifference.of(
+            drawn, draw_traced(traced, tables, settings, frame.camera.size_px)
         )
-    return difference.largest_difference
+        if not difference.matches:
+            raise ExportRefused(
+                f"In one view the player's graph ({tier}) is {difference.psnr:.1f} dB from its "
+                f"rays as they were traced; at least {MIN_SAME_PSNR:.0f} dB are required. Nothing "
+                "was written; the checkpoint is kept. This is a fault of the program: please "
+                "report it with the version of onnxruntime."
+            )
+        largest = max(largest, difference.largest_difference)
+    return largest
 
 
 def psnr_to_renderer(player: Player, view: PosedView, exact: Float32[np.ndarray, "_ _ 3"]) -> float:

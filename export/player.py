@@ -24,6 +24,7 @@ from export.player_inputs import (
     check_render_inputs,
     downscale_camera,
     graph_initializers,
+    graph_inputs,
     resize_camera,
     upscale_picture,
 )
@@ -216,15 +217,8 @@ class Player:
     ) -> UInt8[np.ndarray, "height width 4"]:
         """Run the graph once."""
         width, height = camera.size_px
-        lens = [*camera.focal_px, *camera.center_px]
-        inputs = {
-            "bones": bones.reshape(24, 12),
-            "camera": np.array(lens, dtype=np.float32),
-            "height": np.array(height, dtype=np.int64),
-            "width": np.array(width, dtype=np.int64),
-            "samples": np.array(samples, dtype=np.int64),
-        }
         try:
+            inputs = graph_inputs(bones, camera, samples)
             packed = np.asarray(self._session.run(["rgba"], inputs)[0])
         except Exception as error:  # onnxruntime has no common class for what a graph can do
             raise InputError(

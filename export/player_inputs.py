@@ -208,6 +208,19 @@ BAND_ROWS = 64
 """Rows that are enlarged at a time."""
 
 
+def graph_inputs(
+    bones: Float32[np.ndarray, "24 3 4"], camera: Camera, samples: int
+) -> dict[str, Shaped[np.ndarray, "..."]]:
+    """Return the inputs of a graph by name, for camera-from-canonical matrices."""
+    width, height = camera.size_px
+    sizes = {"height": height, "width": width, "samples": samples}
+    return {
+        "bones": bones.reshape(24, 12),
+        "camera": np.array([*camera.focal_px, *camera.center_px], dtype=np.float32),
+        **{name: np.array(size, dtype=np.int64) for name, size in sizes.items()},
+    }
+
+
 def resize_camera(camera: Camera, size: int | np.integer | tuple[int, int] | None) -> Camera:
     """Return the camera, its field of view kept, for a longer side or (width, height) in pixels."""
     if size is None:

@@ -6,8 +6,14 @@ import numpy as np
 from jaxtyping import Float32
 
 from avatar.kernels.kernel_compiler import NO_ALLOCATION, compile_kernel
-from export.bake.reference_geometry import RaySegments
-from export.package.player_tables import BRICK_SIZE, LOG_DENSITY_RANGE, BrickTable, RenderSettings
+from export.bake.traced_rays import RaySegments, TracedPicture, filter_specks
+from export.package.player_tables import (
+    BRICK_SIZE,
+    LOG_DENSITY_RANGE,
+    BrickTable,
+    PlayerTables,
+    RenderSettings,
+)
 
 F32 = np.float32
 VOXELS_PER_BRICK = BRICK_SIZE**3
@@ -76,6 +82,16 @@ def composite_segments(
     out = np.zeros((segments.num_rays, 4), dtype=np.float32)
     _run_kernel(segments, settings, bricks, codes, out, out, None)
     return out
+
+
+def draw_traced(
+    traced: TracedPicture, tables: PlayerTables, settings: RenderSettings, size_px: tuple[int, int]
+) -> Float32[np.ndarray, "height width 4"]:
+    """Draw a picture by its rays: premultiplied color and alpha in [0, 1]."""
+    picture = np.zeros((size_px[0] * size_px[1], 4), dtype=np.float32)
+    codes = VoxelCodes.of(tables.bricks)
+    picture[traced.pixel] = composite_segments(traced.segments, settings, tables.bricks, codes)
+    return filter_specks(picture.reshape(*size_px[::-1], 4), traced)
 
 
 def back_project(

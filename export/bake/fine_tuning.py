@@ -9,6 +9,7 @@ Voxels that hardly show then share codes (`voxel_cells`), and the shared codes a
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float32, Int64
@@ -17,8 +18,7 @@ from scipy.spatial.transform import Rotation
 from avatar.rig import Rig
 from capture.camera import Camera
 from export.bake.compositor import SirtUpdate, VoxelCodes, back_project, composite_segments
-from export.bake.reference_geometry import RaySegments
-from export.bake.reference_player import PlayerInputs, TracedPicture, trace_picture
+from export.bake.traced_rays import RaySegments, RayTracer, TracedPicture
 from export.bake.voxel_cells import (
     VoxelCells,
     brick_chunks,
@@ -141,11 +141,15 @@ class FineTuningInputs:
     views: Sequence[PosedView]
     executor: Executor
 
+    @cached_property
+    def _tracers(self) -> dict[str, RayTracer]:
+        made = self.executor.map(lambda each: RayTracer(self.tables, each), self.settings.values())
+        return dict(zip(self.settings, made, strict=True))
+
     def draw_targets(
         self,
-        codes: VoxelCodes,
         views: Sequence[PosedView],
-        tiers: Sequence[RenderSettings],
+        tiers: Sequence[str],
         on_picture: Callable[[], None] = lambda: None,
     ) -> list[RenderTargets]:
         """Draw views with the renderer while the player's rays are traced beside it, for each tier.
@@ -154,8 +158,9 @@ class FineTuningInputs:
         called after each picture.
         """
         drawn = [list[tuple[TracedPicture, RgbaPicture]]() for _ in tiers]
+        tracers = [self._tracers[tier] for tier in tiers]
         traces = (
-            [self.executor.submit(self._trace, codes, settings, *view) for settings in tiers]
+            [self.executor.submit(self._trace, tracer, *view) for tracer in tracers]
             for view in views
         )
         ahead = next(traces, [])
@@ -174,13 +179,10 @@ class FineTuningInputs:
             on_picture()
         return [_join_targets(parts) for parts in drawn]
 
-    def _trace(
-        self, codes: VoxelCodes, settings: RenderSettings, pose: BodyPose, camera: Camera
-    ) -> TracedPicture:
+    def _trace(self, tracer: RayTracer, pose: BodyPose, camera: Camera) -> TracedPicture:
         camera_from_body = camera.camera_from_world @ self.rig.world_from_body(pose)
         bones = camera_from_body @ self.rig.body_from_canonical(pose.joint_rotations)
-        inputs = PlayerInputs.of(bones[:, :3].astype(np.float32), camera, settings.samples)
-        return trace_picture(self.tables, codes, settings, inputs)
+        return tracer.trace(bones[:, :3].astype(np.float32), camera)
 
     def perturbed_views(
         self, count: int, pose_noise_rad: float, generator: np.random.Generator, longest_px: int
@@ -230,7 +232,7 @@ def is_below_target(inputs: FineTuningInputs) -> bool:
         PROBE_PICTURES, POSE_NOISE_RAD, np.random.default_rng(1), VALIDATION_PX
     )
     settings, codes = inputs.settings["hq"], VoxelCodes.of(inputs.tables.bricks)
-    (targets,) = inputs.draw_targets(codes, near, [settings])
+    (targets,) = inputs.draw_targets(near, ["hq"])
     return targets.psnr(inputs.tables, settings, codes) < TARGET_DB
 
 
@@ -249,14 +251,15 @@ def fine_tune(
         (pose, fit_camera(camera, VALIDATION_PX, max_upscale=MAX_UPSCALE))
         for pose, camera in inputs.views
     ]
-    tiers = list(inputs.settings.values())
     total = len(training) + len(asked) + len(novel) + FREE_ROUNDS + SHARED_ROUNDS
     steps = iter(range(1, total + 1))
     codes = VoxelCodes.of(tables.bricks)
 
     def drawn(views: list[PosedView]) -> list[tuple[RenderTargets, RenderSettings]]:
-        targets = inputs.draw_targets(codes, views, tiers, lambda: progress(next(steps) / total))
-        return list(zip(targets, tiers, strict=True))
+        targets = inputs.draw_targets(
+            views, list(inputs.settings), lambda: progress(next(steps) / total)
+        )
+        return list(zip(targets, inputs.settings.values(), strict=True))
 
     judges, learnt = drawn(asked + novel), drawn(training)
 

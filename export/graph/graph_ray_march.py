@@ -158,18 +158,23 @@ class BlockValues:
         end: End of the block along the ray, metres.
         transmittance: Transmittance of the ray after the block.
         color: Premultiplied color that the block adds.
+        path: Where the samples lie (7 × rays): begin and step from one to the next in voxels of the
+            brick grid, and that step in metres.
     """
 
     end: GraphValue
     end_canonical: GraphValue
     transmittance: GraphValue
     color: GraphValue
+    path: list[GraphValue]
 
 
 def march_segments(
     context: GraphContext, posed: GraphValue, segment: SegmentValues, close_up: GraphValue
-) -> tuple[GraphValue, GraphValue]:
+) -> tuple[GraphValue, GraphValue, list[GraphValue]]:
     """Composite rays front to back; return premultiplied color and transmittance, in [0, 1].
+
+    With `context.traces` also the ray of each block, and the blocks' paths.
 
     After each block of samples, rays that have ended are dropped; a Newton step moves the others
     back onto their camera rays and updates their directions. The last block takes the rest of a
@@ -186,10 +191,17 @@ def march_segments(
         context, segment, segment.begin * 0.0 + 1.0, settings.block_samples, usual * shortened
     )
     number = graph.range(graph.size(segment.begin).cast(np.int32))
-    start = [block.transmittance, block.color, *_unfinished_rays(context, number, segment, block)]
+    traced = [number, graph.concatenate(block.path)] if context.traces else []
+    start = [
+        block.transmittance,
+        block.color,
+        *traced,
+        *_unfinished_rays(context, number, segment, block),
+    ]
 
     def once(turn: GraphValue, state: list[GraphValue]) -> tuple[GraphValue, list[GraphValue]]:
-        light, color, number, before, *values = state
+        light, color, *taken, number, before = state[: len(traced) + 4]
+        values = state[len(traced) + 4 :]
         segment = _newton_step(context, posed, _unpack_segment(values))
         doublings = (turn + 2 - steady).maximum(0).cast(np.float32)
         last = turn > blocks - 3
@@ -198,11 +210,14 @@ def march_segments(
         block = composite_samples(context, segment, before, settings.block_samples, longest)
         light = light.scatter(number, block.transmittance)
         color = color.scatter(number.repeat_rows(3), block.color, reduction="add", axis=1)
+        if taken:
+            path = graph.concatenate([taken[1], graph.concatenate(block.path)], axis=1)
+            taken = [graph.concatenate([taken[0], number]), path]
         left = _unfinished_rays(context, number, segment, block)
-        return graph.size(left[0]) > 0, [light, color, *left]
+        return graph.size(left[0]) > 0, [light, color, *taken, *left]
 
-    light, color = graph.loop_while(blocks - 1, start, once)[:2]
-    return color, light
+    light, color, *rest = graph.loop_while(blocks - 1, start, once)
+    return color, light, rest[: len(traced)]
 
 
 def compression_scale(context: GraphContext, direction: GraphValue) -> GraphValue:
@@ -270,6 +285,7 @@ def composite_samples(
         end_canonical=segment.start_canonical + segment.direction_canonical * way,
         transmittance=passed,
         color=seen * weight,
+        path=[start, slope, step.reshape(1, -1)],
     )
 
 

@@ -47,6 +47,7 @@ class DepthLayer:
         doubtful: Whether the surfel is folded (its Jacobian is not inverted), compressed (in a
             close-up a metre along the ray crosses more than `MAX_TRUSTED_COMPRESSION` metres of
             canonical space) or seen from behind.
+        blocks: With `GraphContext.traces` the ray of each block of samples, and their paths.
     """
 
     ray: GraphValue
@@ -58,6 +59,7 @@ class DepthLayer:
     enter: GraphValue
     end: GraphValue
     doubtful: GraphValue
+    blocks: list[GraphValue]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -118,9 +120,9 @@ def trace_depth_layer(
         start_canonical=start, direction_canonical=direction,
     )  # fmt: skip
     if front is not None or context.settings.max_blocks == 1:
-        color, light = _composite_in_one_block(context, segment)
+        color, light, blocks = _composite_in_one_block(context, segment)
     else:
-        color, light = march_segments(context, surface.posed, segment, surface.close_up)
+        color, light, blocks = march_segments(context, surface.posed, segment, surface.close_up)
     return DepthLayer(
         ray=ray,
         surfel=surfel,
@@ -131,18 +133,25 @@ def trace_depth_layer(
         enter=enter,
         end=end,
         doubtful=trusted.logical_not() | (dot(normal, direction) > 0.0),
+        blocks=blocks,
     )
 
 
 def _composite_in_one_block(
     context: GraphContext, segment: SegmentValues
-) -> tuple[GraphValue, GraphValue]:
-    """Composite segments in one block; return premultiplied color and transmittance."""
+) -> tuple[GraphValue, GraphValue, list[GraphValue]]:
+    """Composite segments in one block; as `march_segments`."""
     settings, ones = context.settings, segment.begin * 0.0 + 1.0
     block = composite_samples(
         context, segment, ones, settings.further_layer_samples, settings.max_segment_m
     )
-    return block.color, block.transmittance
+    graph = context.graph
+    blocks = (
+        [graph.range(graph.size(segment.begin).cast(np.int32)), graph.concatenate(block.path)]
+        if context.traces
+        else []
+    )
+    return block.color, block.transmittance, blocks
 
 
 def _segment_bounds(
@@ -220,7 +229,7 @@ def filter_specks(
     or shows it from behind (`DepthLayer`): there a ray sees the surfel's own color or a wrong place
     of the cloth. A speck is a pixel whose ray passed the first layer, which should have stopped it:
     it lies inside of the avatar and differs from what is about it. Both are smaller than a
-    footprint. The reference is `export.bake.reference_player.filter_specks`. Covered pixels have a
+    footprint. `export.bake.traced_rays.filter_specks` says the same in numpy. Covered pixels have a
     z-buffer `cell` each, and `channels` premultiplied color and alpha.
     """
     graph, window = context.graph, splats.window

@@ -35,6 +35,7 @@ class GraphContext:
         tables: Their sizes and scales become constants.
         table_values: Values of `export.player_inputs.graph_initializers`, by name.
         samples: Density samples along `RenderSettings.sample_span_m`, int64 scalar.
+        traces: Whether the graph tells where rays sample the bricks, instead of a picture.
     """
 
     graph: GraphBuilder
@@ -43,6 +44,7 @@ class GraphContext:
     settings: RenderSettings
     camera: CameraValues
     samples: GraphValue
+    traces: bool = False
 
 
 # Vectors are values of three rows, x, y and z, and a column a point.

@@ -27,6 +27,19 @@ from export.graph.onnx_builder import GraphBuilder, GraphValue
 from export.package.player_tables import MIN_FOOTPRINT_PX, PlayerTables, RenderSettings
 from export.player_inputs import graph_initializers
 
+TRACE_OUTPUTS = ["pixel", "doubtful", "passed", "footprint_px", "ray", "layer", "path"]
+"""Outputs of `build_trace_graph`: covered pixels of the picture in ascending order; whether each is
+doubtful, and whether light passes its first layer; the edge of a footprint; and of each block of
+samples the ray, counted as pixels are, the layer from 0, and the path (`BlockValues`)."""
+
+
+def build_trace_graph(tables: PlayerTables, settings: RenderSettings) -> onnx.ModelProto:
+    """Build the graph that tells where the player's rays sample `tables`, each to its end.
+
+    Inputs and tables as of `build_graph`; outputs `TRACE_OUTPUTS`.
+    """
+    return _build(tables, replace(settings, min_transmittance=-1.0), traces=True)
+
 
 def build_graph(tables: PlayerTables, settings: RenderSettings) -> onnx.ModelProto:
     """Build the graph that draws `tables`.
@@ -36,6 +49,10 @@ def build_graph(tables: PlayerTables, settings: RenderSettings) -> onnx.ModelPro
     (height × width), int32: red, green, blue and straight alpha, one byte each, red the lowest.
     Its tables are external, named as in `graph_initializers`.
     """
+    return _build(tables, settings, traces=False)
+
+
+def _build(tables: PlayerTables, settings: RenderSettings, *, traces: bool) -> onnx.ModelProto:
     graph = GraphBuilder()
     context = GraphContext(
         graph=graph,
@@ -47,13 +64,14 @@ def build_graph(tables: PlayerTables, settings: RenderSettings) -> onnx.ModelPro
         settings=settings,
         camera=_camera_inputs(graph),
         samples=graph.input("samples", np.int64, []),
+        traces=traces,
     )
-    graph.output(_draw_picture(context), "rgba", ["pixels"])
+    _draw_picture(context)
     return graph.model()
 
 
-def _draw_picture(context: GraphContext) -> GraphValue:
-    """Splat, trace all layers, filter specks, pack."""
+def _draw_picture(context: GraphContext) -> None:
+    """Splat and trace all layers; filter specks and pack, or tell where the rays were."""
     graph = context.graph
     posed = pose_nodes(context)
     surfels = pose_surfels(context, posed)
@@ -66,12 +84,17 @@ def _draw_picture(context: GraphContext) -> GraphValue:
     pixel = graph.range((window.width * window.height).cast(np.int32)).compress(covered)
     ray = pixel_rays(context.camera, window, pixel)
     first = trace_depth_layer(context, surface, keys.gather(pixel), ray, None)
-    color, light = first.color, first.transmittance
-    if context.settings.layers > 1:
-        color, light = _add_further_layers(context, surface, splats, pixel, first)
+    color, light, blocks = _add_further_layers(context, surface, splats, pixel, first)
+    if context.traces:
+        passed = first.transmittance > context.settings.layer_min_transmittance
+        covered = _picture_pixels(context, window, pixel)
+        parts = [covered, first.doubtful, passed, splats.footprint_px, *blocks]
+        for value, name in zip(parts, TRACE_OUTPUTS, strict=True):
+            graph.output(value, name, {"footprint_px": [], "path": [7, "blocks"]}.get(name, ["_"]))
+        return
     channels = graph.concatenate([color, (1.0 - light).reshape(1, -1)])
     channels = filter_specks(context, splats, _window_cells(window, pixel), first, channels)
-    return _pack_rgba(context, window, pixel, channels)
+    graph.output(_pack_rgba(context, window, pixel, channels), "rgba", ["pixels"])
 
 
 def _camera_inputs(graph: GraphBuilder) -> CameraValues:
@@ -92,11 +115,15 @@ def _add_further_layers(
     splats: SurfelSplats,
     pixel: GraphValue,
     first: DepthLayer,
-) -> tuple[GraphValue, GraphValue]:
-    """Return color and transmittance after all layers, one column a ray of the first."""
+) -> tuple[GraphValue, GraphValue, list[GraphValue]]:
+    """Return color and transmittance after all layers, one column a ray of the first.
+
+    With `context.traces` also the ray, the layer and the path of all blocks of samples.
+    """
     graph, window, hidden = context.graph, splats.window, None
     color, light, before = first.color, first.transmittance, first
     number = graph.range(graph.size(pixel).cast(np.int32))
+    traced = [first.blocks]
     for _ in range(1, context.settings.layers):
         wanted = before.transmittance > context.settings.layer_min_transmittance
         kept = graph.range(graph.size(number).cast(np.int32)).compress(wanted)
@@ -121,13 +148,20 @@ def _add_further_layers(
             enter=before.enter,
             end=before.end.gather(kept),
             doubtful=before.doubtful,
+            blocks=[],
         )
         layer = trace_depth_layer(context, surface, keys, seen_from.ray, seen_from)
         added = layer.color * seen_from.transmittance
         color = color.scatter(number.repeat_rows(3), added, reduction="add", axis=1)
         before = replace(layer, transmittance=seen_from.transmittance * layer.transmittance)
         light = light.scatter(number, before.transmittance)
-    return color, light
+        traced.append([number.gather(layer.blocks[0]), layer.blocks[1]] if layer.blocks else [])
+    if not context.traces:
+        return color, light, []
+    layers = [rays * 0 + layer for layer, (rays, _) in enumerate(traced)]
+    rays, paths = zip(*traced, strict=True)
+    blocks = [graph.concatenate(rays), graph.concatenate(layers)]
+    return color, light, [*blocks, graph.concatenate(paths, axis=1)]
 
 
 def _window_cells(window: SplatWindow, pixel: GraphValue) -> GraphValue:
@@ -151,9 +185,13 @@ def _pack_rgba(
     )
     alpha = graph.where(alpha > 127, alpha - 256, alpha)  # the highest byte has the sign bit
     packed = red + green * (1 << 8) + blue * (1 << 16) + alpha * (1 << 24)
+    empty = graph.full(graph.shape(view.height * view.width), np.int32(0))
+    return empty.scatter(_picture_pixels(context, window, pixel), packed)
+
+
+def _picture_pixels(context: GraphContext, window: SplatWindow, pixel: GraphValue) -> GraphValue:
+    """Return the picture's numbers of pixels of the window."""
     width = window.width.cast(np.int32)
     row = pixel // width
     column = pixel - row * width + window.left.cast(np.int32)
-    place = (row + window.top.cast(np.int32)) * view.width.cast(np.int32) + column
-    empty = graph.full(graph.shape(view.height * view.width), np.int32(0))
-    return empty.scatter(place, packed)
+    return (row + window.top.cast(np.int32)) * context.camera.width.cast(np.int32) + column

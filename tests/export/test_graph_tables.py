@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from baselines.reference_skinning import PosedNodes, skin_trilinear
 from capture.input_error import InputError
-from export.bake.skinning_kernels import PosedNodes, skin_trilinear
 from export.package.player_tables import RenderSettings, round_codes
 from export.player_inputs import skinning_nodes, subdivided_skinning_nodes
 

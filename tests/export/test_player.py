@@ -10,18 +10,18 @@ import pytest
 from scipy import ndimage
 
 from avatar.evaluation.image_metrics import psnr
-from capture.camera import Camera
-from capture.input_error import InputError
-from export.bake import reference_player
-from export.bake.compositor import VoxelCodes, composite_segments
-from export.bake.reference_geometry import RaySegments
-from export.bake.reference_player import PlayerInputs, draw_reference
-from export.bake.skinning_kernels import (
+from baselines.reference_player import PlayerInputs, draw_reference, trace_picture
+from baselines.reference_skinning import (
     PosedNodes,
     invert_matrices,
     skin_tetrahedral,
     skin_trilinear,
 )
+from capture.camera import Camera
+from capture.input_error import InputError
+from export.bake import compositor
+from export.bake.compositor import VoxelCodes, composite_segments
+from export.bake.traced_rays import RaySegments, RayTracer
 from export.graph.player_graph import build_graph
 from export.package.package_file import COARSE_GRAPH, read_package
 from export.package.player_tables import QUALITY_TIERS, RenderSettings
@@ -51,17 +51,39 @@ def test_the_graph_draws_what_the_reference_draws(
     pose = stand_in.canonical if posed == "canonical" else bent
     view = camera(*size, distance_m=distance_m)
     settings = player.manifest.tiers[tier].settings
-    inputs = PlayerInputs(
-        bones=player.bones(pose, view),
-        focal=np.array(view.focal_px, np.float32),
-        center=np.array(view.center_px, np.float32),
-        size_px=size,
-        samples=5,
-    )
+    inputs = PlayerInputs.of(player.bones(pose, view), view, 5)
     drawn = premultiply(player.render(pose, view, samples=5))
     difference = PictureDifference.of(drawn, draw_reference(tables, settings, inputs))
     assert drawn[..., 3].mean() > 0.05
     assert difference.matches, difference
+
+
+@pytest.mark.parametrize("tier", ["hq", "lite"])
+def test_the_graph_traces_the_rays_that_the_reference_traces(player, tables, bent, camera, tier):
+    view, settings = camera(131, 77, distance_m=1.2), QUALITY_TIERS[tier]
+    inputs = PlayerInputs.of(player.bones(bent, view), view, settings.samples)
+    traced = RayTracer(tables, settings).trace(inputs.bones, view)
+    expected = trace_picture(tables, VoxelCodes.of(tables.bricks), settings, inputs)
+    np.testing.assert_array_equal(traced.pixel, expected.pixel)
+    assert traced.footprint_px == expected.footprint_px
+    assert (traced.doubtful == expected.doubtful).mean() > 0.99
+    assert (traced.passed == expected.passed).mean() > 0.99
+    ours, theirs = traced.segments, expected.segments
+    lengths = np.diff(ours.ray_offsets), np.diff(theirs.ray_offsets)
+    assert (lengths[0] == lengths[1]).mean() > 0.98
+    same = (
+        np.repeat(lengths[0] == lengths[1], lengths[0]),
+        np.repeat(lengths[0] == lengths[1], lengths[1]),
+    )
+    for name, atol in (
+        ("layer", 0),
+        ("count", 0),
+        ("step_m", 1e-4),
+        ("start", 0.1),
+        ("slope", 0.02),
+    ):
+        apart = getattr(ours, name)[same[0]] - getattr(theirs, name)[same[1]]
+        assert (np.abs(apart) <= atol).mean() > 0.98, name
 
 
 @pytest.mark.parametrize("tier", ["hq", "lite"])
@@ -92,16 +114,10 @@ def test_folded_skin_is_filtered_as_in_the_reference(exported, tables, camera, t
     view = replace(camera(96, 96), focal_px=(800.0, 800.0), center_px=(98.0, 184.0))
     player = Player.load(exported.path, tier=tier)
     settings = player.manifest.tiers[tier].settings
-    inputs = PlayerInputs(
-        bones=player.bones(pose, view),
-        focal=np.array(view.focal_px, np.float32),
-        center=np.array(view.center_px, np.float32),
-        size_px=view.size_px,
-        samples=settings.samples,
-    )
+    inputs = PlayerInputs.of(player.bones(pose, view), view, settings.samples)
     drawn = premultiply(player.render(pose, view))
     assert PictureDifference.of(drawn, draw_reference(tables, settings, inputs)).matches
-    monkeypatch.setattr(reference_player, "filter_specks", lambda picture, traced: picture)
+    monkeypatch.setattr(compositor, "filter_specks", lambda picture, traced: picture)
     before = draw_reference(tables, settings, inputs)
     assert PictureDifference.of(drawn, before).close_fraction < 0.99
 
@@ -166,13 +182,7 @@ def test_any_number_of_layers_is_drawn_as_in_the_reference(
         )
     )
     view = camera(131, 120, distance_m=1.6)
-    inputs = PlayerInputs(
-        bones=player.bones(bent, view),
-        focal=np.array(view.focal_px, np.float32),
-        center=np.array(view.center_px, np.float32),
-        size_px=(131, 120),
-        samples=settings.samples,
-    )
+    inputs = PlayerInputs.of(player.bones(bent, view), view, settings.samples)
     drawn = premultiply(player.render(bent, view))
     assert PictureDifference.of(drawn, draw_reference(tables, settings, inputs)).matches
 

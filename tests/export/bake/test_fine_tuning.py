@@ -4,6 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from baselines.reference_player import PlayerInputs, draw_reference
 from export import build
 from export.bake.bake_tables import (
     BRICK_BYTES,
@@ -15,7 +16,7 @@ from export.bake.bake_tables import (
 )
 from export.bake.compositor import VoxelCodes, back_project, composite_segments
 from export.bake.fine_tuning import FineTuningInputs, fine_tune
-from export.bake.reference_player import PlayerInputs, draw_reference, trace_picture
+from export.bake.traced_rays import RayTracer
 from export.build import export_field
 from export.package.package_file import read_package
 from export.package.player_tables import QUALITY_TIERS, THICK_FIELD_TIERS
@@ -26,13 +27,7 @@ SETTINGS = QUALITY_TIERS["hq"]
 def inputs_of(rig, pose, camera) -> PlayerInputs:
     bones = camera.camera_from_world @ rig.world_from_body(pose)
     bones = bones @ rig.body_from_canonical(pose.joint_rotations)
-    return PlayerInputs(
-        bones=bones[:, :3].astype(np.float32),
-        focal=np.array(camera.focal_px, dtype=np.float32),
-        center=np.array(camera.center_px, dtype=np.float32),
-        size_px=camera.size_px,
-        samples=SETTINGS.samples,
-    )
+    return PlayerInputs.of(bones[:, :3].astype(np.float32), camera, SETTINGS.samples)
 
 
 @pytest.fixture(scope="module")
@@ -49,9 +44,9 @@ def codes(tables):
 
 
 @pytest.fixture(scope="module")
-def segments(stand_in, tables, codes, views):
+def segments(stand_in, tables, views):
     inputs = inputs_of(stand_in.rig, *views["bent"])
-    return trace_picture(tables, codes, SETTINGS, inputs).segments
+    return RayTracer(tables, SETTINGS).trace(inputs.bones, views["bent"][1]).segments
 
 
 @pytest.fixture(scope="module")
@@ -217,7 +212,7 @@ def test_the_fine_tuned_package_has_the_graphs_that_were_checked_as_baked(export
     monkeypatch.setattr(build, "check_graph", lambda *given: checked.append(0) or check(*given))
     first, tuned = exported(baked_first=True)
     assert tuned.fine_tuning_psnr is not None
-    assert len(checked) == sum(build.GRAPH_CHECK_PICTURES.values())  # each once
+    assert len(checked) == len(QUALITY_TIERS)  # each once
     assert tuned.largest_difference == first.largest_difference
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from baselines.reference_geometry import SurfelFootprints, fill_holes, z_buffer
 from export.bake import voxel_cells
 from export.bake.compositor import SirtUpdate, VoxelCodes
 from export.bake.proxy_surface import (
@@ -15,7 +16,6 @@ from export.bake.proxy_surface import (
     dilate_colors,
     extract_proxy_surface,
 )
-from export.bake.reference_geometry import SurfelFootprints, fill_holes, z_buffer
 from export.bake.voxel_cells import (
     brick_chunks,
     choose_cells,

@@ -186,14 +186,14 @@ def test_a_player_that_differs_from_the_renderer_is_written_with_a_warning(expor
     assert read_package(report.path).manifest.metrics["warnings"] == [warning]
 
 
-def test_a_graph_that_differs_from_its_reference_is_refused(export, tmp_path, monkeypatch):
+def test_a_graph_that_differs_from_its_rays_is_refused(export, tmp_path, monkeypatch):
     right = build.build_graph
     monkeypatch.setattr(
         build,
         "build_graph",
         lambda tables, settings: right(tables, replace(settings, max_segment_m=0.01)),
     )
-    with pytest.raises(ExportRefused, match="dB from its reference"):
+    with pytest.raises(ExportRefused, match="dB from its rays"):
         export()
     assert list(tmp_path.iterdir()) == []
 

@@ -4,42 +4,42 @@
     colors = composite_segments(traced.segments, settings, tables.bricks, codes)
 
 It is written from the tables and the settings alone, with arrays of vectors, and shares no code
-with the graph.
+with the graph; its rays are composited as those that the graph traces are.
 """
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
-from capture.camera import Camera
-from export.bake.compositor import VoxelCodes, composite_segments
-from export.bake.reference_geometry import (
+from baselines.reference_geometry import (
     EMPTY_PIXEL_KEY,
     CanonicalRays,
-    RaySegments,
     SurfelFootprints,
+    append_layer,
     compression_factor,
     fill_holes,
+    first_layer_segments,
+    further_layer_segments,
     invert_jacobians,
     surfel_of_key,
     z_buffer,
 )
-from export.bake.skinning_kernels import (
+from baselines.reference_skinning import (
     MIN_VOLUME,
     PosedNodes,
     invert_matrices,
     skin_tetrahedral,
     skin_trilinear,
 )
+from capture.camera import Camera
+from export.bake.compositor import VoxelCodes, composite_segments, draw_traced
+from export.bake.traced_rays import TracedPicture
 from export.package.player_tables import (
     DEPTH_CODES,
     HOLE_SPACINGS,
-    MAX_MEDIAN_DIFFERENCE,
     MAX_TRUSTED_COMPRESSION,
     MIN_FOOTPRINT_PX,
-    MIN_MEDIAN_ALPHA,
     SURFEL_BITS,
     PlayerTables,
     RenderSettings,
@@ -75,23 +75,6 @@ class PlayerInputs:
             size_px=camera.size_px,
             samples=samples,
         )
-
-
-class TracedPicture(NamedTuple):
-    """Covered pixels of a picture, and where their rays sample the bricks.
-
-    Attributes:
-        pixel: Numbers of the covered pixels, ascending.
-        doubtful: Whether the surfel that the pixel sees is folded, compressed along the ray or seen
-            from behind.
-        passed: Whether light passes the first layer, so that others are looked for.
-    """
-
-    pixel: Int64[np.ndarray, "pixels"]
-    segments: RaySegments
-    doubtful: Bool[np.ndarray, "pixels"]
-    passed: Bool[np.ndarray, "pixels"]
-    footprint_px: int
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -135,34 +118,8 @@ def draw_reference(
     tables: PlayerTables, settings: RenderSettings, inputs: PlayerInputs
 ) -> Float32[np.ndarray, "height width 4"]:
     """Return premultiplied color and alpha in [0, 1]."""
-    width, height = inputs.size_px
-    codes = VoxelCodes.of(tables.bricks)
-    traced = trace_picture(tables, codes, settings, inputs)
-    picture = np.zeros((width * height, 4), dtype=np.float32)
-    picture[traced.pixel] = composite_segments(traced.segments, settings, tables.bricks, codes)
-    return filter_specks(picture.reshape(height, width, 4), traced)
-
-
-def filter_specks(
-    picture: Float32[np.ndarray, "height width 4"], traced: TracedPicture
-) -> Float32[np.ndarray, "height width 4"]:
-    """Take the median of nine pixels, half a footprint apart, where the picture is unreliable.
-
-    It replaces doubtful pixels, and those inside of the avatar whose ray passed the first layer and
-    that differ from it: specks where sheets of skin cross.
-    """
-    half = traced.footprint_px // 2
-    filtered, pixel = picture.reshape(-1, 4).copy(), traced.pixel
-    bordered = np.pad(picture, ((half, half), (half, half), (0, 0)))
-    row, column = np.divmod(pixel, picture.shape[1])
-    steps = [(i * half, j * half) for i in range(3) for j in range(3)]
-    median = np.median([bordered[row + i, column + j] for i, j in steps], axis=0)
-    inside = median[:, 3] > MIN_MEDIAN_ALPHA
-    differs = np.abs(median - filtered[pixel]).max(axis=1) > MAX_MEDIAN_DIFFERENCE
-    speck = traced.passed & inside & differs & (traced.footprint_px >= MIN_FOOTPRINT_PX)
-    chosen = traced.doubtful | speck
-    filtered[pixel[chosen]] = median[chosen]
-    return filtered.reshape(picture.shape)
+    traced = trace_picture(tables, VoxelCodes.of(tables.bricks), settings, inputs)
+    return draw_traced(traced, tables, settings, inputs.size_px)
 
 
 def trace_picture(
@@ -187,7 +144,7 @@ def trace_picture(
         uniform_blocks=settings.uniform_blocks + close_up,
         max_blocks=settings.max_blocks + close_up,
     )
-    segments = RaySegments.of_first_layer(rays, posed.nodes, tables.bricks, blocks, inputs.samples)
+    segments = first_layer_segments(rays, posed.nodes, tables.bricks, blocks, inputs.samples)
     alpha = composite_segments(segments, settings, tables.bricks, codes)[:, 3]
     front = _FrontLayer(
         transmittance=1.0 - alpha, depth=depth, end=rays.end.copy(), surfel=surfel_of_key(key)
@@ -202,14 +159,14 @@ def trace_picture(
         rays, depth, _ = _ray_entries(
             tables, settings, inputs, posed, covered[alive], key[alive], front.of(alive), close_up
         )
-        behind = RaySegments.of_further_layer(
+        behind = further_layer_segments(
             rays, alive, len(covered), tables.bricks, (settings.further_layer_samples, layer)
         )
         alpha = composite_segments(behind, settings, tables.bricks, codes)[:, 3]
         front.transmittance *= 1.0 - alpha
         front.depth[alive], front.end[alive] = depth, rays.end
         front.surfel[alive] = surfel_of_key(key[alive])
-        segments = segments.append_layer(behind)
+        segments = append_layer(segments, behind)
     return TracedPicture(covered, segments, doubtful, passed, splats.side)
 
 

@@ -1,13 +1,13 @@
 """Geometry of the reference player in numpy: posed skinning nodes, z-buffer, ray segments."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int32, Int64
+from jaxtyping import Bool, Float32, Int64
 
-from export.bake.skinning_kernels import PosedNodes, invert_matrices, skin_trilinear
+from baselines.reference_skinning import PosedNodes, invert_matrices, skin_trilinear
+from export.bake.traced_rays import RaySegments
 from export.package.player_tables import (
     DEPTH_CODES,
     HOLE_SPACINGS,
@@ -70,120 +70,78 @@ def newton_correction(
     return rays._replace(start_canonical=start, direction_canonical=direction)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class RaySegments:
-    """Blocks of equidistant samples along rays, each ray's in the order in which light passes them.
+def first_layer_segments(
+    rays: CanonicalRays,
+    posed: PosedNodes,
+    bricks: BrickTable,
+    settings: RenderSettings,
+    samples: int,
+) -> RaySegments:
+    """March the first layer's rays to their ends, as if none ever became opaque.
 
-    Attributes:
-        ray_offsets: First segment of each ray, and the number of segments.
-        start: Begin of each segment, in voxels of the brick grid.
-        slope: Voxels from one sample to the next.
-        step_m: Metres from one sample to the next along the ray.
-        layer: Depth layer, from 0.
+    There is a ray for each covered pixel; `samples` are counted along
+    `RenderSettings.sample_span_m`.
     """
-
-    ray_offsets: Int64[np.ndarray, "rays_and_one"]
-    start: Float32[np.ndarray, "segments 3"]
-    slope: Float32[np.ndarray, "segments 3"]
-    step_m: Float32[np.ndarray, "segments"]
-    count: Int32[np.ndarray, "segments"]
-    layer: Int32[np.ndarray, "segments"]
-
-    @property
-    def num_rays(self) -> int:
-        """Number of rays, with segments or without."""
-        return len(self.ray_offsets) - 1
-
-    @classmethod
-    def of_first_layer(
-        cls,
-        rays: CanonicalRays,
-        posed: PosedNodes,
-        bricks: BrickTable,
-        settings: RenderSettings,
-        samples: int,
-    ) -> "RaySegments":
-        """March the first layer's rays to their ends, as if none ever became opaque.
-
-        There is a ray for each covered pixel; `samples` are counted along
-        `RenderSettings.sample_span_m`.
-        """
-        blocks = list(_march_blocks(rays, posed, settings, samples))
-        number = np.concatenate([ray for ray, _, _ in blocks])
-        rest = CanonicalRays(*map(np.concatenate, zip(*(b[1] for b in blocks), strict=True)))
-        step_m = np.concatenate([step for _, _, step in blocks])
-        order = np.argsort(number, kind="stable")
-        return cls._along(
-            CanonicalRays(*(part[order] for part in rest)),
-            step_m[order],
-            np.searchsorted(number[order], np.arange(len(rays.begin) + 1)).astype(np.int64),
-            bricks,
-            (settings.block_samples, 0),
-        )
-
-    @classmethod
-    def of_further_layer(
-        cls,
-        rays: CanonicalRays,
-        ray_index: Int64[np.ndarray, "rays"],
-        num_rays: int,
-        bricks: BrickTable,
-        count_and_layer: tuple[int, int],
-    ) -> "RaySegments":
-        """Make one segment for each ray of a further layer.
-
-        Ascending `ray_index` names the first layer's rays, of which there are `num_rays`; the last
-        argument has a segment's samples and the layer's number, from 1.
-        """
-        step_m = (rays.end - rays.begin) / np.float32(count_and_layer[0])
-        offsets = np.searchsorted(ray_index, np.arange(num_rays + 1)).astype(np.int64)
-        return cls._along(rays, step_m, offsets, bricks, count_and_layer)
-
-    @classmethod
-    def _along(
-        cls,
-        rays: CanonicalRays,
-        step_m: Float32[np.ndarray, "segments"],
-        ray_offsets: Int64[np.ndarray, "rays_and_one"],
-        bricks: BrickTable,
-        count_and_layer: tuple[int, int],
-    ) -> "RaySegments":
-        """Express segments, which are grouped by ray already, in voxels of the brick grid."""
-        (count, layer), voxel_m = count_and_layer, np.float32(bricks.voxel_m)
-        return cls(
-            ray_offsets=ray_offsets,
-            start=(rays.start_canonical - bricks.low) / voxel_m,
-            slope=rays.direction_canonical * (step_m / voxel_m)[:, None],
-            step_m=step_m,
-            count=np.full(len(step_m), count, dtype=np.int32),
-            layer=np.full(len(step_m), layer, dtype=np.int32),
-        )
-
-    def append_layer(self, behind: "RaySegments") -> "RaySegments":
-        """Append the segments of a layer behind to those of each ray."""
-        rays = np.arange(self.num_rays)
-        owners = [np.repeat(rays, np.diff(segments.ray_offsets)) for segments in (self, behind)]
-        order = np.argsort(np.concatenate(owners), kind="stable")
-        columns = {
-            name: np.concatenate([getattr(self, name), getattr(behind, name)])[order]
-            for name in _SEGMENT_FIELDS
-        }
-        return RaySegments(ray_offsets=self.ray_offsets + behind.ray_offsets, **columns)
-
-    @classmethod
-    def concatenate(cls, many: "Sequence[RaySegments]") -> "RaySegments":
-        """Concatenate the rays of several pictures."""
-        offsets = np.cumsum([0, *(len(segments.step_m) for segments in many)])
-        starts = [s.ray_offsets[:-1] + o for s, o in zip(many, offsets[:-1], strict=True)]
-        columns = {
-            name: np.concatenate([getattr(segments, name) for segments in many])
-            for name in _SEGMENT_FIELDS
-        }
-        return cls(ray_offsets=np.concatenate([*starts, offsets[-1:]]), **columns)
+    blocks = list(_march_blocks(rays, posed, settings, samples))
+    number = np.concatenate([ray for ray, _, _ in blocks])
+    rest = CanonicalRays(*map(np.concatenate, zip(*(b[1] for b in blocks), strict=True)))
+    step_m = np.concatenate([step for _, _, step in blocks])
+    order = np.argsort(number, kind="stable")
+    return _segments_along(
+        CanonicalRays(*(part[order] for part in rest)),
+        step_m[order],
+        np.searchsorted(number[order], np.arange(len(rays.begin) + 1)).astype(np.int64),
+        bricks,
+        (settings.block_samples, 0),
+    )
 
 
-_SEGMENT_FIELDS = [field.name for field in fields(RaySegments) if field.name != "ray_offsets"]
-"""Fields with one row per segment."""
+def further_layer_segments(
+    rays: CanonicalRays,
+    ray_index: Int64[np.ndarray, "rays"],
+    num_rays: int,
+    bricks: BrickTable,
+    count_and_layer: tuple[int, int],
+) -> RaySegments:
+    """Make one segment for each ray of a further layer.
+
+    Ascending `ray_index` names the first layer's rays, of which there are `num_rays`; the last
+    argument has a segment's samples and the layer's number, from 1.
+    """
+    step_m = (rays.end - rays.begin) / np.float32(count_and_layer[0])
+    offsets = np.searchsorted(ray_index, np.arange(num_rays + 1)).astype(np.int64)
+    return _segments_along(rays, step_m, offsets, bricks, count_and_layer)
+
+
+def _segments_along(
+    rays: CanonicalRays,
+    step_m: Float32[np.ndarray, "segments"],
+    ray_offsets: Int64[np.ndarray, "rays_and_one"],
+    bricks: BrickTable,
+    count_and_layer: tuple[int, int],
+) -> RaySegments:
+    """Express segments, which are grouped by ray already, in voxels of the brick grid."""
+    (count, layer), voxel_m = count_and_layer, np.float32(bricks.voxel_m)
+    return RaySegments(
+        ray_offsets=ray_offsets,
+        start=(rays.start_canonical - bricks.low) / voxel_m,
+        slope=rays.direction_canonical * (step_m / voxel_m)[:, None],
+        step_m=step_m,
+        count=np.full(len(step_m), count, dtype=np.int32),
+        layer=np.full(len(step_m), layer, dtype=np.int32),
+    )
+
+
+def append_layer(front: RaySegments, behind: RaySegments) -> RaySegments:
+    """Append the segments of a layer behind to those of each ray."""
+    rays = np.arange(front.num_rays)
+    owners = [np.repeat(rays, np.diff(segments.ray_offsets)) for segments in (front, behind)]
+    order = np.argsort(np.concatenate(owners), kind="stable")
+    columns = {
+        name: np.concatenate([getattr(front, name), getattr(behind, name)])[order]
+        for name in ("start", "slope", "step_m", "count", "layer")
+    }
+    return RaySegments(ray_offsets=front.ray_offsets + behind.ray_offsets, **columns)
 
 
 def _march_blocks(
