@@ -5,10 +5,10 @@ A hash grid and a small network, with a hand-written gradient.
 
 import copy
 import math
-from typing import NamedTuple, final
+from typing import final
 
 import torch
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32
 from torch import Tensor
 
 from avatar.config import TrainConfig
@@ -29,21 +29,13 @@ POINTS_PER_CHUNK = 1 << 13
 """Points per chunk, whose features and hidden layer fit into a cache."""
 
 
-class Activations(NamedTuple):
-    """Values of the forward pass that the backward pass needs."""
-
-    points: Float32[Tensor, "points 3"]
-    features: Float32[Tensor, "points width"]
-    raw: RawPoints
-
-
 @final
 class RadianceField:
     """Color and density at canonical points, without view direction (InstantAvatar, §3.1).
 
     One network of `width → 64 → 4`: 2.8 times cheaper than the two of the paper's code. `layers`
-    are the weights and biases of both layers; `backward` of a frozen field leaves their gradients
-    out. `gradient_strength` is the mean strength of the points' gradients in the last step.
+    are the weights and biases of both layers; a frozen field takes no gradients.
+    `gradient_strength` is the mean strength of the points' gradients in the last step.
     """
 
     is_frozen = False
@@ -102,38 +94,6 @@ class RadianceField:
         return self.table.grad
 
     @torch.no_grad()
-    def forward(self, points: Float32[Tensor, "points 3"]) -> Activations:
-        """Raw outputs at canonical points, and what their gradient will need."""
-        return Activations(
-            points, *operations.field_forward(points, self.table, self.levels, self.network)
-        )
-
-    @torch.no_grad()
-    def backward(
-        self,
-        activations: Activations,
-        grad_raw: Float32[Tensor, "some 4"],
-        rows: Int64[Tensor, "some"] | None = None,
-    ) -> Float32[Tensor, "some width"]:
-        """Writes the gradient of every parameter (the table's is added), unless it is frozen.
-
-        `grad_raw` is the gradient of the outputs of the points in `rows`, all points if None; the
-        others have none. Returns the gradient of these points' features.
-        """
-        points, features, _ = activations
-        rows = torch.arange(len(points)) if rows is None else rows
-        grad_features, grads = operations.network_backward(
-            features, rows, grad_raw, self.network, is_frozen=self.is_frozen
-        )
-        if grads is None:
-            return grad_features
-        for parameter, grad in zip(self.layers, grads, strict=True):
-            assert parameter.grad is not None, "a gradient is overwritten, never taken away"
-            parameter.grad.copy_(grad)
-        operations.encode_backward(points, rows, grad_features, self.levels, self.table_grad)
-        return grad_features
-
-    @torch.no_grad()
     def add_gradients(self, learnt: LearntRays) -> None:
         """Takes the gradients of a pass: writes the network's, adds the table's; none if frozen."""
         if learnt.network is None:
@@ -141,12 +101,15 @@ class RadianceField:
         for parameter, grad in zip(self.layers, learnt.network, strict=True):
             assert parameter.grad is not None, "a gradient is overwritten, never taken away"
             parameter.grad.copy_(grad)
-        operations.add_table_gradient(learnt, self.levels, self.table_grad)
+        operations.add_table_gradient(learnt.points, learnt.features, self.levels, self.table_grad)
 
     @torch.no_grad()
     def raw_outputs_at(self, points: Float32[Tensor, "points 3"]) -> RawPoints:
         """Raw outputs at any number of canonical points, in chunks."""
-        chunks = [self.forward(chunk).raw for chunk in points.split(POINTS_PER_CHUNK)]
+        chunks = [
+            operations.field_forward(chunk, self.table, self.levels, self.network)[1]
+            for chunk in points.split(POINTS_PER_CHUNK)
+        ]
         return torch.cat(chunks) if chunks else points.new_empty(0, 4)
 
 

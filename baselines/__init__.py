@@ -1,1 +1,1 @@
-"""Baselines: other methods, trained and scored beside ours; never imported by production code."""
+"""Baselines: other methods, and kernels and player stated plainly; never imported by production."""

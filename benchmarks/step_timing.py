@@ -19,8 +19,6 @@ from benchmarks.measurements import Measurement
 from benchmarks.sample_training import LoadedTrainer
 from benchmarks.stopwatch import time_interleaved
 
-POINTS = 65_536
-
 
 class AutogradField:
     """A field's parameters, and its forward pass as autograd sees it."""
@@ -114,48 +112,6 @@ def _largest_difference(parameters: list[torch.nn.Parameter], plain: object) -> 
     assert isinstance(plain, tuple)
     both = zip(parameters, plain, strict=True)
     return max(float((p.grad - g).abs().max() / g.abs().max()) for p, g in both)
-
-
-def encode_marks(seen: LoadedTrainer) -> list[Measurement]:
-    """The hash grid forward and backward at training samples."""
-    field = seen.trainer.avatar.field
-    points = training_points(seen, POINTS)
-    grad = torch.randn(POINTS, field.levels.feature_width, generator=_seeded())
-    table = field.table.detach().clone().requires_grad_()
-    rows = torch.arange(POINTS)
-
-    def ours() -> None:
-        field.table_grad.zero_()
-        operations.encode(points, field.table, field.levels)
-        operations.encode_backward(points, rows, grad, field.levels, field.table_grad)
-
-    def plain() -> None:
-        torch.autograd.grad(torch_reference.encode(points, table, field.levels), table, grad)
-
-    times = time_interleaved({"ours": ours, "torch": plain})
-    mega = {name: POINTS / time / 1e6 for name, time in times.items()}
-    levels = f"{len(field.levels.cells_per_m)} levels, {field.levels.entries:,} entries"
-    return [
-        Measurement(
-            name="encode forward + backward vs plain torch, times",
-            value=times["torch"] / times["ours"], required="8", stretch_goal="15",
-            context=f"{POINTS:,} points of training rays, {levels}: {mega['ours']:.2f} and "
-            f"{mega['torch']:.3f} million points/s",
-        )
-    ]  # fmt: skip
-
-
-def training_points(seen: LoadedTrainer, count: int) -> Float32[Tensor, "count 3"]:
-    """Canonical samples as training draws them, ray by ray."""
-    trainer, config = seen.trainer, seen.trainer.config
-    how = MarchSettings(config.sample_step_m, config.opaque_margin_m, config.max_samples)
-    chance = _seeded()
-    found: list[Tensor] = []
-    while sum(map(len, found)) < count:
-        batch = trainer.replay.sample_rays(config.rays, chance)
-        grid = trainer.avatar.occupancy.density_grid
-        found.append(operations.march(batch.rays, trainer.replay.correspondences, grid, how).points)
-    return torch.cat(found)[:count].contiguous()
 
 
 def _seeded() -> torch.Generator:

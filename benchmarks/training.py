@@ -25,7 +25,7 @@ from benchmarks.sample_training import (
     training_config,
 )
 from benchmarks.startup import measure_startup
-from benchmarks.step_timing import encode_marks, step_marks
+from benchmarks.step_timing import step_marks
 from benchmarks.stopwatch import limit_threads
 from benchmarks.thread_scaling import scaling_marks
 from benchmarks.training_quality import (
@@ -89,7 +89,6 @@ def operation_marks(capture: Path) -> Iterator[Measurement]:
     limit_threads(1)
     train_for_core_seconds(seen.trainer, WARMUP_TRAINING_SECONDS)
     yield from step_marks(seen)
-    yield from encode_marks(seen)
 
 
 def large_marks(folder: Path) -> Iterator[Measurement]:

@@ -106,7 +106,7 @@ def forward(
     """Features and raw outputs of points.
 
     Args:
-        points: Canonical points; they and all of `HashLevels` as in `numba_hash_grid.encode`.
+        points: Canonical points; they and all of `HashLevels` as in `numba_hash_grid.encode_block`.
         weights, bias: W₁ (width, hidden) and b₁ (1, hidden).
         output_weights, output_bias: W₂ᵀ (4, hidden) and b₂ (4).
         features, raw: (points, width) and (points, 4); written. `features` has as many rows as the
@@ -238,7 +238,16 @@ def backward_passes(
 ):  # fmt: skip
     """Writes the gradients of every `passes_apart`-th pass over `rows`, and adds them up.
 
-    The arguments are those of `backward`, with the sums of one thread.
+    Args:
+        first_pass, passes_apart: The first pass, and the way to the next, in `POINTS_PER_PASS`.
+        features: Of all points (points, width).
+        rows: Those of them that have a gradient.
+        grad_raw: Gradient of each of these points' outputs (rows, 4).
+        weights, bias, output_weights: As in `forward`.
+        transposed: W₁ᵀ, its width padded with zeros to a multiple of eight.
+        grad_features: (rows, width); written.
+        weight_sum, output_sum, bias_sum: Sums (width, hidden), (4, hidden) and, of b₁ and of b₂,
+            (2, hidden). Without rows, the gradients of a frozen network are left out.
     """
     width = features.shape[1]
     f, g = np.empty((POINTS_PER_PASS, width), F32), np.empty((POINTS_PER_PASS, OUTPUTS), F32)
@@ -259,27 +268,3 @@ def backward_passes(
         for p in range(number):
             for k in range(0, width, 4):
                 store4(grad_features, first + p, k, load4(grad_f, p, k))
-
-
-@compile_kernel(**FAST_MATH)
-def backward(
-    thread, threads, features, rows, grad_raw, weights, bias, output_weights, transposed,
-    grad_features, weight_sums, output_sums, bias_sums,
-):  # fmt: skip
-    """Gradients of the network's features, weights and biases.
-
-    Args:
-        features: Of all points (points, width).
-        rows: Those of them that have a gradient.
-        grad_raw: Gradient of each of these points' outputs (rows, 4).
-        weights, bias, output_weights: As in `forward`.
-        transposed: W₁ᵀ, its width padded with zeros to a multiple of eight.
-        grad_features: (rows, width); written.
-        weight_sums, output_sums, bias_sums: Each thread's sums (threads, width, hidden), (threads,
-            4, hidden) and, of b₁ and of b₂, (threads, 2, hidden); zero before. Without rows, the
-            gradients of a frozen network are left out.
-    """
-    backward_passes(
-        thread, threads, features, rows, grad_raw, weights, bias, output_weights, transposed,
-        grad_features, weight_sums[thread], output_sums[thread], bias_sums[thread],
-    )  # fmt: skip

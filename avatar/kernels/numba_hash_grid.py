@@ -94,7 +94,10 @@ def _trilinear_weights(within, number, weights):
 
 @compile_kernel(**INLINED_ALLOCATION)
 def encode_block(points, start, stop, low, cells_per_m, counts, dense, offsets, table, features):
-    """Features of the points from `start` to `stop`, at most `POINTS_PER_BLOCK`, as `encode`."""
+    """Trilinear features, on all levels, of at most `POINTS_PER_BLOCK` points.
+
+    Points outside the box extrapolate from its border.
+    """
     number = stop - start
     places, within = np.empty((3, POINTS_PER_BLOCK), F32), np.empty((3, POINTS_PER_BLOCK), F32)
     cells = np.empty((3, POINTS_PER_BLOCK), I32)
@@ -114,23 +117,11 @@ def encode_block(points, start, stop, low, cells_per_m, counts, dense, offsets, 
 
 
 @compile_kernel(**FAST_MATH)
-def encode(
-    thread, threads, points, low, cells_per_m, counts, dense, offsets, table, features
-):  # fmt: skip
-    """Trilinear features of all levels; points outside the box extrapolate from its border."""
-    blocks = (points.shape[0] + POINTS_PER_BLOCK - 1) // POINTS_PER_BLOCK
-    for block in range(thread, blocks, threads):
-        start = block * POINTS_PER_BLOCK
-        stop = min(start + POINTS_PER_BLOCK, points.shape[0])
-        encode_block(points, start, stop, low, cells_per_m, counts, dense, offsets, table, features)
-
-
-@compile_kernel(**FAST_MATH)
 def encode_backward(
     thread, threads, points, rows, runs, low, cells_per_m, counts, dense, offsets, grad_features,
     grad_table,
 ):  # fmt: skip
-    """Adds the gradient of `encode`, by its table, to `grad_table`, each thread on its levels.
+    """Adds the gradient of the features, by the table, to `grad_table`, each thread on its levels.
 
     Args:
         points: All points.
@@ -196,7 +187,7 @@ def encode_points_backward(
     points, rows, low, cells_per_m, counts, dense, offsets, table, grad_features, factor,
     grad_points,
 ):  # fmt: skip
-    """Gradient of `encode` times a factor, by the points in `rows`, written to `grad_points`.
+    """Gradient of `encode_block` times a factor, by the points in `rows`, written to `grad_points`.
 
     `grad_features` has the features of these points, and may have more levels than `cells_per_m`.
     """

@@ -54,30 +54,6 @@ MAX_REUSED_SAMPLES = 1 << 20
 """Room for more samples than this is given back at once."""
 
 
-def encode(points: Points, table: HashTable, levels: HashLevels) -> Features:
-    """Hash-grid features."""
-    features = torch.empty(len(points), levels.feature_width)
-    run_threads(
-        numba_hash_grid.encode,
-        points.numpy(), *_level_arrays(levels), table.detach().numpy(), features.numpy(),
-    )  # fmt: skip
-    return features
-
-
-def encode_backward(
-    points: Points,
-    rows: Int64[Tensor, "some"],
-    grad_features: Float32[Tensor, "some width"],
-    levels: HashLevels,
-    grad_table: HashTable,
-) -> None:
-    """Adds the table's gradient to `grad_table`; `grad_features` are of the points in `rows`."""
-    run_threads(
-        numba_hash_grid.encode_backward, points.numpy(), rows.numpy(), np.array([[0, len(rows)]]),
-        *_level_arrays(levels), grad_features.numpy(), grad_table.numpy(),
-    )  # fmt: skip
-
-
 def field_forward(
     points: Points, table: HashTable, levels: HashLevels, network: NetworkLayers
 ) -> tuple[Features, RawOutputs]:
@@ -180,33 +156,15 @@ def _pose_arrays(poses: PosedBones | None) -> tuple[np.ndarray, ...]:
     return *_skinning_arrays(poses.skinning), poses.bones.numpy()
 
 
-def add_table_gradient(learnt: LearntRays, levels: HashLevels, grad_table: HashTable) -> None:
-    """Adds the table's gradient of rays that were learnt to `grad_table`."""
-    rows, grad_features, runs = learnt.features
+def add_table_gradient(
+    points: Points, features: FeatureGradients, levels: HashLevels, grad_table: HashTable
+) -> None:
+    """Adds the table's gradient to `grad_table`; `features` are of rows of all `points`."""
+    rows, grad_features, runs = features
     run_threads(
-        numba_hash_grid.encode_backward, learnt.points.numpy(), rows, runs, *_level_arrays(levels),
+        numba_hash_grid.encode_backward, points.numpy(), rows, runs, *_level_arrays(levels),
         grad_features, grad_table.numpy(),
     )  # fmt: skip
-
-
-def network_backward(
-    features: Features,
-    rows: Int64[Tensor, "some"],
-    grad_raw: Float32[Tensor, "some 4"],
-    network: NetworkLayers,
-    *,
-    is_frozen: bool = False,
-) -> tuple[Float32[Tensor, "some width"], NetworkLayers | None]:
-    """Gradients of the features of the points in `rows`, and of the layers unless frozen."""
-    grad_features = torch.empty(len(rows), features.shape[1])
-    sums = _network_sums(_threads(), features.shape[1], is_frozen=is_frozen)
-    first, bias, second, _, transposed = _network_arrays(network)
-    run_threads(
-        numba_field.backward,
-        features.numpy(), rows.numpy(), grad_raw.numpy(), first, bias, second, transposed,
-        grad_features.numpy(), *sums,
-    )  # fmt: skip
-    return grad_features, None if is_frozen else _network_gradients(sums)
 
 
 def _threads() -> int:

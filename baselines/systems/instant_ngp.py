@@ -1,17 +1,19 @@
 """Instant-NGP (Müller et al. 2022) without articulation: a hash grid in the body frame.
 
-The person is taken for a rigid thing that only turns and moves as a whole. The grid, its compiled
-kernels and the network are the product's own, so that nothing but the articulation is missing.
+The person is taken for a rigid thing that only turns and moves as a whole. The grid and its
+compiled kernels are the product's own, so that nothing but the articulation is missing.
 """
 
 from typing import Any, final
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor, nn
 
 from avatar.config import COARSEST_M, TrainConfig
-from avatar.kernels.operands import MAX_LOG_DENSITY, HashLevels
+from avatar.kernels import operations
+from avatar.kernels.operands import MAX_LOG_DENSITY, FeatureGradients, HashLevels
 from avatar.radiance_field import RadianceField
 from avatar.training.trainer import NETWORK_RATE_FACTOR
 from baselines.systems.method_settings import MethodSettings
@@ -38,13 +40,23 @@ class _HashGridGradient(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, points: Tensor, anchor: Tensor, field: RadianceField) -> Tensor:
         """The raw outputs; `anchor` only makes autograd come back here."""
-        ctx.field, ctx.seen = field, field.forward(points)
-        return ctx.seen.raw
+        features, raw = operations.field_forward(points, field.table, field.levels, field.network)
+        ctx.field, ctx.points, ctx.features = field, points, features
+        return raw
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[None, Tensor, None]:
         """Writes the parameters' gradients."""
-        ctx.field.backward(ctx.seen, gradients[0].contiguous())
+        field, features = ctx.field, ctx.features.requires_grad_()
+        with torch.enable_grad():
+            first, first_bias, second, second_bias = field.network
+            raw = torch.relu(features @ first + first_bias) @ second + second_bias
+        grad_features, *grads = torch.autograd.grad(raw, [features, *field.network], gradients[0])
+        for parameter, grad in zip(field.layers, grads, strict=True):
+            parameter.grad.copy_(grad)
+        count = len(features)
+        parts = FeatureGradients(np.arange(count), grad_features.numpy(), np.array([[0, count]]))
+        operations.add_table_gradient(ctx.points, parts, field.levels, field.table_grad)
         return None, torch.zeros(()), None
 
 

@@ -45,7 +45,8 @@ class TierInfo:
         layout: Sizes and scales of the tables; the streams are read by the one of "hq".
         settings: How the tables are drawn.
         psnr_to_renderer: Mean PSNR to the volume renderer, dB.
-        largest_difference: Between graph and reference, in 1/255, over the checked frames.
+        largest_difference: Between the graph and its rays composited by the compiled kernel, in
+            1/255, over the checked frames.
     """
 
     layout: TableLayout

@@ -41,7 +41,7 @@ def lattice_samples(avatar: Avatar, pose, camera, cells: CorrespondenceGrid):
 def brute_force(avatar: Avatar, pose, camera, cells: CorrespondenceGrid) -> np.ndarray:
     """All of them but those, summed in double precision."""
     samples, strays = lattice_samples(avatar, pose, camera, cells)
-    raw = avatar.field.forward(samples.points).raw.double()
+    raw = avatar.field.raw_outputs_at(samples.points).double()
     raw[strays, 3] = EMPTY_LOG_DENSITY
     colors = torch_reference.composite(raw, samples.offsets, samples.counts, avatar.sample_step_m)
     return colors.reshape(*camera.size_px[::-1], 4).numpy()

@@ -14,6 +14,7 @@ from avatar.kernels.operands import (
     MAX_LOG_DENSITY,
     CorrespondenceTables,
     DensityGrid,
+    FeatureGradients,
     MarchSettings,
     NormalVolume,
     RayBatch,
@@ -42,11 +43,16 @@ def test_the_levels_hold_dense_and_hashed_ones(levels):
     assert (np.diff(levels.offsets)[2:] == 4096).all()
 
 
+def encoded(points, table, levels):
+    layers = [torch.zeros(shape) for shape in ((levels.feature_width, 64), 64, (64, 4), 4)]
+    return operations.field_forward(points, table, levels, tuple(layers))[0]
+
+
 def test_features_at_a_vertex_of_a_dense_level_are_its_entry(levels, generator):
     table = torch.randn(levels.entries, FEATURES_PER_LEVEL, generator=generator)
     i, j, k = 3, 2, 1
     point = torch.from_numpy(levels.low) + torch.tensor([i, j, k]) / float(levels.cells_per_m[0])
-    features = operations.encode(point[None].float(), table, levels)
+    features = encoded(point[None].float(), table, levels)
     nx, ny, _ = levels.vertex_counts[0].tolist()
     torch.testing.assert_close(
         features[0, :FEATURES_PER_LEVEL], table[i + nx * (j + ny * k)], atol=1e-5, rtol=0
@@ -58,7 +64,7 @@ def test_compiled_encoding_agrees_with_its_meaning(levels, generator, count):
     table = torch.randn(levels.entries, FEATURES_PER_LEVEL, generator=generator)
     points = points_in(levels, count, generator, beyond=0.1)
     torch.testing.assert_close(
-        operations.encode(points, table, levels), torch_reference.encode(points, table, levels),
+        encoded(points, table, levels), torch_reference.encode(points, table, levels),
         atol=1e-4, rtol=1e-5,
     )  # fmt: skip
 
@@ -68,7 +74,8 @@ def test_compiled_table_gradient_agrees_with_autograd(levels, generator, count):
     points = points_in(levels, count, generator)
     slope = torch.randn(count, levels.feature_width, generator=generator)
     ours = torch.zeros(levels.entries, FEATURES_PER_LEVEL)
-    operations.encode_backward(points, torch.arange(count), slope, levels, ours)
+    parts = FeatureGradients(np.arange(count), slope.numpy(), np.array([[0, count]]))
+    operations.add_table_gradient(points, parts, levels, ours)
     leaf = torch.zeros_like(ours, requires_grad=True)
     (theirs,) = torch.autograd.grad(torch_reference.encode(points, leaf, levels), leaf, slope)
     torch.testing.assert_close(ours, theirs, atol=1e-4, rtol=1e-4)

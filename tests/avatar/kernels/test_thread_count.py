@@ -8,6 +8,7 @@ import torch
 from avatar.kernels import operations
 from avatar.kernels.operands import (
     AdamSettings,
+    FeatureGradients,
     LossSettings,
     MarchSettings,
     PosedBones,
@@ -15,7 +16,7 @@ from avatar.kernels.operands import (
 )
 
 OPERATIONS = (
-    "encode", "field_forward", "encode_backward", "march", "composite", "learn",
+    "field_forward", "add_table_gradient", "march", "composite", "learn",
     "scatter_max_density", "update_roots", "mean_normals", "adam_step",
 )  # fmt: skip
 
@@ -33,7 +34,8 @@ def results_of(learnt) -> dict[str, list[torch.Tensor]]:
     slope = torch.randn(count, field.levels.feature_width, generator=generator)
     grad_table = torch.zeros_like(field.table)
     rows = torch.arange(0, count, 2)
-    operations.encode_backward(points, rows, slope[rows], field.levels, grad_table)
+    parts = FeatureGradients(rows.numpy(), slope[rows].numpy(), np.array([[0, len(rows)]]))
+    operations.add_table_gradient(points, parts, field.levels, grad_table)
     features, outputs = operations.field_forward(points, field.table, field.levels, field.network)
     operations.scatter_max_density(points, raw[:, 3].contiguous(), grid)
     learnt = operations.learn(
@@ -52,9 +54,8 @@ def results_of(learnt) -> dict[str, list[torch.Tensor]]:
     return {
         "mean_normals": [normals],
         "adam_step": stepped[1:],
-        "encode": [operations.encode(points, field.table, field.levels)],
         "field_forward": [features, outputs],
-        "encode_backward": [grad_table],
+        "add_table_gradient": [grad_table],
         "march": list(samples),
         "composite": [operations.composite(raw, samples, 0.01)],
         "learn": [learnt.log_density, learnt.rendered, learnt.loss, learnt.wrenches],

@@ -45,14 +45,6 @@ def test_a_copy_has_the_same_numbers_and_none_in_common(field):
         assert ours.grad.data_ptr() != theirs.grad.data_ptr()
 
 
-def test_a_frozen_field_hands_on_the_same_gradient_and_keeps_none(field):
-    points, grad = torch.rand(50, 3), torch.rand(50, 4)
-    through = field.frozen().backward(field.forward(points), grad.clone())
-    assert not any(parameter.grad.any() for parameter in field.parameters())
-    assert torch.equal(through, field.backward(field.forward(points), grad.clone()))
-    assert all(parameter.grad.any() for parameter in field.parameters())
-
-
 def test_the_first_steps_are_followed_at_once(field):
     mean = filled(field.clone(), 0.0)
     for steps in range(1, EMA_INTERVAL + 1):

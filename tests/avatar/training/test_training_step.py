@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -115,6 +116,16 @@ def test_the_steps_gradient_is_that_of_autograd(trainer):
     expected = torch.autograd.grad(mean_loss(trainer, parameters, *drawn), parameters)
     for ours, theirs in zip(grads, expected, strict=True):
         assert float((ours - theirs).abs().max()) <= 1e-5 * float(theirs.abs().max())
+
+
+def test_a_frozen_field_takes_no_gradients(trainer):
+    moving, _ = one_step(trainer)
+    for grad in (parameter.grad for parameter in trainer.avatar.field.parameters()):
+        grad.zero_()
+    frozen = dataclasses.replace(trainer.avatar, field=trainer.avatar.field.frozen())
+    held, _ = one_step(SimpleNamespace(avatar=frozen, replay=trainer.replay))
+    assert all(grad.any() for grad in moving)
+    assert not any(grad.any() for grad in held)
 
 
 def test_the_whole_loss_changes_as_its_gradient_says(trainer):
