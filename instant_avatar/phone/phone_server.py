@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import socket
 import tempfile
 import threading
 import time
@@ -88,6 +89,7 @@ class PhoneServer:
         self.on_entered: Callable[[], object] = lambda: None
         self.missing_player = ""
         self._loop = asyncio.new_event_loop()
+        self._sockets: list[socket.socket] = []
         self._player: dict[str, bytes] = {}
         self._warm_up = b""
         self._requests: dict[str, deque[float]] = {}
@@ -122,7 +124,8 @@ class PhoneServer:
         async def listen() -> None:
             await runner.setup()
             for port, context in sites:
-                await web.TCPSite(runner, host, port, ssl_context=context).start()
+                self._sockets.append(socket.create_server((host, port)))
+                await web.SockSite(runner, self._sockets[-1], ssl_context=context).start()
 
         self._runner = runner
         self._loop.run_until_complete(listen())
@@ -135,6 +138,10 @@ class PhoneServer:
             film.is_over = True
 
         async def end() -> None:
+            with suppress(NotImplementedError):  # as on Windows
+                for each in self._sockets:
+                    self._loop.remove_reader(each)
+            await asyncio.sleep(0.0)  # one accepted in this moment would be refused, but not closed
             assert self._runner.server is not None
             transports = [each.transport for each in self._runner.server.connections]
             await self._runner.cleanup()

@@ -1,14 +1,19 @@
 """The phone page's server, with clients that are slow, broken or hostile; nothing is trained."""
 
 import errno
+import gc
 import gzip
 import http.client
 import json
 import re
 import shutil
+import socket
+import sys
+import threading
 import time
 import zlib
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from urllib.parse import quote
 
 import pytest
@@ -48,6 +53,33 @@ def phone(queue):
     port = server._runner.addresses[0][1]
     yield Phone(port, access)
     server.close()
+
+
+def test_connections_that_come_while_the_server_ends_are_closed(queue, monkeypatch):
+    unclosed = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda each: unclosed.append(each.exc_value))
+    monkeypatch.setattr(phone_server, "_player_files", dict)
+    for _ in range(6):
+        server = PhoneServer(queue, AccessControl(), None)
+        server.start("127.0.0.1", [(0, None)])
+        address, connected, ended = server._runner.addresses[0], threading.Event(), []
+
+        def connect(address=address, connected=connected, ended=ended):
+            while not ended:
+                with suppress(OSError), socket.create_connection(address, timeout=1.0):
+                    connected.set()
+
+        browsers = [threading.Thread(target=connect) for _ in range(3)]
+        for browser in browsers:
+            browser.start()
+        connected.wait()
+        server.close()
+        ended.append(True)
+        for browser in browsers:
+            browser.join()
+        del server
+        gc.collect()
+    assert not unclosed
 
 
 class Phone:
