@@ -25,10 +25,11 @@ CALLEE_FOLDER = Path(__file__).resolve().parent
 NO_ALLOCATION: dict[str, Any] = {**FAST_MATH, "_nrt": False}
 """Kernel options without allocation: arrays are not reference-counted. The counting is atomic and
 takes half of the time where arrays pass from one small kernel to the next."""
-INLINED: dict[str, Any] = {**NO_ALLOCATION, "forceinline": True}
+INLINED: dict[str, Any] = {**NO_ALLOCATION, "forceinline": True, "no_cpython_wrapper": True}
 """Options of a kernel that others call. LLVM inlines it: numba's own inlining types its statements
-again in every caller, which takes a third of the time that compilation does."""
-INLINED_ALLOCATION: dict[str, Any] = {**FAST_MATH, "forceinline": True}
+again in every caller, which takes a third of the time that compilation does. Python must not call
+it, and would crash: a wrapper for that takes as long as a small kernel."""
+INLINED_ALLOCATION: dict[str, Any] = {**FAST_MATH, "forceinline": True, "no_cpython_wrapper": True}
 """Options of such a kernel that allocates."""
 
 

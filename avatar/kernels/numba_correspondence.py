@@ -367,7 +367,7 @@ def find_unreliable_roots(
                         if x * x + y * y + z * z > far_m * far_m:
                             unreliable[row] = True
                             break
-                    row += U32(3) if bent else U32(1)
+                    row = U32(row + (U32(3) if bent else U32(1)))
 
 
 @compile_kernel(**NO_ALLOCATION)

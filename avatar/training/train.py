@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from typing import final
 
 import numpy as np
+import torch
 from jaxtyping import UInt8
 
 from avatar.evaluation.held_out import (
@@ -31,6 +32,13 @@ from avatar.events import (
     Warned,
 )
 from avatar.kernels import operations
+from avatar.kernels.operands import (
+    LossSettings,
+    PosedBones,
+    PriorPoints,
+    RayBatch,
+    RaySamples,
+)
 from avatar.render import render
 from avatar.rig import Rig
 from avatar.training.frame_stream import RedundantFrame, StreamItem, TrainingFrame, rebuild_frame
@@ -355,18 +363,50 @@ def warm_up(trainer: Trainer) -> float:
     if thread in WARM_THREADS:
         return 0.0
     WARM_THREADS.add(thread)
-    rig = trainer.avatar.rig
-    config = dataclasses.replace(trainer.config, rays=64, empty_space_points=16, density_tv_pairs=8)
-    stand_in = Trainer(rig, config)
-    camera = _front_camera(rig)
-    stand_in.add_frame(_dummy_frame(rig, camera))
+    stand_in = warm_up_rays(trainer)
     stand_in.steps = FIRST_CORRECTION_STEPS
-    for _ in range(config.occupancy_interval):
+    for _ in range(stand_in.config.occupancy_interval):
         stand_in.step(rate=1.0, hard_surface_share=1.0)
+    return time.perf_counter() - began
+
+
+def warm_up_rays(trainer: Trainer) -> Trainer:
+    """Compiles what comes before a step learns, and rendering; returns a trainer with one frame."""
+    stand_in = _small_trainer(trainer)
+    rig = stand_in.avatar.rig
+    camera = _front_camera(rig)
+    render(stand_in.avatar, BodyPose.rest(), camera)
+    stand_in.add_frame(_dummy_frame(rig, camera))
     poses = stand_in.poses  # an exact pose does not move, and nothing would have followed it
     operations.update_roots(stand_in.replay.correspondences, 0, poses.skinning, poses.bones[0])
-    render(stand_in.avatar, BodyPose.rest(), camera)
-    return time.perf_counter() - began
+    batch = stand_in.replay.sample_rays(stand_in.config.rays, stand_in.generator)
+    stand_in.exposures.neutralize(batch)
+    return stand_in
+
+
+def warm_up_learning(trainer: Trainer) -> None:
+    """Compiles `operations.learn`, on no rays: half of all compilation.
+
+    `warm_up` comes to it late; a process can begin with it while another one warms rays up.
+    """
+    stand_in = _small_trainer(trainer)
+    none, nowhere, poses = torch.zeros(0), torch.zeros(0, 3), stand_in.poses
+    no_rows = torch.zeros(0, dtype=torch.int32)
+    operations.learn(
+        RayBatch(nowhere, nowhere, no_rows, none), torch.zeros(0, 4), torch.zeros(0, 3, 3),
+        RaySamples(nowhere, torch.zeros(0, dtype=torch.int64), no_rows, no_rows),
+        stand_in.replay.correspondences,
+        PriorPoints([nowhere] * 7, none, np.zeros((7, 2), dtype=np.float32), 1.0),
+        stand_in.learner.shading.lit_skin(), PosedBones(poses.skinning, poses.bones, 1), 0,
+        stand_in.field.table, stand_in.field.levels, stand_in.field.network,
+        LossSettings(1.0, 1.0, 1.0, 1.0),
+    )  # fmt: skip
+
+
+def _small_trainer(trainer: Trainer) -> Trainer:
+    """A trainer of the same person, whose steps are short."""
+    config = dataclasses.replace(trainer.config, rays=64, empty_space_points=16, density_tv_pairs=8)
+    return Trainer(trainer.avatar.rig, config)
 
 
 def _front_camera(rig: Rig) -> Camera:

@@ -17,7 +17,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
-import export
+import avatar
+from capture.hardware import usable_cores
 from capture.source import FrameSource
 from preprocess.capture_inputs import CaptureInputs, InputKind, find_own_masks
 from preprocess.plugins import segmenter_name
@@ -28,10 +29,15 @@ if TYPE_CHECKING:  # the process that fits needs no console, and scipy only once
     from preprocess.capture_session import Capture
     from preprocess.fitting.capture_fit import CaptureFit
 
-COMPILE = "from instant_avatar.run.start_up import warm_up; warm_up()"
-"""Program of the process that compiles."""
-KERNELS = Path(export.__file__).parent / "bake"
-"""Folder of the kernels that are compiled last."""
+COMPILE = (
+    "import gc; gc.disable(); from instant_avatar.run.start_up import warm_up; "
+    "warm_up(is_second={})"
+)
+"""Program of the two processes that compile; a seventh of their time would go into garbage."""
+KERNELS = Path(avatar.__file__).parent / "kernels"
+"""Folder of the kernel that is compiled last."""
+LAST_KERNEL = "numba_shading.add_light"
+"""Module and name of that kernel, the last one of a training step."""
 FIT = "from instant_avatar.run.start_up import fit_for_parent; fit_for_parent()"
 """Program of the process that fits."""
 
@@ -50,11 +56,13 @@ def preparing_to_train(console: "Console") -> Iterator[Callable[[], None]]:
 
     def compile_beside() -> None:
         nowhere = subprocess.DEVNULL
-        compilers.append(
-            subprocess.Popen(
-                [sys.executable, "-c", COMPILE], stdin=nowhere, stdout=nowhere, stderr=nowhere
+        for is_second in (False, True)[: usable_cores()]:
+            program = COMPILE.format(is_second)
+            compilers.append(
+                subprocess.Popen(
+                    [sys.executable, "-c", program], stdin=nowhere, stdout=nowhere, stderr=nowhere
+                )
             )
-        )
 
     def load() -> None:
         with suppress(ImportError), without_garbage_collection():  # imported again, it is named
@@ -63,16 +71,16 @@ def preparing_to_train(console: "Console") -> Iterator[Callable[[], None]]:
 
             context: Any = cpu_target.target_context
             context.refresh()
-            from export.bake.proxy_surface import visible_depth_steps  # compiled after the others
+            from avatar.kernels.numba_shading import add_light
 
-            cache: Any = getattr(getattr(visible_depth_steps, "_cache", None), "_cache_file", None)
+            cache: Any = getattr(getattr(add_light, "_cache", None), "_cache_file", None)
             is_missing = cache is not None and not cache._load_index()
             if is_missing and not compilers and not has_ended.is_set():
                 compile_beside()
 
     if is_first_run():
         console.info(
-            "This is the first run: its kernels are compiled beside what follows, in about a "
+            "This is the first run: its kernels are compiled beside what follows, in half a "
             "minute; training starts after that, and within seconds in later runs."
         )
         compile_beside()
@@ -98,11 +106,11 @@ def is_first_run() -> bool:
     """Whether no kernel was ever compiled here, as far as can be seen before numba is loaded."""
     if "NUMBA_CACHE_DIR" in os.environ or not os.access(KERNELS, os.W_OK):
         return False  # numba knows where they are
-    return not any(KERNELS.glob("__pycache__/*.nbi"))
+    return not any(KERNELS.glob(f"__pycache__/{LAST_KERNEL}-*.nbi"))
 
 
-def warm_up() -> None:
-    """Compile all kernels, or load those that are compiled."""
+def warm_up(*, is_second: bool = False) -> None:
+    """Compile all kernels, or load those that are compiled; a second process compiles a half."""
     from avatar.config import TrainConfig
     from avatar.rig import Rig
     from avatar.training import train
@@ -111,8 +119,14 @@ def warm_up() -> None:
     from preprocess.body.parametric_body import load_body_model
 
     rig = Rig.from_shaped_body(load_body_model(None).with_shape())
-    train.warm_up(Trainer(rig, TrainConfig()))
-    proxy_surface.warm_up()
+    trainer = Trainer(rig, TrainConfig())
+    if is_second:
+        train.warm_up_rays(trainer)
+        proxy_surface.warm_up()
+    else:
+        train.warm_up_learning(trainer)
+        train.warm_up(trainer)
+        proxy_surface.warm_up()
 
 
 def can_fit_beside(inputs: CaptureInputs, source: FrameSource) -> bool:

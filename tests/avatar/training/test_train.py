@@ -21,6 +21,7 @@ from avatar.events import (
     Stepped,
     WaitingForFrame,
 )
+from avatar.kernels import numba_training_step
 from avatar.render import render
 from avatar.training import train as train_module
 from avatar.training.frame_stream import prepare_frame, prepare_stream
@@ -442,3 +443,12 @@ def test_a_revised_pose_is_that_of_a_frame_that_came_with_it(rig, clip):
     assert trainers[0].replay.replay_frames()[0].pose is one.pose
     bones = [trainer.poses.bones[0] for trainer in trainers]
     torch.testing.assert_close(*bones)
+
+
+def test_a_process_that_compiles_learning_alone_compiles_what_a_step_calls(rig, monkeypatch):
+    monkeypatch.setattr(train_module, "WARM_THREADS", set())
+    trainer = Trainer(rig, TrainConfig())
+    train_module.warm_up(trainer)
+    compiled = set(numba_training_step.learn.overloads)
+    train_module.warm_up_learning(trainer)
+    assert set(numba_training_step.learn.overloads) == compiled != set()
