@@ -15,7 +15,7 @@ from capture.input_error import InputError
 from instant_avatar.evaluation.evaluation_frames import held_out_frames
 from instant_avatar.run.run_folder import RunFolder
 from preprocess.alignment.silhouette_objective import spaced_indices
-from preprocess.body.body_surface import MeshSilhouette, soft_iou
+from preprocess.body.body_surface import DENSE_SKIN_POINTS, SkinPoints, soft_iou
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.capture_session import Capture
 from preprocess.masks.mask_files import open_masks
@@ -137,11 +137,12 @@ def mask_iou(tracked: Path, given: Path, size_px: tuple[int, int]) -> float:
 def body_iou(recording: Capture) -> float:
     """Mean IoU of the posed body with the masks of a recording; 0 for frames without a pose.
 
-    The body's triangles are filled at the frames' own size, and masks count from 0.5 on. (The
+    The skin is drawn at the frames' own size, and masks count from 0.5 on. (The
     product's grades compare small silhouettes of skin points with soft masks, quickly: there a body
     scores 0.90 against its own masks, here 0.99.)
     """
-    source, motion, body = recording.source, recording.motion, MeshSilhouette(recording.shaped)
+    source, motion = recording.source, recording.motion
+    skin = SkinPoints.of(recording.shaped, 50 * DENSE_SKIN_POINTS)
     assert motion.frames is not None
     poses = {int(motion.frames[row]): int(row) for row in np.flatnonzero(motion.valid)}
     ious = []
@@ -154,7 +155,7 @@ def body_iou(recording: Capture) -> float:
         ious.append(0.0)
         if number in poses:
             row = poses[number]
-            drawn = body.draw_pose(motion[row], recording.camera_of_pose(row))
+            drawn = skin.draw(motion[row], recording.camera_of_pose(row))
             ious[-1] = soft_iou(drawn, mask.astype(np.float32))
     return float(np.mean(ious))
 

@@ -15,7 +15,7 @@ from instant_avatar.tracked_video import BODY_COLOR, MASK_COLOR, draw_outline
 from preprocess.alignment.capture_geometry import FULL_WINDOW, CaptureGeometry
 from preprocess.alignment.keypoint_objective import TrackedImage
 from preprocess.alignment.silhouette_objective import components_touching, spaced_indices
-from preprocess.body.body_surface import MeshSilhouette, soft_iou
+from preprocess.body.body_surface import DENSE_SKIN_POINTS, SkinPoints, soft_iou
 from preprocess.masks.mask_sources import StoredMasks
 
 COLUMNS = 6
@@ -58,12 +58,12 @@ def write_contact_sheet(
 def _draw_row(
     check: CaptureValidation, geometry: CaptureGeometry, title: str, iou: float
 ) -> RgbImage:
-    body = MeshSilhouette(check.capture.shaped)
+    skin = SkinPoints.of(check.capture.shaped, DENSE_SKIN_POINTS)
     masks = check.capture.masks
     mask_of = masks.in_order_at_worst().read if isinstance(masks, StoredMasks) else None
     chosen = [check.images[place] for place in spaced_indices(len(check.images), COLUMNS)]
     seen = geometry.in_video_frames(check.capture.source.frames_in_file)
-    cells = [_draw_cell(image, geometry, seen, body, mask_of) for image in chosen]
+    cells = [_draw_cell(image, geometry, seen, skin, mask_of) for image in chosen]
     label = np.full((LABEL_PX, sum(c.shape[1] for c in cells), 3), PAPER_COLOR, np.uint8)
     score = "body outline (no masks)" if np.isnan(iou) else f"IoU {iou:.2f}"
     _draw_text(label, f"{title}: {score}", 6)
@@ -74,7 +74,7 @@ def _draw_cell(
     image: TrackedImage,
     geometry: CaptureGeometry,
     seen: CaptureGeometry,
-    body: MeshSilhouette,
+    skin: SkinPoints,
     mask_of: Callable[[int, tuple[int, int]], AlphaMask] | None,
 ) -> RgbImage:
     """Draw one frame with both outlines.
@@ -92,7 +92,7 @@ def _draw_cell(
     if row is None:
         label += ": no pose"
     elif same_aspect_ratio(size, seen.size_px):
-        drawn = body.draw_pose(seen.motion[row], seen.camera_at(image.index, size))
+        drawn = skin.draw(seen.motion[row], seen.camera_at(image.index, size))
         draw_outline(picture, drawn.astype(np.float32), BODY_COLOR, width_px=2)
     if mask_of is not None and video.window == FULL_WINDOW:
         try:

@@ -10,7 +10,7 @@ import numpy as np
 from capture.atomic_files import atomic_file
 from capture.source import AlphaMask, RgbImage
 from capture.video_writer import H264, write_video
-from preprocess.body.body_surface import SkinPoints, splat_silhouette
+from preprocess.body.body_surface import SkinPoints
 from preprocess.capture_session import Capture
 from preprocess.observation import Observation, shrink_to_longer_side
 
@@ -53,7 +53,7 @@ def _draw_frames(capture: Capture, doubts: Mapping[int, str]) -> Iterator[RgbIma
         image = cv2.resize(item.frame.rgb, size_px, interpolation=cv2.INTER_AREA)
         camera = item.camera.resize(size_px)
         small = item.camera.resize(shrink_to_longer_side(item.camera.size_px, SILHOUETTE_PX))
-        drawn = splat_silhouette(skin.posed(item.pose), small).astype(np.float32)
+        drawn = skin.draw(item.pose, small).astype(np.float32)
         draw_outline(image, cv2.resize(item.alpha, size_px), MASK_COLOR, width_px=1)
         draw_outline(image, cv2.resize(drawn, size_px), BODY_COLOR, width_px=1)
         pixels = camera.project(capture.shaped.with_pose(item.pose).joints())

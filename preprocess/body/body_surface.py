@@ -1,15 +1,10 @@
-"""The surface of a body: normals, areas, points on the skin, silhouettes, distances from outlines.
-
-Skin points are splatted where speed counts (small images, a thousand times in a search); the mesh
-is filled where sub-pixel accuracy counts (masks).
-"""
+"""The surface of a body: normals, areas, points on the skin, silhouettes, outlines."""
 
 from dataclasses import dataclass
-from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Int
 from scipy.ndimage import minimum_filter
 from scipy.sparse import coo_array, diags_array
 from scipy.sparse.linalg import splu
@@ -149,6 +144,8 @@ def visible_from_anywhere(
 
 SKIN_POINTS = 8000
 """Points sampled on the skin: about three per pixel of a person `SILHOUETTE_PERSON_PX` high."""
+DENSE_SKIN_POINTS = 40_000
+"""As many for a person of 200 px; higher ones get holes."""
 SILHOUETTE_PERSON_PX = 96
 """Height of a person in small images, px: a pixel is about 2 cm."""
 NEAR_PLANE_M = 0.05
@@ -206,6 +203,10 @@ class SkinPoints:
         blended = (self.weights @ transforms.reshape(24, 12).astype(np.float32)).reshape(-1, 3, 4)
         return np.einsum("pab,pb->pa", blended[:, :, :3], self.rest) + blended[:, :, 3]
 
+    def draw(self, pose: BodyPose, camera: Camera) -> Bool[np.ndarray, "height width"]:
+        """The pixels that the body covers (`splat_silhouette`)."""
+        return splat_silhouette(self.posed(pose), camera)
+
 
 def splat_silhouette(
     points_world: Float[np.ndarray, "points 3"], camera: Camera
@@ -247,63 +248,6 @@ def soft_iou(body: Bool[np.ndarray, "height width"], alpha: AlphaMask) -> float:
     both, either = float(alpha[body].sum()), float(alpha.sum() + body.sum())
     union = either - both
     return both / union if union > 0.0 else 0.0
-
-
-SUBPIXEL_BITS = 4
-"""Fractional bits of drawn corners: 1/16 px."""
-
-
-@final
-class MeshSilhouette:
-    """Draws one person's body, or any vertices with its triangles, as a filled shape.
-
-    OpenCV fills many polygons at once by the even-odd rule. So each call gets the triangles of one
-    limb that face the camera, or those that face away: these do not overlap.
-    """
-
-    def __init__(self, shaped: ShapedBody) -> None:
-        """Group the triangles by limb."""
-        self._shaped = shaped
-        faces = shaped.body.faces
-        limb = shaped.body.weights[faces].sum(axis=1).argmax(axis=1)
-        limbs = [faces[limb == joint] for joint in range(24) if (limb == joint).any()]
-        self._limbs = [(each, np.unique(each)) for each in limbs]
-
-    def draw_pose(self, pose: BodyPose, camera: Camera) -> Bool[np.ndarray, "height width"]:
-        """The pixels that the body covers; none if it comes too near or behind the camera."""
-        return self.draw_vertices(self._shaped.with_pose(pose).vertices(), camera) > 0
-
-    def draw_vertices(
-        self, vertices: Float[np.ndarray, "vertices 3"], camera: Camera
-    ) -> UInt8[np.ndarray, "height width"]:
-        """Draw the body's triangles between the given vertices, metres: 1, else 0.
-
-        Nothing is drawn if a vertex is behind the camera or too near.
-        """
-        width, height = camera.size_px
-        image = np.zeros((height, width), dtype=np.uint8)
-        depth = vertices @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
-        if depth.min() < NEAR_PLANE_M:
-            return image
-        pixels = (camera.project(vertices) - 0.5) * (1 << SUBPIXEL_BITS)
-        corners = np.clip(np.round(pixels), -(1 << 20), 1 << 20).astype(np.int32)
-        for faces, used in self._limbs:
-            triangles = corners[faces].astype(np.int64)
-            a, b = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-            towards = a[:, 0] * b[:, 1] < a[:, 1] * b[:, 0]
-            points = corners[used]
-            low = np.clip((points.min(axis=0) >> SUBPIXEL_BITS) - 1, 0, (width, height))
-            high = np.clip((points.max(axis=0) >> SUBPIXEL_BITS) + 3, 0, (width, height))
-            part = image[low[1] : high[1], low[0] : high[0]]
-            triangles -= low << SUBPIXEL_BITS
-            for side in (towards, ~towards):
-                filled = np.zeros(part.shape, dtype=np.uint8)
-                polygons = list(triangles[side].astype(np.int32))
-                if polygons and part.size:
-                    cv2.fillPoly(filled, polygons, 1, cv2.LINE_8, SUBPIXEL_BITS)
-                part |= filled
-        closed = cv2.morphologyEx(image, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-        return np.asarray(closed, dtype=np.uint8)
 
 
 def signed_distance_px(mask: Bool[np.ndarray, "height width"]) -> AlphaMask:

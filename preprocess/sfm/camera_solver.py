@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from capture.hardware import peak_memory_mb
 from capture.input_error import InputError
 from capture.source import Frame, FrameSource
-from preprocess.body.body_surface import MeshSilhouette
+from preprocess.body.body_surface import DENSE_SKIN_POINTS, SkinPoints
 from preprocess.cameras.camera_file import ASSUMED_CAMERA_SOURCE
 from preprocess.capture_session import Capture, Provenance
 from preprocess.frame_association import interpolate_missing_cameras
@@ -281,13 +281,14 @@ def make_person_mask(capture: Capture) -> PersonMaskFn:
                 return None
 
         return by_mask
-    outline, pose_row = MeshSilhouette(capture.shaped), associate_poses(capture.motion, source)
+    skin = SkinPoints.of(capture.shaped, DENSE_SKIN_POINTS)
+    pose_row = associate_poses(capture.motion, source)
 
     def by_body(frame: Frame, size_px: tuple[int, int]) -> Bool[np.ndarray, "_ _"] | None:
         row = pose_row(frame)
         if row is None or not capture.motion.valid[row]:
             return None
-        body = outline.draw_pose(capture.motion[row], capture.cameras[0].resize(size_px))
+        body = skin.draw(capture.motion[row], capture.cameras[0].resize(size_px))
         rows = np.flatnonzero(body.any(axis=1))
         if not len(rows):
             return None

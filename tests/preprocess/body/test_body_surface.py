@@ -1,7 +1,5 @@
 """Tests for small silhouettes: area, place, agreement."""
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
@@ -10,7 +8,6 @@ import trimesh
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.body_surface import (
-    MeshSilhouette,
     SkinPoints,
     smooth_over_surface,
     soft_iou,
@@ -74,21 +71,6 @@ def test_splatted_and_exact_silhouettes_agree(skin, shaped, camera):
 def test_nothing_is_drawn_of_a_person_behind_the_camera(skin, camera):
     behind = skin.posed(BodyPose.rest()) + np.array([0.0, 0.0, 10.0], dtype=np.float32)
     assert not splat_silhouette(behind, camera).any()
-
-
-def test_the_filled_mesh_covers_what_skin_points_cover(skin, shaped, camera):
-    pose = BodyPose.rest()
-    drawn = MeshSilhouette(shaped).draw_pose(pose, camera)
-    at = np.floor(camera.project(shaped.with_pose(pose).vertices())).astype(int)
-    assert drawn[at[:, 1], at[:, 0]].mean() > 0.99
-    splatted = splat_silhouette(skin.posed(pose), camera)
-    assert soft_iou(drawn, splatted.astype(np.float32)) > 0.9  # and nothing else
-
-
-def test_no_mesh_is_drawn_of_a_person_behind_the_camera(shaped, camera):
-    pose = BodyPose.rest()
-    behind = replace(pose, root_translation=np.array([0.0, 0.0, 10.0]))
-    assert not MeshSilhouette(shaped).draw_pose(behind, camera).any()
 
 
 def test_a_lens_bends_the_silhouette_as_it_bends_points(skin, camera):

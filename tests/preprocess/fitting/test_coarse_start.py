@@ -10,7 +10,7 @@ from PIL import Image
 
 from capture.camera import Camera
 from preprocess.body.body_pose import Motion
-from preprocess.body.body_surface import MeshSilhouette
+from preprocess.body.body_surface import DENSE_SKIN_POINTS, SkinPoints
 from preprocess.body.parametric_body import (
     BodyModel,
     ShapedBody,
@@ -63,13 +63,13 @@ def taller(person: ShapedBody, factor: float) -> ShapedBody:
 
 def film(folder: Path, person: ShapedBody, motion: Motion, given: str) -> None:
     """Images of a person of two colors before a wall of many; masks, alpha channels, or neither."""
-    rng, outline = np.random.default_rng(5), MeshSilhouette(person)
+    rng, skin = np.random.default_rng(5), SkinPoints.of(person, DENSE_SKIN_POINTS)
     wall = cv2.resize(rng.integers(30, 225, (16, 12, 3), dtype=np.uint8), SIZE)
     (folder / "images").mkdir(parents=True)
     if given == "masks":
         (folder / "masks").mkdir()
     for row in range(len(motion)):
-        seen = outline.draw_pose(motion[row], CAMERA)
+        seen = skin.draw(motion[row], CAMERA)
         cloth = rng.integers(0, 50, (*SIZE[::-1], 3)) + np.array([30, 40, 180])
         cloth[: SIZE[1] // 2] += np.array([150, 0, -120])
         rgb = np.where(seen[..., None], cloth, wall) + rng.normal(0.0, 4.0, (*SIZE[::-1], 3))
