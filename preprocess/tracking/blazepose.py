@@ -301,7 +301,7 @@ class BlazePoseTracker:
         nearest = 1.0
         for other in self._detect_some(rgb):
             apart = distance_in_sides(found.square, other.square)
-            if apart > SAME_PERSON_DISTANCE and not self._is_same(rgb, found.square, other.square):
+            if apart > SAME_PERSON_DISTANCE and self._is_another(rgb, found.square, other.square):
                 self._has_company = True
                 nearest = min(nearest, apart)
         if nearest < NEAR:
@@ -331,24 +331,26 @@ class BlazePoseTracker:
         if is_beside and apart < NEAR:
             self._crowded_frames = CROWD_MEMORY
 
-    def _is_same(self, rgb: RgbImage, person: PersonSquare, other: PersonSquare) -> bool:
-        """Check whether a detection near the person is the person; remember another one's looks.
+    def _is_another(self, rgb: RgbImage, person: PersonSquare, other: PersonSquare) -> bool:
+        """Check whether a detection is another person; remember the looks of one who is near.
 
-        The detector's squares around small persons lie beside them; their key points do not.
+        The detector's squares around small persons lie beside them, and it takes a sleeve near the
+        camera for a person; key points do neither.
         """
         apart = distance_in_sides(person, other)
         if apart >= REACHING:
-            return False
-        found = self._find_landmarks(rgb, other)
-        if found.keypoints.presence < MIN_PRESENCE:
-            return False
-        if distance_in_sides(person, found.square) <= OVERLAPPING:
             return True
+        found = self._find_landmarks(rgb, other)
+        if (
+            found.keypoints.presence < MIN_PRESENCE
+            or distance_in_sides(person, found.square) <= OVERLAPPING
+        ):
+            return False
         if self._beside is None or apart < distance_in_sides(person, self._beside.square):
             self._see_beside(person, found)
         if apart < NEAR:
             self._company.learn(colors_of(rgb, found.keypoints))
-        return False
+        return True
 
     def _looks_right(self, colors: Float[np.ndarray, "numbers"]) -> bool:
         """True if colors are rather the person's than those of another one."""

@@ -210,6 +210,16 @@ def test_a_small_person_is_not_another_one(striped):
     assert not any(each is None or each.crowded for each in found)
 
 
+def test_a_sleeve_that_the_detector_takes_for_a_person_is_not_another_one(plain, monkeypatch):
+    tracker, picture = BlazePoseTracker(), scene((plain, 0))
+    x, y = plain.joints[18]
+    square = PersonSquare(x=x, y=y, side=60.0, angle=0.0)
+    sleeve = PersonDetection(square=square, box=np.array([x, y, x, y]), score=0.9)
+    monkeypatch.setattr(tracker, "_detect_some", lambda rgb: [sleeve])
+    found = [tracker(picture) for _ in range(6)]
+    assert not any(each is None or each.crowded for each in found)
+
+
 @pytest.mark.parametrize("person", [1, 2])
 def test_each_of_two_persons_in_a_wide_picture_can_be_followed(striped, plain, person):
     """In this room the detector sees only the one on the right, of the whole picture."""
