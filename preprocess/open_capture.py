@@ -170,7 +170,7 @@ def align_capture(
     poses = Provenance(
         "poses",
         imported.paths.poses.name,
-        (motion.note, *lost_pose_warnings(motion), *warnings),
+        (motion.note, *lost_pose_warnings(imported.motion), *warnings),
         uncertainty=1.0 if motion.is_fitted else 0.0,
     )
     cameras = Provenance("cameras", capture.cameras.source, (capture.cameras.note,))

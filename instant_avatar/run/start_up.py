@@ -87,9 +87,10 @@ def preparing_to_train(console: "Console") -> Iterator[Callable[[], None]]:
 
     def wait() -> None:
         loading.join()
-        for process in compilers:
+        if compilers:
             with console.status("compiling kernels (slow on the first run only)"):
-                process.wait()
+                for process in compilers:
+                    process.wait()
 
     loading = threading.Thread(target=load, name="loading libraries")
     loading.start()

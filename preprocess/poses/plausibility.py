@@ -157,7 +157,7 @@ def lost_pose_warnings(motion: Motion) -> Iterator[str]:
     lost = len(motion) - int(motion.valid.sum())
     if lost:
         yield (
-            f"{lost} of {len(motion)} poses are NaN, implausible or marked as not valid; their "
+            f"{lost} of {len(motion)} poses are not numbers, or marked as not valid; their "
             "frames are left out."
         )
 

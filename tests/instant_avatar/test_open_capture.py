@@ -122,6 +122,15 @@ def test_a_focal_length_that_the_poses_state_is_believed(capture, own, changed):
     assert found.cameras[0].focal_px[0] == pytest.approx(intrinsic[0, 0])
 
 
+def test_a_pose_that_no_body_has_is_named_once(capture, own, changed):
+    bent = own.motion.joint_rotations.copy()
+    bent[3, 7] = 0.0, 25.0, 0.0
+    changed(capture / "poses.npz", body_pose=bent.reshape(24, -1))
+    notes = open_capture(CaptureInputs(video=capture)).notes
+    (sentence,) = (note for note in notes if "of 24 poses" in note)
+    assert sentence.startswith("1 of 24 poses bend a joint")
+
+
 def test_a_new_format_is_one_importer(film, own, in_camera, tmp_path, monkeypatch):
     """The example of CONTRIBUTING.md."""
 
