@@ -16,15 +16,9 @@ from baselines.systems.posed_person import (
 from baselines.systems.ray_rendering import BodyRays, render_rays
 
 TINY = MethodSettings(
-    frames=2,
-    rays=256,
-    samples=12,
-    layers=2,
-    width=32,
-    octaves=4,
-    pose_rate=1e-3,
-    learning_rate=1e-2,
-)
+    frames=2, rays=256, samples=12, layers=2, width=32,
+    octaves=4, pose_rate=1e-3, learning_rate=1e-2,
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")

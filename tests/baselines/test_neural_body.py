@@ -12,15 +12,9 @@ from baselines.systems.posed_person import SkinnedPerson
 from baselines.systems.voxel_convolution import ActiveVoxels, VoxelConvolution
 
 TINY = MethodSettings(
-    frames=1,
-    rays=192,
-    samples=12,
-    width=16,
-    octaves=2,
-    voxel_m=0.05,
-    channels=4,
-    learning_rate=5e-3,
-)
+    frames=1, rays=192, samples=12, width=16, octaves=2,
+    voxel_m=0.05, channels=4, learning_rate=5e-3,
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -69,24 +69,16 @@ def test_grey_and_16_bit_pictures_become_8_bit_rgb(tmp_path):
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
-def test_a_cut_off_picture_is_left_out_and_told(write_images, suffix, capfd):
-    folder = write_images(3, suffix=suffix)
-    path = folder / f"shot_1{suffix}"
-    path.write_bytes(path.read_bytes()[:-40])
-    source = open_source(folder)
-    assert [frame.index for frame in source.frames()] == [0, 2]
-    assert "shot_1" in source.warnings[0]
-    assert capfd.readouterr().err == ""
-
-
-def test_a_picture_that_cannot_be_read_or_has_another_size_is_left_out(write_images, capfd):
-    folder = write_images(5)
-    (folder / "shot_1.png").write_bytes(b"no picture")
-    (folder / "shot_2.png").write_bytes(b"")
-    cv2.imwrite(str(folder / "shot_3.png"), np.zeros((10, 10, 3), np.uint8))
+def test_a_picture_that_cannot_be_read_or_has_another_size_is_left_out(write_images, suffix, capfd):
+    folder = write_images(5, suffix=suffix)
+    cut_off = folder / f"shot_1{suffix}"
+    cut_off.write_bytes(cut_off.read_bytes()[:-40])
+    (folder / f"shot_2{suffix}").write_bytes(b"")
+    cv2.imwrite(str(folder / f"shot_3{suffix}"), np.zeros((10, 10, 3), np.uint8))
     source = open_source(folder)
     assert [frame.index for frame in source.frames()] == [0, 4]
     assert len(source.warnings) == 3
+    assert "shot_1" in source.warnings[0]
     assert "10x10" in source.warnings[2]
     assert len(list(source.frames())) == 2
     assert len(source.warnings) == 3
@@ -99,9 +91,6 @@ def test_a_folder_without_pictures_is_refused(tmp_path):
     (tmp_path / "notes.txt").write_text("nothing")
     with pytest.raises(InputError, match=r"\.txt"):
         open_source(tmp_path)
-
-
-def test_a_folder_of_damaged_pictures_is_refused(tmp_path):
     for index in range(3):
         (tmp_path / f"{index}.png").write_bytes(b"\x89PNG")
     with pytest.raises(InputError, match=tmp_path.name):

@@ -91,13 +91,6 @@ def test_a_recording_is_described_before_its_frames_are_read(write_video):
     assert describe_recording(some).startswith(f"{path.name}: 10 of 20 frames")
 
 
-@pytest.mark.parametrize(("content", "word"), [(b"", "0 bytes"), (b"no video" * 99, "cannot be")])
-def test_a_file_that_is_no_video_is_refused_with_its_cause(tmp_path, content, word):
-    (tmp_path / "video.mp4").write_bytes(content)
-    with pytest.raises(InputError, match=word):
-        open_source(tmp_path / "video.mp4")
-
-
 def test_a_glance_decodes_a_few_places_from_the_first_to_the_last(write_video):
     source = open_source(write_video(frames=60), rotate=90)
     pairs = glance(source)
@@ -145,11 +138,13 @@ def test_a_recording_without_its_index_is_refused_with_advice(write_video):
         open_source(path)
 
 
-@pytest.mark.parametrize("content", [b"", b"hello", bytes(range(256)) * 40])
-def test_what_is_no_video_is_refused(tmp_path, content, capfd):
+@pytest.mark.parametrize(
+    ("content", "word"), [(b"", "0 bytes"), (b"hello", "cannot be"), (b"no video" * 99, "cannot")]
+)
+def test_what_is_no_video_is_refused_with_its_cause(tmp_path, content, word, capfd):
     path = tmp_path / "video.mp4"
     path.write_bytes(content)
-    with pytest.raises(InputError, match=path.name):
+    with pytest.raises(InputError, match=rf"video\.mp4 .*{word}"):
         open_source(path)
     assert capfd.readouterr().err == ""
 

@@ -18,11 +18,11 @@ from export.package.package_file import read_package
 from export.player import Player
 from export.skinned_mesh import SURFACE_DENSITY, _level_function, extract_mesh
 from export.splat_colors import cameras_around
-from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import body_from_rest, rotation_matrices, world_from_body
 from preprocess.poses.pose_format_registry import read_poses
 from tests.export.test_mesh_texture import show_nothing
 from tests.export.test_splats import is_closed, volume
+from tests.motions import make_motion
 
 TYPES = {5126: "<f4", 5125: "<u4", 5123: "<u2", 5121: "u1"}
 SIZES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -44,13 +44,9 @@ def motion(bent):
     share = np.array([0.3, 0.7, 1.0])
     flip = Rotation.from_euler("xyz", [np.pi - 0.2, 0.3, 0.1])
     yaw = Rotation.from_rotvec(share[:, None] * [0.0, 1.2, 0.0])
-    return Motion(
-        root_rotations=(flip * yaw).as_rotvec(),
-        root_translations=share[:, None] * [0.5, -0.2, 3.0] + 1.0,
-        joint_rotations=share[:, None, None] * bent.joint_rotations,
-        valid=np.ones(3, dtype=bool),
-        betas=np.zeros(10),
-        body_model="body24",
+    places = share[:, None] * [0.5, -0.2, 3.0] + 1.0
+    return make_motion(
+        (flip * yaw).as_rotvec(), places, share[:, None, None] * bent.joint_rotations
     )
 
 
@@ -190,14 +186,7 @@ def test_every_key_of_the_animation_is_the_pose_turned_upright(file, mesh, packa
 
 def test_quaternions_take_the_short_way(package):
     turns = np.linspace(0.0, 4.0 * np.pi, 60)
-    spin = Motion(
-        root_rotations=np.stack([0 * turns, (turns + np.pi) % (2 * np.pi) - np.pi, 0 * turns], 1),
-        root_translations=np.zeros((60, 3)),
-        joint_rotations=np.zeros((60, 23, 3)),
-        valid=np.ones(60, dtype=bool),
-        betas=np.zeros(10),
-        body_model="body24",
-    )
+    spin = make_motion(np.stack([0 * turns, (turns + np.pi) % (2 * np.pi) - np.pi, 0 * turns], 1))
     animation = SkeletonAnimation.of(spin, tuple(range(60)), 30.0, package.manifest.rest_joints[0])
     steps = np.sum(animation.rotations[:, 1:] * animation.rotations[:, :-1], axis=-1)
     assert (steps > 0.9).all()

@@ -8,8 +8,8 @@ import pytest
 
 from capture.input_error import InputError
 from export import player_page
-from preprocess.body.body_pose import Motion
 from preprocess.poses.pose_format_registry import read_poses
+from tests.motions import make_motion
 
 
 @pytest.fixture(scope="module")
@@ -25,14 +25,9 @@ def kept(tmp_path_factory):
 def motion(bent):
     """Three poses, of which the tracker lost the second."""
     share = np.array([0.5, 1.0, 0.8])[:, None]
-    return Motion(
-        root_rotations=share * bent.root_rotation,
-        root_translations=share * bent.root_translation,
-        joint_rotations=share[:, None] * bent.joint_rotations,
-        valid=np.array([True, False, True]),
-        betas=np.zeros(10),
-        body_model="body24",
-    )
+    joints, valid = share[:, None] * bent.joint_rotations, np.array([True, False, True])
+    roots, places = share * bent.root_rotation, share * bent.root_translation
+    return make_motion(roots, places, joints, valid=valid)
 
 
 @pytest.fixture

@@ -15,11 +15,11 @@ from instant_avatar.capture_validation import passes_quick_check
 from instant_avatar.corrected_capture import renumber_motion
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.alignment.capture_geometry import CaptureGeometry
-from preprocess.body.body_pose import Motion
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.open_capture import open_capture
 from preprocess.poses.pose_file import write_motion
 from preprocess.poses.pose_format_registry import read_poses
+from tests.motions import make_motion
 
 SPOILS = {
     "frame_offset": capture_corruptions.delay_poses(4),
@@ -305,79 +305,33 @@ def test_ingest_goes_on_with_force(spoilt, call_ingest, without_baking, tmp_path
     assert "the poses come 9 frames too early" in " ".join(outcome.err.split())
 
 
-SIDE, FRAMES = 96, 40
-
-
-@pytest.fixture(scope="module")
-def turning(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("turning") / "capture"
-    film_capture(folder, ShootConfig(frames=FRAMES, size=SIDE, background="plain", turns=1.0))
-    return folder
-
-
-@pytest.fixture
-def capture(turning, tmp_path) -> Path:
-    shutil.copytree(turning, tmp_path / "capture")
-    return tmp_path / "capture"
-
-
-@pytest.fixture
-def diagnosed(capture, tmp_path):
-    """Runs ia-check on the capture: its exit code and its JSON."""
-
-    def call(*arguments):
-        found = tmp_path / "found.json"
-        words = [str(capture), *map(str, arguments)]
-        code = check.main(
-            [*words, "--json", str(found), "--sheet", str(tmp_path / "sheet.png"), "--overwrite"]
-        )
-        return code, json.loads(found.read_text())
-
-    return call
-
-
-def masks_of(folder: Path) -> list[Path]:
-    return sorted((folder / "masks").iterdir())
-
-
-def change_masks(folder: Path, change) -> None:
-    for row, path in enumerate(masks_of(folder)):
-        cv2.imwrite(str(path), change(row, cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)))
-
-
 @pytest.mark.slow
-def test_poses_of_another_person_from_the_middle_on_are_no_offset(capture, diagnosed):
-    motion = read_poses(capture / "poses.npz")
-    motion.root_translations[FRAMES // 2 :, 0] += 0.9
-    write_motion(capture / "poses.npz", motion)
-    code, found = diagnosed()
+def test_poses_of_another_person_from_the_middle_on_are_no_offset(spoilt, call_check):
+    folder = spoilt()
+    motion = read_poses(folder / "poses.npz")
+    motion.root_translations[20:, 0] += 0.9
+    write_motion(folder / "poses.npz", motion)
+    code, _, found = call_check(folder)
     assert any("(20)" in anomaly for anomaly in found["anomalies"])
     assert found["corrections"] == []
     assert code == 2
 
 
 @pytest.mark.slow
-def test_boxes_are_called_boxes_and_no_focal_length_is_fitted_to_them(capture, diagnosed):
-    def boxed(_, mask):
+def test_boxes_are_called_boxes_and_no_focal_length_is_fitted_to_them(spoilt, call_check):
+    folder = spoilt()
+    for path in (folder / "masks").iterdir():
+        mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         rows, columns = np.nonzero(mask > 127)
         mask[rows.min() : rows.max(), columns.min() : columns.max()] = 255
-        return mask
-
-    change_masks(capture, boxed)
-    _, found = diagnosed()
+        cv2.imwrite(str(path), mask)
+    _, _, found = call_check(folder)
     assert any("boxes" in anomaly for anomaly in found["anomalies"])
     assert found["corrections"] == []
 
 
 def test_poses_on_both_sides_of_a_gap_stay_valid_and_those_within_are_not():
-    motion = Motion(
-        root_rotations=np.zeros((4, 3)),
-        root_translations=np.arange(12.0).reshape(4, 3),
-        joint_rotations=np.zeros((4, 23, 3)),
-        valid=np.ones(4, dtype=bool),
-        betas=np.zeros(10),
-        body_model="smpl",
-    )
+    motion = make_motion(np.zeros((4, 3)), np.arange(12.0).reshape(4, 3))
     geometry = CaptureGeometry(
         motion=motion,
         row_frames=np.array([0.0, 1.0, 5.0, 6.0]),

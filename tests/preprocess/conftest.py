@@ -18,6 +18,7 @@ from preprocess.body.parametric_body import ShapedBody, load_body_model
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.fitting.keypoint_rows import KEYPOINT_JOINTS, KeypointModel
 from preprocess.tracking.keypoints import KeypointTrack
+from tests.motions import make_motion, make_track
 
 
 @pytest.fixture
@@ -39,14 +40,9 @@ def smpl_arrays(rng) -> dict[str, np.ndarray]:
 @pytest.fixture
 def motion(rng) -> Motion:
     """Six small poses."""
-    return Motion(
-        root_rotations=0.3 * rng.normal(size=(6, 3)),
-        root_translations=rng.normal(size=(6, 3)),
-        joint_rotations=0.3 * rng.normal(size=(6, 23, 3)),
-        valid=np.ones(6, dtype=bool),
-        betas=rng.normal(size=10),
-        body_model="body24",
-    )
+    roots, places = 0.3 * rng.normal(size=(6, 3)), rng.normal(size=(6, 3))
+    joints = 0.3 * rng.normal(size=(6, 23, 3))
+    return make_motion(roots, places, joints, betas=rng.normal(size=10))
 
 
 @pytest.fixture
@@ -60,15 +56,8 @@ def truth(rng) -> Motion:
     waves = 0.4 * np.sin(phase[:, None, None] + rng.uniform(0.0, 6.0, (1, 23, 3)))
     waves[:, 21:] = 0.0  # SMPL's hands: no tracker knows more of them
     places = np.column_stack([0.3 * np.sin(phase), 0.2 + 0.0 * phase, 3.0 + 0.4 * np.cos(phase)])
-    return Motion(
-        root_rotations=roots,
-        root_translations=places,
-        joint_rotations=waves,
-        valid=np.ones(count, dtype=bool),
-        betas=0.5 * rng.normal(size=10),
-        body_model="smpl",
-        frames=np.arange(count),
-    )
+    betas = 0.5 * rng.normal(size=10)
+    return make_motion(roots, places, waves, "smpl", betas=betas, frames=np.arange(count))
 
 
 @pytest.fixture
@@ -157,15 +146,8 @@ def turning_person() -> Callable[[int], Motion]:
         joints[:, [0, 1], 0], joints[:, [3, 4], 0] = -0.3, 0.5  # hips and knees
         joints[:, 15], joints[:, 16] = (0.0, 0.0, -0.9), (0.0, 0.0, 0.9)  # shoulders
         joints[:, 17, 1], joints[:, 18, 1] = -0.8, 0.8  # elbows
-        return Motion(
-            root_rotations=roots.as_rotvec(),
-            root_translations=np.tile([0.0, 0.2, 3.0], (count, 1)),
-            joint_rotations=joints,
-            valid=np.ones(count, dtype=bool),
-            betas=np.zeros(10),
-            body_model="body24",
-            frames=np.arange(count),
-        )
+        places = np.tile([0.0, 0.2, 3.0], (count, 1))
+        return make_motion(roots.as_rotvec(), places, joints, frames=np.arange(count))
 
     return turning_person
 
@@ -185,14 +167,9 @@ def track_motion(mean_body, keypoint_camera) -> Callable[[Motion], KeypointTrack
             points.append(np.einsum("pab,pb->pa", carried[:, :3, :3], rest) + carried[:, :3, 3])
         world = np.stack(points)
         pixels = keypoint_camera.project(world.reshape(-1, 3)).reshape(-1, 33, 2)
-        return KeypointTrack(
-            frames=np.arange(len(motion)),
-            image_px=pixels,
-            world_m=world - world[:, [23, 24]].mean(axis=1, keepdims=True),
-            visibility=np.ones((len(motion), 33)),
-            presence=np.ones(len(motion)),
-            size_px=keypoint_camera.size_px,
-            times_s=np.arange(len(motion)) / 30.0,
-        )
+        world -= world[:, [23, 24]].mean(axis=1, keepdims=True)
+        numbers = np.arange(len(motion))
+        parts = {"image_px": pixels, "world_m": world, "times_s": numbers / 30.0}
+        return make_track(numbers, keypoint_camera.size_px, **parts)
 
     return track_motion

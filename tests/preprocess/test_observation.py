@@ -22,7 +22,6 @@ from preprocess.observation import (
     observation_builder,
     shrink_to_longer_side,
 )
-from preprocess.tracking.keypoints import KeypointTrack
 from preprocess.tracking.video_tracking import (
     ANOTHER_NEAR,
     DISAGREEING,
@@ -30,6 +29,7 @@ from preprocess.tracking.video_tracking import (
     PROBLEM_BITS,
     TrackingProblem,
 )
+from tests.motions import make_motion, make_track
 
 SIZE = (48, 64)
 COUNT = 8
@@ -39,15 +39,7 @@ def moving(rows: int, **changes) -> Motion:
     """Poses that carry their row in x."""
     translations = np.zeros((rows, 3))
     translations[:, 0] = np.arange(rows)
-    parts = {
-        "root_rotations": np.zeros((rows, 3)),
-        "root_translations": translations,
-        "joint_rotations": np.zeros((rows, 23, 3)),
-        "valid": np.ones(rows, dtype=bool),
-        "betas": np.zeros(10),
-        "body_model": "body24",
-    }
-    return Motion(**{**parts, **changes})
+    return make_motion(np.zeros((rows, 3)), translations, **changes)
 
 
 @pytest.fixture
@@ -170,15 +162,8 @@ def test_tracked_frames_are_dropped_for_what_was_seen_in_them(parts):
     source, masks, cameras = parts()
     found = [0, 1, 2, 3, 4, 6, 7]
     crowded = PROBLEM_BITS[TrackingProblem.CROWDED]
-    track = KeypointTrack(
-        frames=np.array(found),
-        image_px=np.zeros((7, 33, 2)),
-        world_m=np.zeros((7, 33, 3)),
-        visibility=np.ones((7, 33)),
-        presence=np.ones(7),
-        size_px=SIZE,
-        problems=np.where(np.array(found) == 1, crowded, 0),
-    )
+    problems = np.where(np.array(found) == 1, crowded, 0)
+    track = make_track(np.array(found), SIZE, problems=problems)
     valid = ~np.isin(np.arange(COUNT), [1, 3, 5])
     motion = moving(COUNT, valid=valid, frames=np.arange(COUNT), keypoints=track)
     results = list(observe(source, motion, masks, cameras))

@@ -255,7 +255,7 @@ def test_a_turntable_shows_all_sides_and_ends_where_it_began(frames, player):
         assert np.abs(drawn[picture] - player.render(pose, camera)).mean() < 0.1
 
 
-def test_a_turntable_s_seconds_may_be_left_out(frames, monkeypatch):
+def test_a_turntable_s_seconds_may_be_left_out(frames):
     assert len(frames("--turntable", "--fps", "2")) == 12
     assert len(frames("--turntable", "-3", "--fps", "2")) == 6
 
@@ -379,19 +379,10 @@ def amass(motion, pelvis, folder):
         gender=np.array("male"),
         mocap_framerate=np.array(120.0),
     )
-    return path, ["--fps", "120"]
-
-
-def animation(motion, pelvis, folder):
-    """InstantAvatar's dances: SMPL's 72 numbers, and nothing about time."""
-    path = folder / "dance.npz"
-    joints = motion.joint_rotations.reshape(len(motion), 69)
-    poses = np.column_stack([motion.root_rotations, joints])
-    np.savez(path, poses=poses.astype(np.float32), trans=motion.root_translations)
-    return path, []
+    return path
 
 
 def test_motion_capture_of_120_poses_shows_every_second_one(frames, player, novel, tmp_path):
-    path, _ = amass(read_poses(novel), player.manifest.rest_joints[0], tmp_path)
+    path = amass(read_poses(novel), player.manifest.rest_joints[0], tmp_path)
     fast, usual = frames("--poses", path, "--fps", "120"), frames("--poses", path)
     np.testing.assert_array_equal(usual, fast[::2])

@@ -14,8 +14,9 @@ from instant_avatar.animation.driving_motion import (
     demo_motion,
 )
 from instant_avatar.animation.play_arguments import CLOSE_UP_ZOOM, Viewpoint
-from preprocess.body.body_pose import BodyPose, Motion
+from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import rotation_matrices
+from tests.motions import make_motion
 
 
 @pytest.fixture(scope="module")
@@ -125,16 +126,11 @@ def test_wishes_that_cannot_be_are_named():
             Viewpoint(**wishes)
 
 
-def motion_of(rate, count, rng, *, valid=None):
-    return Motion(
-        root_rotations=rng.normal(size=(count, 3)),
-        root_translations=np.arange(count)[:, None] * np.array([0.1, 0.0, -0.2]),
-        joint_rotations=rng.normal(size=(count, 23, 3)) * 0.5,
-        valid=np.ones(count, dtype=bool) if valid is None else valid,
-        betas=np.zeros(10),
-        body_model="smpl",
-        times_s=None if rate is None else 5.0 + np.arange(count) / rate,
-    )
+def motion_of(rate, count, rng, **changes):
+    roots, joints = rng.normal(size=(count, 3)), rng.normal(size=(count, 23, 3)) * 0.5
+    places = np.arange(count)[:, None] * np.array([0.1, 0.0, -0.2])
+    times_s = None if rate is None else 5.0 + np.arange(count) / rate
+    return make_motion(roots, places, joints, "smpl", times_s=times_s, **changes)
 
 
 @pytest.mark.parametrize(

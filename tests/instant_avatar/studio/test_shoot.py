@@ -114,17 +114,8 @@ def test_novel_poses_are_far_from_all_that_is_filmed(actor):
 
 
 def test_the_folder_is_a_native_capture(capture):
-    top = {
-        "video.mp4",
-        "preview.mp4",
-        "masks",
-        "cameras.npz",
-        "poses.npz",
-        "dance.npz",
-        "truth",
-        LIST,
-    }
-    assert {path.name for path in capture.iterdir()} == top
+    names = ["video.mp4", "preview.mp4", "masks", "cameras.npz", "poses.npz", "dance.npz", "truth"]
+    assert {path.name for path in capture.iterdir()} == {*names, LIST}
     assert len(list((capture / "masks").glob("*.png"))) == SMALL.frames
     with np.load(capture / "cameras.npz") as cameras:
         assert cameras["intrinsic"].shape == (3, 3)

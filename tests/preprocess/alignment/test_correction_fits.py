@@ -8,8 +8,8 @@ import pytest
 from preprocess.alignment.capture_geometry import CaptureGeometry, VideoTransform
 from preprocess.alignment.corrections import fit_to_keypoints
 from preprocess.alignment.keypoint_objective import KeypointObjective, TrackedImage
-from preprocess.body.body_pose import Motion
 from preprocess.body.parametric_body import load_body_model
+from tests.motions import make_motion
 
 SIZE, FRAMES = (120, 160), 6
 
@@ -18,13 +18,10 @@ SIZE, FRAMES = (120, 160), 6
 def true() -> CaptureGeometry:
     """A person who walks and turns in front of a static camera."""
     rng, turns = np.random.default_rng(1), np.linspace(0.0, 2.0, FRAMES)
-    motion = Motion(
-        root_rotations=np.pi * np.column_stack([np.cos(turns), 0.0 * turns, np.sin(turns)]),
-        root_translations=np.column_stack([turns - 1.0, 0.0 * turns + 0.3, 3.5 + 0.4 * turns]),
-        joint_rotations=0.3 * rng.normal(size=(FRAMES, 23, 3)),
-        valid=np.ones(FRAMES, dtype=bool),
-        betas=np.zeros(10),
-        body_model="body24",
+    motion = make_motion(
+        np.pi * np.column_stack([np.cos(turns), 0.0 * turns, np.sin(turns)]),
+        np.column_stack([turns - 1.0, 0.0 * turns + 0.3, 3.5 + 0.4 * turns]),
+        0.3 * rng.normal(size=(FRAMES, 23, 3)),
     )
     return CaptureGeometry(
         motion=motion,

@@ -23,6 +23,7 @@ from preprocess.capture_inputs import CaptureInputs
 from preprocess.capture_session import Capture
 from preprocess.open_capture import open_capture
 from preprocess.poses.pose_file import write_motion
+from tests.motions import make_motion
 
 SIZE, FRAMES = (96, 128), 8
 CAMERA = Camera(focal_px=(190.0, 190.0), center_px=(48.0, 64.0), size_px=SIZE,
@@ -36,14 +37,9 @@ def turning(model: str) -> Motion:
     turns = np.linspace(0.0, np.pi, FRAMES) / 2.0
     joints = 0.15 * rng.normal(size=(1, 23, 3)) + 0.1 * rng.normal(size=(FRAMES, 23, 3))
     joints[:, [15, 16], 2] += -0.7, 0.7
-    return Motion(
-        root_rotations=np.pi * np.column_stack([np.cos(turns), 0.0 * turns, np.sin(turns)]),
-        root_translations=np.array([[0.05 * row - 0.1, 0.1, 3.5] for row in range(FRAMES)]),
-        joint_rotations=joints,
-        valid=np.ones(FRAMES, dtype=bool),
-        betas=np.zeros(10),
-        body_model=model,
-    )
+    roots = np.pi * np.column_stack([np.cos(turns), 0.0 * turns, np.sin(turns)])
+    places = np.array([[0.05 * row - 0.1, 0.1, 3.5] for row in range(FRAMES)])
+    return make_motion(roots, places, joints, model)
 
 
 @pytest.fixture(scope="module")

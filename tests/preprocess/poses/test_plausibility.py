@@ -12,7 +12,7 @@ from preprocess.poses.plausibility import (
     plausibility_warnings,
     require_plausible,
 )
-from preprocess.tracking.keypoints import KeypointTrack
+from tests.motions import make_motion, make_track
 
 WRIST = 19
 """Row of the left wrist among the joints without the root."""
@@ -28,14 +28,7 @@ def walk() -> Motion:
     joints[:, [15, 16], 2] = -1.0, 1.0
     places = np.zeros((POSES, 3))
     places[:, 0], places[:, 2] = 0.04 * np.arange(POSES), 3.0
-    return Motion(
-        root_rotations=np.tile([np.pi, 0.0, 0.1], (POSES, 1)),
-        root_translations=places,
-        joint_rotations=joints,
-        valid=np.ones(POSES, dtype=bool),
-        betas=np.zeros(10),
-        body_model="smpl",
-    )
+    return make_motion(np.tile([np.pi, 0.0, 0.1], (POSES, 1)), places, joints, "smpl")
 
 
 def spun(walk, turns_a_pose: float) -> Motion:
@@ -107,14 +100,7 @@ def turning(count: int, step_rad: float) -> Motion:
     """A person who turns about the vertical axis."""
     roots = np.zeros((count, 3))
     roots[:, 1] = step_rad * np.arange(count)
-    return Motion(
-        root_rotations=roots,
-        root_translations=np.zeros((count, 3)),
-        joint_rotations=np.zeros((count, 23, 3)),
-        valid=np.ones(count, dtype=bool),
-        betas=np.zeros(10),
-        body_model="smpl",
-    )
+    return make_motion(roots, model="smpl")
 
 
 def take_front_for_back(motion: Motion, rows: list[int]) -> Motion:
@@ -183,15 +169,8 @@ def test_poses_that_were_tracked_here_keep_their_fast_joints():
     """They were fitted to the film: a runner's leg swings faster than other trackers are right."""
     motion = turning(60, 0.03)
     motion.joint_rotations[20:23, WRIST, 0] += 2.5
-    keypoints = KeypointTrack(
-        frames=np.arange(60),
-        image_px=np.zeros((60, 33, 2)),
-        world_m=np.zeros((60, 33, 3)),
-        visibility=np.ones((60, 33)),
-        presence=np.ones(60),
-        size_px=(64, 64),
-    )
-    motion = replace(motion, proportions=np.zeros(1), keypoints=keypoints)
+    track = make_track(np.arange(60), (64, 64))
+    motion = replace(motion, proportions=np.zeros(1), keypoints=track)
     kept = require_plausible(motion, "poses.npz").joint_rotations
     np.testing.assert_array_equal(kept, motion.joint_rotations)
     assert list(plausibility_warnings(motion)) == []

@@ -436,19 +436,7 @@ def test_where_romp_could_not_fit_a_place_the_pose_is_lost(world):
 
 def without(rows: np.ndarray, motion: Motion) -> Motion:
     kept = np.setdiff1d(np.arange(len(motion)), rows)
-    return replace(
-        motion,
-        **{
-            name: getattr(motion, name)[kept]
-            for name in (
-                "root_rotations",
-                "root_translations",
-                "joint_rotations",
-                "valid",
-                "frames",
-            )
-        },
-    )
+    return motion.select_rows(kept, motion.frames[kept])
 
 
 def test_a_short_gap_is_bridged_and_a_long_one_stays(world, shaped, joints_of):

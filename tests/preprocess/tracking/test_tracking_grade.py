@@ -12,6 +12,7 @@ from preprocess.body.parametric_body import load_body_model
 from preprocess.tracking.keypoints import KeypointTrack
 from preprocess.tracking.tracking_grade import TrackingGrade, grade_tracking
 from preprocess.tracking.video_tracking import PROBLEM_BITS, TrackingProblem
+from tests.motions import make_motion, make_track
 
 FRAMES = 60
 FPS = 30.0
@@ -30,28 +31,14 @@ def a_motion(turns: float = 1.0, noise_rad: float = 0.0) -> Motion:
     roots = Rotation.from_rotvec(upright) * Rotation.from_rotvec(
         np.column_stack([np.zeros(FRAMES), angles, np.zeros(FRAMES)])
     )
-    return Motion(
-        root_rotations=roots.as_rotvec(),
-        root_translations=np.tile([0.0, 0.0, 3.0], (FRAMES, 1)),
-        joint_rotations=noise_rad * rng.normal(size=(FRAMES, 23, 3)),
-        valid=np.ones(FRAMES, dtype=bool),
-        betas=np.zeros(10),
-        body_model="body24",
-        frames=np.arange(FRAMES),
-    )
+    places, joints = np.tile([0.0, 0.0, 3.0], (FRAMES, 1)), rng.normal(size=(FRAMES, 23, 3))
+    return make_motion(roots.as_rotvec(), places, noise_rad * joints, frames=np.arange(FRAMES))
 
 
 def some_keypoints() -> KeypointTrack:
     image = np.full((FRAMES, 33, 2), 300.0)
     image[:, 0, 1], image[:, 27:33, 1] = 100.0, 500.0
-    return KeypointTrack(
-        frames=np.arange(FRAMES),
-        image_px=image,
-        world_m=np.zeros((FRAMES, 33, 3)),
-        visibility=np.ones((FRAMES, 33)),
-        presence=np.ones(FRAMES),
-        size_px=(600, 600),
-    )
+    return make_track(np.arange(FRAMES), (600, 600), image_px=image)
 
 
 def grade(shaped, keypoints=None, motion=None, iou=0.85, times=TIMES) -> TrackingGrade:
