@@ -371,7 +371,7 @@ def warm_up(trainer: Trainer) -> float:
 
 
 def warm_up_rays(trainer: Trainer) -> Trainer:
-    """Compiles what comes before a step learns, and rendering; returns a trainer with one frame."""
+    """Compiles rendering, and of a step what is not learning; returns a trainer with one frame."""
     stand_in = _small_trainer(trainer)
     rig = stand_in.avatar.rig
     camera = _front_camera(rig)
@@ -381,6 +381,10 @@ def warm_up_rays(trainer: Trainer) -> Trainer:
     operations.update_roots(stand_in.replay.correspondences, 0, poses.skinning, poses.bones[0])
     batch = stand_in.replay.sample_rays(stand_in.config.rays, stand_in.generator)
     stand_in.exposures.neutralize(batch)
+    count = stand_in.config.rays
+    stand_in.exposures.observe(batch, torch.zeros(count, 4))
+    stand_in.learner.shading.observe(torch.zeros(count, 3), batch.target, torch.zeros(count, 4))
+    poses.accumulate(batch.rays.slots.long(), torch.zeros(count, 24, 6), torch.zeros(count))
     return stand_in
 
 

@@ -36,8 +36,8 @@ COMPILE = (
 """Program of the two processes that compile; a seventh of their time would go into garbage."""
 KERNELS = Path(avatar.__file__).parent / "kernels"
 """Folder of the kernel that is compiled last."""
-LAST_KERNEL = "numba_shading.add_light"
-"""Module and name of that kernel, the last one of a training step."""
+LAST_KERNEL = "numba_pose.largest_distance"
+"""Module and name of that kernel, the last one of a step that corrects poses."""
 FIT = "from instant_avatar.run.start_up import fit_for_parent; fit_for_parent()"
 """Program of the process that fits."""
 
@@ -71,9 +71,9 @@ def preparing_to_train(console: "Console") -> Iterator[Callable[[], None]]:
 
             context: Any = cpu_target.target_context
             context.refresh()
-            from avatar.kernels.numba_shading import add_light
+            from avatar.kernels.numba_pose import largest_distance
 
-            cache: Any = getattr(getattr(add_light, "_cache", None), "_cache_file", None)
+            cache: Any = getattr(getattr(largest_distance, "_cache", None), "_cache_file", None)
             is_missing = cache is not None and not cache._load_index()
             if is_missing and not compilers and not has_ended.is_set():
                 compile_beside()

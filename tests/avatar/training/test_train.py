@@ -22,6 +22,9 @@ from avatar.events import (
     WaitingForFrame,
 )
 from avatar.kernels import numba_training_step
+from avatar.kernels.numba_pose import add_rays
+from avatar.kernels.numba_rendering import march
+from avatar.kernels.numba_shading import add_light
 from avatar.render import render
 from avatar.training import train as train_module
 from avatar.training.frame_stream import prepare_frame, prepare_stream
@@ -445,10 +448,13 @@ def test_a_revised_pose_is_that_of_a_frame_that_came_with_it(rig, clip):
     torch.testing.assert_close(*bones)
 
 
-def test_a_process_that_compiles_learning_alone_compiles_what_a_step_calls(rig, monkeypatch):
+def test_two_processes_that_compile_halves_compile_what_a_step_calls(rig, monkeypatch):
     monkeypatch.setattr(train_module, "WARM_THREADS", set())
     trainer = Trainer(rig, TrainConfig())
-    train_module.warm_up(trainer)
-    compiled = set(numba_training_step.learn.overloads)
     train_module.warm_up_learning(trainer)
-    assert set(numba_training_step.learn.overloads) == compiled != set()
+    train_module.warm_up_rays(trainer)
+    halves = (numba_training_step.learn, add_rays, add_light, march)
+    compiled = [set(kernel.overloads) for kernel in halves]
+    train_module.warm_up(trainer)
+    assert [set(kernel.overloads) for kernel in halves] == compiled
+    assert set() not in compiled

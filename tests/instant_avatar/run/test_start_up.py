@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from avatar.kernels import numba_shading
+from avatar.kernels import numba_pose
 from avatar.rig import Rig
 from capture.hardware import usable_cores
 from capture.source_opening import open_source
@@ -44,7 +44,7 @@ def started(monkeypatch):
 def set_index(monkeypatch, index):
     file = SimpleNamespace(_load_index=lambda: index)
     kernel = SimpleNamespace(_cache=SimpleNamespace(_cache_file=file))
-    monkeypatch.setattr(numba_shading, "add_light", kernel)
+    monkeypatch.setattr(numba_pose, "largest_distance", kernel)
 
 
 def test_kernels_that_are_there_start_no_process(started, monkeypatch):
