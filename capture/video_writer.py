@@ -14,6 +14,7 @@ from av.video.reformatter import ColorRange, Colorspace
 from jaxtyping import UInt8
 
 from capture.input_error import InputError, quote_command
+from capture.work_ahead import read_ahead
 
 Pixels = UInt8[np.ndarray, "height width channels"]
 
@@ -79,7 +80,7 @@ def write_video(path: Path, images: Iterable[Pixels], fps: float, codec: VideoCo
     """
     count = 0
     with open_video_writer(path, fps, codec) as write:
-        for image in images:
+        for image in read_ahead(images):
             write(image)
             count += 1
     return count

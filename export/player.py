@@ -4,9 +4,7 @@ player = Player.load("avatar.iavatar")
 rgba = player.render(pose, camera)          # uint8, straight alpha
 """
 
-from collections import deque
 from collections.abc import Generator, Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import final
@@ -17,6 +15,7 @@ from jaxtyping import Float, Float32, UInt8
 
 from capture.camera import Camera
 from capture.input_error import InputError
+from capture.work_ahead import map_ahead
 from export.package.manifest import Manifest
 from export.package.package_file import AvatarPackage, read_package
 from export.player_inputs import (
@@ -252,18 +251,9 @@ class Player:
             for pose, camera in shots:
                 yield self.render(pose, camera, samples=samples)
             return
-        with ThreadPoolExecutor(workers) as executor:
-            drawn = deque[Future[UInt8[np.ndarray, "_ _ 4"]]]()
-            try:
-                for pose, camera in shots:
-                    drawn.append(executor.submit(self.render, pose, camera, samples=samples))
-                    if len(drawn) >= 2 * workers:
-                        yield drawn.popleft().result()
-                while drawn:
-                    yield drawn.popleft().result()
-            finally:
-                for picture in drawn:
-                    picture.cancel()
+        yield from map_ahead(
+            lambda shot: self.render(*shot, samples=samples), shots, workers=workers
+        )
 
     def bones(self, pose: BodyPose, camera: Camera) -> Float32[np.ndarray, "24 3 4"]:
         """Return camera-from-canonical matrices of the joints."""

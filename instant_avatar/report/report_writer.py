@@ -14,7 +14,7 @@ from avatar.evaluation.image_metrics import (
     overall_verdict,
 )
 from capture.atomic_files import atomic_file, write_text_atomically
-from capture.hardware import peak_memory_mb
+from capture.hardware import peak_memory_mb, usable_cores
 from capture.input_error import quote_command
 from capture.live_sources import camera_address
 from export.player import Player
@@ -270,8 +270,9 @@ def demo_animation(player: Player) -> bytes:
     motion = demo_motion()
     camera = FollowingCamera.of(player, motion, ANIMATION_PX)
     frames = ResampledMotion.of(motion, fps=ANIMATION_FPS)
-    poses = [frames.pose(frame) for frame in range(min(len(frames), ANIMATION_FRAMES))]
-    return encode_webp([player.render(p, camera.camera_for(p)) for p in poses], fps=ANIMATION_FPS)
+    poses = (frames.pose(frame) for frame in range(min(len(frames), ANIMATION_FRAMES)))
+    shots = ((pose, camera.camera_for(pose)) for pose in poses)
+    return encode_webp(list(player.render_all(shots, workers=usable_cores())), fps=ANIMATION_FPS)
 
 
 def _fitted_pose_stats(result: TrainingResult) -> HeldOutStats | None:

@@ -7,12 +7,13 @@ the mean than a few of them in whole. Key frames of earlier videos are replayed 
 
 import math
 import time
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple, final
 
+import numba
 import numpy as np
 from jaxtyping import UInt8
 
@@ -42,13 +43,14 @@ from avatar.training.checkpoint import (
 from avatar.training.frame_stream import rebuild_frame
 from avatar.training.held_out_pose_fitting import fit_test_poses
 from avatar.training.trainer import Trainer
+from capture.work_ahead import map_ahead
 from export.build import ExportReport
 from instant_avatar.cli.console import Console
 from instant_avatar.report.report_schema import CurvePoint, EarlierVideoStats, finite_mean
 from instant_avatar.run.run_folder import RunFolder
 from instant_avatar.run.stream_meter import StreamMeter
 
-SCORING_LIMIT_S = 12.0
+SCORING_LIMIT_S = 8.0
 """Wall time that final scoring and pose fitting aim for."""
 WHOLE_IMAGES_SHARE = 0.2
 """Share of that time after which frames in given poses are no longer scored as whole images."""
@@ -170,10 +172,10 @@ def score_finally(
     limit_s = math.inf if trainer.config.steps else SCORING_LIMIT_S
     began, scored, fitted = time.perf_counter(), list[_ScoredFrame](), list[HeldOutScore]()
     whole_until = began + WHOLE_IMAGES_SHARE * limit_s
-    given = _score_in_given_poses(trainer.avatar, held_out, whole_until)
-    while not is_left_out() and (one := next(given, None)) is not None:
-        scored.append(one)
-        report_progress(f"scoring {len(held_out)} held-out frames", len(scored) / len(held_out))
+    with closing(_score_in_given_poses(trainer.avatar, held_out, whole_until)) as given:
+        while not is_left_out() and (one := next(given, None)) is not None:
+            scored.append(one)
+            report_progress(f"scoring {len(held_out)} held-out frames", len(scored) / len(held_out))
     half_transparent = None
     if not is_left_out():
         half_transparent = half_transparent_share(
@@ -198,20 +200,26 @@ def score_finally(
 
 def _score_in_given_poses(
     avatar: Avatar, held_out: list[HeldOutFrame], whole_until: float
-) -> Iterator[_ScoredFrame]:
+) -> Generator[_ScoredFrame, None, None]:
     """Score frames in an order of which every prefix is spread over the video."""
-    for count, frame in enumerate(coarse_to_fine_order(held_out)):
+
+    def score(numbered: tuple[int, HeldOutFrame]) -> _ScoredFrame:
+        numba.set_num_threads(1)  # of this frame; others are scored beside it
+        count, frame = numbered
         late = count >= MIN_WHOLE_IMAGES and time.perf_counter() > whole_until
         if late or count >= MAX_WHOLE_IMAGES:
             sampled = PixelSample.of(frame).score(avatar)
-            yield _ScoredFrame(frame, score_fine_sample(avatar, frame), sampled, None)
-            continue
+            return _ScoredFrame(frame, score_fine_sample(avatar, frame), sampled, None)
         seen = frame.observation
         picture = render(avatar, seen.pose, seen.camera, cells=frame.correspondences, shaded=True)
         white = np.clip(composite_on_white(picture), 0.0, 1.0)
         sampled = PixelSample.of(frame).score_rendering(picture)
         shown = (white * 255.0 + 0.5).astype(np.uint8)
-        yield _ScoredFrame(frame, score_rendering(picture, frame), sampled, shown)
+        return _ScoredFrame(frame, score_rendering(picture, frame), sampled, shown)
+
+    yield from map_ahead(
+        score, enumerate(coarse_to_fine_order(held_out)), workers=numba.get_num_threads()
+    )
 
 
 def _score_in_fitted_poses(
@@ -230,18 +238,28 @@ def _score_in_fitted_poses(
     def check(share: float) -> None:
         if is_left_out():
             raise KeyboardInterrupt
-        done = (first + share * FRAMES_PER_FIT) / len(scored)
-        report_progress("fitting poses to the held-out frames", min(done, 1.0))
 
-    for first in range(0, len(scored), FRAMES_PER_FIT):
+    def fit(first: int) -> list[HeldOutScore]:
+        numba.set_num_threads(1)  # of these frames; others are fitted beside them
         if is_left_out() or (first and time.perf_counter() > until):
-            return
-        some = scored[first : first + FRAMES_PER_FIT]
+            return []
+        some, scores = scored[first : first + FRAMES_PER_FIT], list[HeldOutScore]()
         fitted = fit_test_poses(trainer, [one.frame for one in some], progress=check)
         for one, frame in zip(some, fitted, strict=True):
             score = score_fine_sample if one.rendering is None else score_frame
             after = score(trainer.avatar, frame)
-            yield after if after.psnr >= one.given.psnr else one.given
+            scores.append(after if after.psnr >= one.given.psnr else one.given)
+        return scores
+
+    stage, first_frames = (
+        "fitting poses to the held-out frames",
+        range(0, len(scored), FRAMES_PER_FIT),
+    )
+    report_progress(stage, 0.0)
+    with closing(map_ahead(fit, first_frames, workers=numba.get_num_threads())) as fits:
+        for done, scores in enumerate(fits, start=1):
+            yield from scores
+            report_progress(stage, done / len(first_frames))
 
 
 @final

@@ -17,6 +17,7 @@ from jaxtyping import Float32, Int
 
 from capture.input_error import InputError
 from capture.source import Frame, FrameSource, RgbImage
+from capture.work_ahead import read_ahead
 from preprocess.plugins import PersonTracker
 from preprocess.tracking.keypoints import CroppedMask, KeypointTrack, PersonKeypoints
 
@@ -181,7 +182,7 @@ class VideoTracking:
         """Go through the frames; yields how many are done, and may be left early."""
         finder, size_px = ProblemFinder(), self._source.size_px
         with ThreadPoolExecutor(max_workers=1, thread_name_prefix="masks") as pool:
-            for frame in self._source.frames():
+            for frame in read_ahead(self._source.frames()):
                 person = None if "corrupt" in frame.flags else self._tracker(frame.rgb)
                 self._times_s[frame.index] = frame.time_s
                 seen = finder.problems(person, size_px)
