@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float32, UInt8
 
 from capture.camera import Camera
 from capture.input_error import InputError
@@ -14,6 +14,7 @@ from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.frame_association import associate_by_order, associate_by_time
 from preprocess.masks.mask_sources import MaskSource
+from preprocess.masks.matting import person_colors
 from preprocess.tracking.video_tracking import reason_left_out
 
 
@@ -38,6 +39,12 @@ class Observation:
         """Refuse images, masks and cameras of different sizes: they are our own bug by now."""
         height, width = self.alpha.shape
         assert self.frame.size_px == (width, height) == self.camera.size_px
+
+    def person_colors(self) -> Float32[np.ndarray, "height width 3"]:
+        """The person's own color of each pixel, in levels: that of an image cut out, as it is."""
+        if self.frame.alpha is not None:
+            return self.frame.rgb.astype(np.float32)
+        return person_colors(self.frame.rgb, self.alpha)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -67,14 +67,17 @@ def composite_on_white(
 def ground_truth_over(
     observation: Observation, background: float
 ) -> Float32[np.ndarray, "height width 3"]:
-    """Ground truth of a rendering over a gray: alpha · image + (1 - alpha) · background."""
+    """Ground truth of a rendering over a gray: alpha · color + (1 - alpha) · background.
+
+    The color is the person's own, without the background that the image's borders hold.
+    """
     alpha = observation.alpha[..., None]
-    picture = observation.frame.rgb.astype(np.float32) / 255.0
+    picture = observation.person_colors() / np.float32(255.0)
     return alpha * picture + np.float32(background) * (1.0 - alpha)
 
 
 def ground_truth_on_white(observation: Observation) -> Float32[np.ndarray, "height width 3"]:
-    """Ground truth of a rendering on white: alpha · image + (1 - alpha) · white."""
+    """Ground truth of a rendering on white: alpha · color + (1 - alpha) · white."""
     return ground_truth_over(observation, 1.0)
 
 

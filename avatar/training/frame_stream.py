@@ -60,7 +60,7 @@ def prepare_frame(observation: Observation, rig: Rig) -> TrainingFrame:
     """Solves the frame's correspondences and selects its training pixels."""
     near = near_person_mask(observation.alpha)
     view = RayView.of(observation.camera, near)
-    colors = premultiplied_rgba(observation.frame.rgb, observation.alpha, near)
+    colors = premultiplied_rgba(observation.person_colors(), observation.alpha, near)
     head = picture_head(observation, rig)
     return _assemble_frame(observation.frame.index, observation.pose, view, colors, head, rig)
 

@@ -20,6 +20,7 @@ from avatar.training.training_pixels import (
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import HEAD_JOINT, body_from_rest
+from preprocess.masks.matting import person_colors
 from preprocess.observation import Observation
 
 HEAD_UP_M = 0.08
@@ -66,7 +67,10 @@ def picture_head(observation: Observation, rig: Rig) -> TrainingPixels | None:
     large, pixels = enlarge(alpha, cv2.INTER_LINEAR), round(float(1.0 / step.min()))
     if pixels > 1:  # as many of the picture lie across one of the mask
         large = cv2.ximgproc.guidedFilter(part, large, pixels, EDGE_VARIANCE)
-    colors = premultiplied_rgba(part, np.clip(large, 0.0, 1.0), near)
+    large = np.clip(large, 0.0, 1.0)
+    if observation.frame.alpha is None:  # an image that is cut out shows the person alone
+        part = person_colors(part, large)
+    colors = premultiplied_rgba(part, large, near)
     return head_pixels(RayView.of(camera, near), colors)
 
 

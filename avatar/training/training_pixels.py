@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Int, Int32, UInt8
+from jaxtyping import Bool, Int, Int32, Shaped, UInt8
 
 from capture.camera import Camera
-from capture.source import AlphaMask, RgbImage
+from capture.source import AlphaMask
 
 NEAR_MASK_SHARE = 0.035
 """Distance from the mask within which pixels are near the person, in image heights."""
@@ -79,9 +79,11 @@ class TrainingPixels(NamedTuple):
 
 
 def premultiplied_rgba(
-    rgb: RgbImage, alpha: AlphaMask, near: Bool[np.ndarray, "height width"]
+    rgb: Shaped[np.ndarray, "height width 3"],
+    alpha: AlphaMask,
+    near: Bool[np.ndarray, "height width"],
 ) -> UInt8[np.ndarray, "near 4"]:
-    """Color times alpha, and alpha, of the pixels near the person, in 8 bits."""
+    """Color times alpha, and alpha, of the pixels near the person, in 8 bits; `rgb` in levels."""
     places = np.flatnonzero(near)
     alphas = alpha.reshape(-1).take(places)
     colors = rgb.reshape(-1, 3).take(places, axis=0)

@@ -23,6 +23,7 @@ from avatar.training.trainer import Trainer
 from capture.camera import Camera
 from capture.source import Frame
 from preprocess.body.body_pose import BodyPose
+from preprocess.masks.matting import person_colors
 from preprocess.observation import DroppedFrame, Observation
 
 
@@ -89,15 +90,34 @@ def observed(rgb, alpha) -> Observation:
 
 def test_the_truth_is_the_picture_where_the_person_is_and_white_elsewhere():
     rgb = np.array([[[255, 51, 0], [10, 20, 30], [0, 102, 204]]], dtype=np.uint8)
-    alpha = np.array([[1.0, 0.0, 0.5]], dtype=np.float32)
-    expected = [[[1.0, 0.2, 0.0], [1.0, 1.0, 1.0], [0.5, 0.7, 0.9]]]
+    alpha = np.array([[1.0, 0.0, 1.0]], dtype=np.float32)
+    expected = [[[1.0, 0.2, 0.0], [1.0, 1.0, 1.0], [0.0, 0.4, 0.8]]]
     np.testing.assert_allclose(ground_truth_on_white(observed(rgb, alpha)), expected, atol=1e-6)
+
+
+def test_the_truth_holds_little_background_at_the_persons_border():
+    alpha = np.tile(np.array([0, 0, 0, 0.3, 1, 1, 1, 0.6, 0, 0], np.float32), (9, 1))
+    person, green = np.array([200.0, 40.0, 90.0]), np.array([0.0, 255.0, 0.0])
+    rgb = np.rint(alpha[..., None] * person + (1.0 - alpha[..., None]) * green).astype(np.uint8)
+    expected = alpha[..., None] * (person / 255.0) + 1.0 - alpha[..., None]
+    as_shown = alpha[..., None] * (rgb / 255.0) + 1.0 - alpha[..., None]
+    error = np.abs(ground_truth_on_white(observed(rgb, alpha)) - expected).max()
+    assert error < 0.3 * np.abs(as_shown - expected).max()
+
+
+def test_an_image_that_is_cut_out_shows_the_person_alone(rng):
+    rgb = rng.integers(0, 256, (7, 5, 3), dtype=np.uint8)
+    alpha = rng.random((7, 5), dtype=np.float32)
+    seen = observed(rgb, alpha)
+    seen = replace(seen, frame=replace(seen.frame, alpha=np.rint(255 * alpha).astype(np.uint8)))
+    expected = alpha[..., None] * (rgb / np.float32(255.0)) + 1.0 - alpha[..., None]
+    np.testing.assert_allclose(ground_truth_on_white(seen), expected, atol=1e-6)
 
 
 def test_a_perfect_rendering_on_white_is_the_truth(rng):
     rgb = rng.integers(0, 256, (7, 5, 3), dtype=np.uint8)
     alpha = rng.random((7, 5), dtype=np.float32)
-    color = rgb.astype(np.float32) / 255.0 * alpha[..., None]
+    color = person_colors(rgb, alpha) / np.float32(255.0) * alpha[..., None]
     perfect = np.concatenate([color, alpha[..., None]], axis=-1)
     np.testing.assert_allclose(
         composite_on_white(perfect), ground_truth_on_white(observed(rgb, alpha)), atol=1e-6
