@@ -146,8 +146,6 @@ MECHANISMS = [
         code=(
             "avatar.training.pose_correction.TemporalPosePrior",
             "avatar.training.pose_correction.prior_from_neighbors",
-            "avatar.training.pose_correction.neighbor_correlations",
-            "avatar.training.pose_correction.neighbor_precision",
             "avatar.training.pose_correction._add_up_neighbors",
         ),
     ),

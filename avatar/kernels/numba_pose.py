@@ -281,10 +281,9 @@ def add_rays(
 
 @compile_kernel(**FAST_MATH)
 def gauss_newton(
-    curvature, gradient, stiffness, correction, mean, precision, sigmas, share, max_step, change,
-    alone,
+    curvature, gradient, stiffness, correction, mean, precision, sigmas, share, max_step, change
 ):  # fmt: skip
-    """Step of a pose correction, and the correction that its rays alone would make.
+    """Step of a pose correction.
 
         (C + s p) Δ = -(g + s p (correction - mean)), in prior sigmas
 
@@ -297,7 +296,7 @@ def gauss_newton(
         sigmas: Prior standard deviation of each row (25).
         share: Factor of the step.
         max_step: Largest change of a number.
-        change, alone: The step, and what the rays alone converge to, in sigmas; written.
+        change: The step; written.
     """
     back, factor = np.empty(75), np.empty((75, 75))
     found, largest = np.empty(75), max_step
@@ -307,11 +306,7 @@ def gauss_newton(
     for i in range(75):
         change[i // 3, i % 3] = -share * sigmas[i // 3] * found[i]
         largest = max(largest, abs(change[i // 3, i % 3]))
-        back[i] = correction[i // 3, i % 3] / sigmas[i // 3]
-    solve_with_prior(curvature, gradient, stiffness, back, factor, found)
-    for i in range(75):
-        change[i // 3, i % 3] *= max_step / largest
-        alone[i // 3, i % 3] = back[i] - found[i]
+    change *= max_step / largest
 
 
 @compile_kernel(**FAST_MATH)

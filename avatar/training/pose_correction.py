@@ -6,9 +6,7 @@ their sum: errors of the field point each ray's gradient another way, an error o
 them all one way.
 
 A tracker's error changes slowly from frame to frame. Where a frame's own rays leave its pose
-undetermined, the corrections of neighboring frames are a better guess than none. How good a guess
-is measured on the corrections that the rays alone would make: how alike they are in neighboring
-frames, and how fast that fades, tells the noise of the rays from errors that change.
+undetermined, the corrections of neighboring frames are a better guess than none.
 """
 
 import math
@@ -22,23 +20,10 @@ from avatar.kernels import numba_pose
 from avatar.kernels.kernel_compiler import FAST_MATH, compile_kernel
 from avatar.kernels.threads import run_threads
 
-MIN_NEIGHBOR_TRIPLES = 12
-"""Frames between two neighbors below which nothing is known about neighbors' errors."""
 MAX_FRAME_GAP = 6
 """Distance in frames beyond which neighbors are ignored."""
-MIN_CORRELATION = 0.1
-"""Correlation of neighbors' estimates up to which they are ignored."""
-FULL_CORRELATION = 0.3
-"""Correlation of neighbors' estimates from which they have their full precision."""
-NEIGHBOR_PRECISION = 16.0
-"""Precision of all neighbors together, relative to that of the tracker's pose, where the noise of
-an estimate is as large as the error that neighbors leave unknown."""
-MIN_NOISE_SHARE = 0.1
-"""Least share of noise in the estimates' power."""
-PRIORS_PER_PRECISION = 8
-"""Priors for which the neighbors' precision, a sum over all frames, is measured once."""
-MAX_PERSISTENCE = 0.9
-"""Largest correlation of neighbors' errors that is believed."""
+NEIGHBOR_PRECISION = 8.0
+"""Precision of all neighbors together, relative to that of the tracker's pose."""
 
 
 class PosePrior(NamedTuple):
@@ -58,95 +43,23 @@ UNINFORMATIVE_PRIOR = PosePrior(np.zeros((25, 3)), 1.0)
 
 @final
 class TemporalPosePrior:
-    """Estimates of the replay frames' corrections, as neighbors of one another."""
+    """The replay frames as neighbors of one another."""
 
     def __init__(self, capacity: int) -> None:
         """Starts without frames."""
         self._frames = np.zeros(capacity, dtype=np.int64)
-        self._precision, self._priors = 0.0, 0
-        self._unregularized = np.zeros((capacity, 25, 3))
-        self._is_sequential, self._has_estimate = np.zeros((2, capacity), dtype=bool)
+        self._is_sequential = np.zeros(capacity, dtype=bool)
 
     def set_frame(self, slot: int, frame: int | None) -> None:
         """Assigns a frame number to a slot; None if the frame has no neighbors."""
-        self._is_sequential[slot], self._has_estimate[slot] = frame is not None, False
-        self._frames[slot] = frame or 0
-        self._priors = 0
-
-    def record_estimate(self, slot: int, unregularized: Float[np.ndarray, "25 3"]) -> None:
-        """Records the correction that a slot's rays alone would make, in prior sigmas."""
-        self._unregularized[slot], self._has_estimate[slot] = (
-            unregularized,
-            self._is_sequential[slot],
-        )
+        self._is_sequential[slot], self._frames[slot] = frame is not None, frame or 0
 
     def prior_for(self, slot: int, corrections: Float[np.ndarray, "slots 25 3"]) -> PosePrior:
         """Prior of a slot's correction from the other slots."""
         row = self._is_sequential
         if not row[slot]:
             return UNINFORMATIVE_PRIOR
-        if self._priors % PRIORS_PER_PRECISION == 0:
-            self._precision = neighbor_precision(
-                self._frames, self._unregularized, self._has_estimate
-            )
-        self._priors += 1
-        frame = int(self._frames[slot])
-        return prior_from_neighbors(frame, self._frames, corrections, row, self._precision)
-
-
-@compile_kernel(**FAST_MATH)
-def neighbor_correlations(
-    order: Int64[np.ndarray, "frames"],
-    frames: Int64[np.ndarray, "frames"],
-    estimates: Float[np.ndarray, "frames 25 3"],
-    known: Bool[np.ndarray, "frames"],
-) -> tuple[float, float]:
-    """Correlations of estimates one frame apart, and two, in [-1, 1]; zeros if there are too few.
-
-    `order` sorts the frames, and the next known one counts as one apart. `estimates` are each
-    frame's correction by its rays alone, in any unit.
-    """
-    triples, power, one_apart, two_apart, first, middle = 0, 0.0, 0.0, 0.0, -1, -1
-    for last in order:
-        if not known[last]:
-            continue
-        if middle >= 0 and frames[last] - frames[middle] > MAX_FRAME_GAP:
-            middle = -1
-        if middle >= 0 and first >= 0:
-            triples += 1
-            for j in range(25):
-                for a in range(3):
-                    x, y, z = estimates[first, j, a], estimates[middle, j, a], estimates[last, j, a]
-                    power += (x * x + y * y + z * z) / 3.0
-                    one_apart += 0.5 * y * (x + z)
-                    two_apart += x * z
-        first, middle = middle, last
-    if triples < MIN_NEIGHBOR_TRIPLES:
-        return 0.0, 0.0
-    return one_apart / max(power, 1e-12), two_apart / max(power, 1e-12)
-
-
-def neighbor_precision(
-    frames: Int64[np.ndarray, "frames"],
-    estimates: Float[np.ndarray, "frames 25 3"],
-    known: Bool[np.ndarray, "frames"],
-) -> float:
-    """Precision of what neighbors tell about a frame's error, relative to the tracker's pose's.
-
-    An estimate is the error of a pose and the noise of its rays. Noise differs from frame to frame,
-    while errors change gradually, in the simplest case with correlations r, r² at one, two frames
-    apart. So r is the ratio of the estimates' correlations, the share of noise is what is missing
-    to 1 at distance 0, and neighbors leave (1 - r²) / (1 + r²) of the errors' power unknown.
-    """
-    one_apart, two_apart = neighbor_correlations(np.argsort(frames), frames, estimates, known)
-    share = (one_apart - MIN_CORRELATION) / (FULL_CORRELATION - MIN_CORRELATION)
-    if share <= 0.0:
-        return 0.0
-    # with e the errors' share of the power, the correlations are e r and e r²
-    persistence = min(max(two_apart / one_apart, one_apart), MAX_PERSISTENCE)
-    errors = one_apart / persistence
-    unknown = errors * (1.0 - persistence**2) / (1.0 + persistence**2)
-    return min(share, 1.0) * NEIGHBOR_PRECISION * max(1.0 - errors, MIN_NOISE_SHARE) / unknown
+        return prior_from_neighbors(int(self._frames[slot]), self._frames, corrections, row)
 
 
 @compile_kernel(**FAST_MATH)
@@ -168,19 +81,18 @@ def prior_from_neighbors(
     frames: Int64[np.ndarray, "frames"],
     corrections: Float[np.ndarray, "frames 25 3"],
     held: Bool[np.ndarray, "frames"],
-    precision: float,
 ) -> PosePrior:
     """Prior of a correction: the mean of neighboring frames' corrections, weighted by nearness.
 
-    Frames that are not `held`, and `frame` itself, are ignored. `precision` is that of all
-    neighbors together, relative to that of the tracker's pose.
+    Frames that are not `held`, and `frame` itself, are ignored.
     """
     total = np.zeros((25, 3))
     weights = _add_up_neighbors(frame, frames, corrections, held, total)
-    if precision == 0.0 or weights == 0.0:
+    if weights == 0.0:
         return UNINFORMATIVE_PRIOR
     # product of two Gaussians: the tracker's pose (mean 0, precision 1) and the neighbors' mean
-    return PosePrior(precision / (1.0 + precision) / weights * total, 1.0 + precision)
+    precision = 1.0 + NEIGHBOR_PRECISION
+    return PosePrior(NEIGHBOR_PRECISION / precision / weights * total, precision)
 
 
 def interpolate_correction(
@@ -190,9 +102,7 @@ def interpolate_correction(
     if not corrections:
         return UNINFORMATIVE_PRIOR.mean
     frames, found = np.array(list(corrections)), np.array(list(corrections.values()))
-    held = np.ones(len(frames), dtype=bool)
-    precision = neighbor_precision(frames, found, held)
-    return prior_from_neighbors(frame, frames, found, held, precision).mean
+    return prior_from_neighbors(frame, frames, found, np.ones(len(frames), dtype=bool)).mean
 
 
 PRIOR_SIGMA_RAD = 0.05
@@ -309,12 +219,10 @@ class GaussNewtonStep(NamedTuple):
         change: Change of the correction: radians, and metres in the last row.
         evidence: Mean of (Σ g)² / Σ g² over the directions that the rays determine: about 1 if
             their gradients g are noise, about the number of rays if all agree.
-        unregularized: Correction that the rays alone would converge to, in prior sigmas.
     """
 
     change: Float[np.ndarray, "25 3"]
     evidence: float
-    unregularized: Float[np.ndarray, "25 3"]
 
 
 def gauss_newton_step(
@@ -336,12 +244,12 @@ def gauss_newton_step(
         full = FULL_EVIDENCE - MIN_EVIDENCE
         share = min(max((0.5 * (evidence + shared_evidence) - MIN_EVIDENCE) / full, 0.0), 1.0)
 
-    change, alone = np.empty((2, 25, 3))
+    change = np.empty((25, 3))
     numba_pose.gauss_newton(
         rays.curvature, rays.gradient, rays.ray_stiffness, correction, prior.mean,
-        float(prior.precision), SIGMA_OF_ROW, share, MAX_STEP, change, alone,
+        float(prior.precision), SIGMA_OF_ROW, share, MAX_STEP, change,
     )  # fmt: skip
-    return GaussNewtonStep(change, evidence, alone)
+    return GaussNewtonStep(change, evidence)
 
 
 def _agreement(rays: NormalEquations) -> float:

@@ -258,7 +258,6 @@ class PoseOptimizer:
             evidence,
             prior=prior._replace(precision=self._prior_precision * prior.precision),
         )
-        self._temporal_prior.record_estimate(slot, step.unregularized)
         self._evidence = (
             EVIDENCE_EMA_DECAY * self._evidence + (1.0 - EVIDENCE_EMA_DECAY) * step.evidence
         )

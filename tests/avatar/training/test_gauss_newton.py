@@ -84,16 +84,6 @@ def test_what_no_ray_feels_goes_to_where_it_is_expected(slopes, rng):
     assert np.linalg.norm(np.delete(step.change, 7, axis=0)) > 0.1
 
 
-def test_what_rays_alone_ask_for_is_where_they_end_whatever_is_expected(slopes, rng):
-    off = rng.normal(size=(25, 3)) * SCALE * 0.3
-    correction = rng.normal(size=(25, 3)) * SCALE * 0.1
-    told = PosePrior(rng.normal(size=(25, 3)) * SCALE, 13.0)
-    one = gauss_newton_step(rays_of(slopes, off + correction), correction, 1.0)
-    other = gauss_newton_step(rays_of(slopes, off + correction), correction, 1.0, prior=told)
-    np.testing.assert_array_equal(one.unregularized, other.unregularized)
-    np.testing.assert_allclose(one.unregularized, -off / SCALE, atol=0.05)
-
-
 def test_rays_that_feel_nothing_ask_for_nothing():
     step = gauss_newton_step(summed(np.zeros((9, 25, 3)), np.zeros(9)), NONE, 1.0)
     assert step.evidence == 0.0
