@@ -259,7 +259,7 @@ class _PackageDraft:
     ) -> ExportReport:
         """Check and write a package, which took `seconds` so far; `level` is zlib's.
 
-        `difference` is that of its graphs from their references, where an earlier package of the
+        `difference` is that of its graphs from their own rays, where an earlier package of the
         same graphs was checked: only the tables differ.
         """
         started = time.perf_counter()

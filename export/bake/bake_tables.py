@@ -37,7 +37,7 @@ from preprocess.body.kinematics import body_from_rest
 
 
 class ExportRefused(RuntimeError):  # noqa: N818 - names what happened
-    """The avatar is empty, or its graph does not match the reference; no package is written."""
+    """The avatar is empty, or its graph does not draw what its rays see; no package is written."""
 
 
 OUTER_MARGIN_M = 0.012
