@@ -54,4 +54,4 @@ def test_it_learns(person, rig, clip):
     system = BaselineSystem(NeuralBody(person, 2, TINY), person, frames, TINY)
     losses = [system.step(share / 40.0) for share in range(40)]
     assert sum(losses[-5:]) < 0.8 * sum(losses[:5])
-    assert system.render(clip.novel)[..., 3].max() <= 1.0
+    assert system.render(clip.novel)[..., 3].max() <= 1.0 + 1e-5
