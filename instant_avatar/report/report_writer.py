@@ -6,6 +6,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, final
 
+import numba
+
 from avatar.evaluation.all_round_verdict import TRAIN_LONGER
 from avatar.evaluation.image_metrics import (
     MAX_MEASURABLE_BLUR,
@@ -14,7 +16,7 @@ from avatar.evaluation.image_metrics import (
     overall_verdict,
 )
 from capture.atomic_files import atomic_file, write_text_atomically
-from capture.hardware import peak_memory_mb, usable_cores
+from capture.hardware import peak_memory_mb
 from capture.input_error import quote_command
 from capture.live_sources import camera_address
 from export.player import Player
@@ -272,7 +274,8 @@ def demo_animation(player: Player) -> bytes:
     frames = ResampledMotion.of(motion, fps=ANIMATION_FPS)
     poses = (frames.pose(frame) for frame in range(min(len(frames), ANIMATION_FRAMES)))
     shots = ((pose, camera.camera_for(pose)) for pose in poses)
-    return encode_webp(list(player.render_all(shots, workers=usable_cores())), fps=ANIMATION_FPS)
+    drawn = player.render_all(shots, workers=numba.get_num_threads())
+    return encode_webp(list(drawn), fps=ANIMATION_FPS)
 
 
 def _fitted_pose_stats(result: TrainingResult) -> HeldOutStats | None:

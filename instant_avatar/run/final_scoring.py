@@ -181,7 +181,7 @@ def score_finally(
         half_transparent = half_transparent_share(
             render_unfilmed_views(trainer.avatar, reduction=UNFILMED_REDUCTION)
         )
-    if fit_poses:
+    if fit_poses and not is_left_out():
         with suppress(KeyboardInterrupt):
             for score in _score_in_fitted_poses(
                 trainer, scored, began + limit_s, report_progress, is_left_out

@@ -1,6 +1,6 @@
 """Tracks the person of a recording: key points in memory, masks as images in a folder.
 
-Networks run on one thread; masks are refined and written on another, so two cores are busy. Frames
+Networks run on one thread; frames are decoded on another, and masks refined on a third. Frames
 in which borders of the image or other persons make the track doubtful are marked.
 """
 

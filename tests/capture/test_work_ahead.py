@@ -17,7 +17,7 @@ def test_results_come_in_the_order_of_the_items(workers):
 
 def test_two_threads_work_side_by_side():
     both = threading.Barrier(2, timeout=60.0)
-    list(map_ahead(lambda _: both.wait(), range(4), workers=2))  # one alone would wait for ever
+    list(map_ahead(lambda _: both.wait(), range(4), workers=2))  # one alone would wait in vain
 
 
 def test_items_are_taken_only_a_few_ahead():
