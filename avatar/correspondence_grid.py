@@ -35,6 +35,7 @@ from avatar.kernels.numba_skinning import MATRIX_LANES
 from avatar.kernels.operands import DensityGrid, RayBatch, RaySamples
 from avatar.rig import CLOTHING_BAND_M, Rig
 from capture.camera import Camera
+from preprocess.body.body_surface import NEAR_PLANE_M
 
 CORRESPONDENCE_CELL_M = 0.03
 
@@ -72,10 +73,6 @@ class CorrespondenceGrid:
         return cls(low=low, cell_m=CORRESPONDENCE_CELL_M, packed_cells=packed_cells, roots=roots)
 
 
-MIN_DEPTH_M = 0.05
-"""Depth below which a corner of the box cannot be projected, metres."""
-
-
 def cull_cells(cells: CorrespondenceGrid, grid: DensityGrid) -> CorrespondenceGrid:
     """Empties the cells that lead to unoccupied space; no sample of another cell is lost.
 
@@ -109,7 +106,7 @@ def screen_bounds(
     corners = np.array(list(itertools.product(*sides.T)))
     in_world = corners @ world_from_body[:3, :3].T + world_from_body[:3, 3]
     depth = in_world @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
-    if camera.distortion or depth.min() < MIN_DEPTH_M:  # the projected corners bound no box
+    if camera.distortion or depth.min() < NEAR_PLANE_M:  # the projected corners bound no box
         return whole
     pixels = camera.project(in_world)
     left, top = np.floor(pixels.min(axis=0)).clip(0).astype(int).tolist()

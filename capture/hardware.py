@@ -9,16 +9,13 @@ from pathlib import Path
 
 import psutil
 
-CGROUP = Path("/sys/fs/cgroup")
-"""Limits of a container (Linux, version 2), which psutil does not know."""
-
 
 def usable_cores() -> int:
     """Return the cores that this process may use: affinity, and the quota of a container."""
     affine = hasattr(os, "sched_getaffinity")  # not everywhere
     cores = len(os.sched_getaffinity(0)) if affine else os.cpu_count() or 1
     with suppress(OSError, ValueError):
-        quota, period = (CGROUP / "cpu.max").read_text(encoding="ascii").split()
+        quota, period = (Path("/sys/fs/cgroup") / "cpu.max").read_text(encoding="ascii").split()
         cores = min(cores, max(1, int(quota) // int(period)))
     return cores
 
@@ -41,10 +38,6 @@ def describe_machine() -> dict[str, object]:
     }
 
 
-PROC_STATUS = Path("/proc/self/status")
-"""Linux's figures about this process."""
-
-
 def peak_memory_mb() -> float:
     """The most that this process has held at a time, MiB.
 
@@ -52,7 +45,7 @@ def peak_memory_mb() -> float:
     (fs/exec.c sets maxrss of the memory that is left behind); /proc does not.
     """
     try:
-        lines = PROC_STATUS.read_text(encoding="ascii").splitlines()
+        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
         return next(float(line.split()[1]) / 1024.0 for line in lines if line.startswith("VmHWM:"))
     except (OSError, ValueError, StopIteration):  # another system
         with suppress(ImportError):  # Windows has no such module

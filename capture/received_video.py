@@ -19,8 +19,6 @@ from capture.input_error import InputError
 from capture.source import Frame, FrameSelection, FrameSource, PacingClock
 from capture.video import DecodedFrame, decode
 
-NOTE_SUFFIX = ".received"
-"""Added to the video's name: the note of what has come of it."""
 POLL_S = 0.01
 """Interval at which a reader looks for bytes that it waits for, seconds."""
 MAX_LONGER_PX = 1920
@@ -114,7 +112,7 @@ class ReceivedFile:
 
 def note_of(path: Path) -> Path:
     """The note beside a video that is being received."""
-    return path.with_name(path.name + NOTE_SUFFIX)
+    return path.with_name(path.name + ".received")
 
 
 @final

@@ -19,8 +19,6 @@ VIDEO_SUFFIXES = frozenset(
     {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".ts", ".wmv"}
 )
 """File endings of videos that are read."""
-CONTAINERS_WITH_FRAME_COUNT = frozenset({".mp4", ".mov", ".m4v", ".avi", ".3gp"})
-"""Containers that count their frames; of others the count is an estimate from the duration."""
 MAX_PIXEL_STRETCH = 0.02
 """Relative difference of a pixel's width and height from which it is worth a word."""
 MAX_DECODE_FAILURES = 16
@@ -178,7 +176,8 @@ class VideoFile(FrameSource):
 
     def _compare_with_claim(self, count: int, end_s: float) -> None:
         """Warn if the container claims more than was decoded."""
-        counted = self.path.suffix.lower() in CONTAINERS_WITH_FRAME_COUNT
+        # other containers estimate the count from the duration
+        counted = self.path.suffix.lower() in {".mp4", ".mov", ".m4v", ".avi", ".3gp"}
         duration_s = self.frames_in_file / max(self._fps, 1e-6)
         if counted and count < self.frames_in_file:
             decoded = f"only {count} of {self.frames_in_file} frames could be decoded"

@@ -97,9 +97,6 @@ def runtime_files(folder: Path | None = None) -> dict[str, bytes]:
 
 PAGE_SUFFIXES = (".html", ".css", ".js", ".svg")
 """Suffixes of the page's own files."""
-PAGE_SCRIPT = "ort.js"
-"""Name of onnxruntime's script on the page: hosts such as nginx serve .mjs as
-application/octet-stream, which browsers do not run."""
 PACKAGE_FILE, MOTION_FILE = "avatar.iavatar", "motion.npz"
 """The package and its motion, as index.html names them."""
 PACKED_WASM_FILE = f"{WASM_FILE}.zlib"
@@ -139,7 +136,8 @@ def player_files(motions: Mapping[str, bytes], *, compression_level: int) -> dic
     index = pages["index.html"].replace(b"<!-- motions -->", "".join(options).encode())
     runtime[PACKED_WASM_FILE] = pack_runtime(compression_level)
     del runtime[WASM_FILE]
-    runtime[PAGE_SCRIPT] = runtime.pop(SCRIPT_FILE)
+    # hosts such as nginx serve .mjs as application/octet-stream, which browsers do not run
+    runtime["ort.js"] = runtime.pop(SCRIPT_FILE)
     return {
         **pages,
         "index.html": index,

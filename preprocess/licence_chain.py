@@ -37,8 +37,6 @@ LICENCES = {
     },
 }  # fmt: skip
 """Programs as `Motion.program` names them, and families of bodies."""
-BUILT_IN_MASKS = "estimated by BlazePose"
-"""Origin of the built-in segmenter's masks."""
 
 
 def made_with(capture: Capture) -> list[dict[str, str]]:
@@ -61,7 +59,7 @@ def _mask_licence(capture: Capture, motion: Motion) -> Licence:
     beside = files.masks is not None and files.masks.parent == files.poses.parent
     if masks == "tracked" or (beside and motion.is_fitted):  # by the tracker of the poses
         return _known(motion.program, f"{masks} of unknown origin")
-    if masks == BUILT_IN_MASKS:
+    if masks == "estimated by BlazePose":
         return LICENCES[DEFAULT_TRACKER]
     return Licence(f"masks of unknown origin ({masks})", "unknown", "unknown")
 

@@ -167,7 +167,6 @@ PARTS_OF_LIMB = {
     "arm": ("upper arm", "forearm", "hand"),
     "leg": ("thigh", "shin", "foot"),
 }
-PLURALS = {"hand": "hands", "foot": "feet", "arm": "arms", "leg": "legs"}
 ALL_AROUND = "all around"
 """Side of a limb that was not seen at all."""
 
@@ -283,7 +282,7 @@ def _limb_sides(
 
 def _advice_sentence(region: UnseenRegion) -> str:
     limb = (
-        PLURALS[region.limb]
+        {"hand": "hands", "foot": "feet", "arm": "arms", "leg": "legs"}[region.limb]
         if region.laterality == "both"
         else f"{region.laterality} {region.limb}".strip()
     )

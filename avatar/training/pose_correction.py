@@ -121,7 +121,6 @@ MAX_STEP = 0.1
 
 
 SIGMA_OF_ROW = np.append(np.full(24, PRIOR_SIGMA_RAD), PRIOR_SIGMA_M)
-PRIOR_SIGMAS = SIGMA_OF_ROW[:, None]
 """Prior standard deviation of each row of a correction."""
 
 

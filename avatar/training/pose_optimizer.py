@@ -23,7 +23,7 @@ from avatar.kernels.operands import SkinningVolume
 from avatar.rig import Rig
 from avatar.training.pose_correction import (
     MIN_EVIDENCE,
-    PRIOR_SIGMAS,
+    SIGMA_OF_ROW,
     JointFrames,
     RaySums,
     TemporalPosePrior,
@@ -299,7 +299,7 @@ class PoseOptimizer:
 
     def pose_gradient(self, slot: int) -> Float[np.ndarray, "25 3"]:
         """Gradient of the accumulated rays' losses with respect to the slot's correction."""
-        return self._rays.equations(slot).gradient[:75].reshape(25, 3) / PRIOR_SIGMAS
+        return self._rays.equations(slot).gradient[:75].reshape(25, 3) / SIGMA_OF_ROW[:, None]
 
     def _apply_correction(self, slot: int, correction: Float[np.ndarray, "25 3"]) -> None:
         """Applies a correction, or the part of it that the frame's roots can follow."""

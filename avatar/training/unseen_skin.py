@@ -35,8 +35,6 @@ BONE_OF_PART = (
 """Joints at both ends of each body part's bone."""
 MIRRORED_PART = np.array([0, 2, 1, 4, 3, 6, 5, 7, 9, 8, 11, 10, 13, 12])
 """The part on the other side of the body."""
-SIDES_OF_BODY = ((1, 2), (4, 5), (16, 17), (18, 19))
-"""Pairs of left and right joints, which lie symmetrically."""
 HEAD, FEET = HEAD_PART, (5, 6)
 """Parts whose front and back are not alike."""
 MIRROR_COST_M = 0.03
@@ -162,7 +160,7 @@ class UnseenSkin:
         """Starts with everything unseen, and so without any source."""
         self.evidence = SkinEvidence(rig)
         self._rig, self._frames = rig, _BoneFrames.of(rig)
-        sides = rig.rest_joints[np.array(SIDES_OF_BODY)][..., 0]
+        sides = rig.rest_joints[np.array([(1, 2), (4, 5), (16, 17), (18, 19)])][..., 0]
         self._middle_x = float(sides.mean())
         self._cells, self._shape = rig.clothing_cells, rig.skin_distance.shape
         self._seed_of_cell = np.full(rig.skin_distance.size, -1, dtype=np.int32)

@@ -21,14 +21,6 @@ READABLE_FORMATS = (5, 6)
 """Versions that are read; all others are refused. Graphs of 5 use fewer tables."""
 MAX_GOLDEN_PX = 128
 """Longest side of a golden frame, pixels."""
-CONVENTIONS = {
-    "units": "metres, radians, density in 1/m",
-    "body_axes": "x to the body's left, y up, z out of the chest (SMPL)",
-    "camera_axes": "x right, y down, z forward (OpenCV); pixel centers at +0.5",
-    "pose": "world = R(root_rotation) (x - J0) + J0 + root_translation; axis-angle joint rotations",
-    "picture": "RGBA, 8 bits, straight alpha",
-}
-"""Conventions that every manifest repeats for its readers."""
 LICENCE_NOTE = (
     "A likeness of a person: use it only as that person allows. It is neither the body model's "
     "data nor code; the rights in it are those of the recording it was learnt from."
@@ -89,7 +81,12 @@ class Manifest:
         """Serialize to the text of manifest.json."""
         content = {
             "format": FORMAT_VERSION,
-            **CONVENTIONS,
+            "units": "metres, radians, density in 1/m",
+            "body_axes": "x to the body's left, y up, z out of the chest (SMPL)",
+            "camera_axes": "x right, y down, z forward (OpenCV); pixel centers at +0.5",
+            "pose": "world = R(root_rotation) (x - J0) + J0 + root_translation; "
+            "axis-angle joint rotations",
+            "picture": "RGBA, 8 bits, straight alpha",
             "joints": JOINT_NAMES,
             "parents": self.parents.tolist(),
             "rest_joints": self.rest_joints.tolist(),

@@ -27,8 +27,6 @@ COARSE_GRAPH = "coarse"
 the time, and draws the first picture. Older packages lack it."""
 MAX_UNPACKED_BYTES = 512 << 20
 """Most bytes that the entries of a package hold together; those of an avatar hold 20 MB."""
-ENTRY_TIMESTAMP = (1980, 1, 1, 0, 0, 0)
-"""Time stamp of every entry, so that equal avatars give equal bytes."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -138,7 +136,8 @@ class PackageWriter:
 
     def _add(self, name: str, content: bytes) -> None:
         self._sums[name] = hashlib.sha256(content).hexdigest()
-        info = zipfile.ZipInfo(name, ENTRY_TIMESTAMP)
+        # one time stamp, so that equal avatars give equal bytes
+        info = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
         self._archive.writestr(info, content, zipfile.ZIP_DEFLATED, self._level)
 
 

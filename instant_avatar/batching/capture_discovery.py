@@ -24,14 +24,8 @@ from preprocess.capture_inputs import CAMERA_NAMES, MASK_NAMES, POSE_FILE_NAMES
 
 PART_NAMES = frozenset((*POSE_FILE_NAMES, *MASK_NAMES, *CAMERA_NAMES))
 """Names of files and folders beside the video of a capture folder."""
-PATH_OPTIONS = ("--poses", "--masks", "--cameras", "--body")
-"""Options whose values are paths."""
 KEYWORDS = re.compile(r"static|solve|segmenter:.*")
 """Values of path options that are no paths."""
-BATCH_OPTIONS = ("out", "resume", "overwrite", "json", "view", "live", "realtime")
-"""Options of ia-ingest that a batch sets itself, or that need a person or a camera."""
-COST_OPTIONS = ("video", "threads")
-"""Options that do not change the avatar; with others it is learnt again."""
 Options = tuple[dict[str, str], tuple[str, ...]]
 """Options of ia-ingest: paths, absolute or URLs, by option, and the words of all others."""
 Row = tuple[str, str, Options, Mapping[str, ListedFile]]
@@ -105,7 +99,10 @@ def parse_options(words: tuple[str, ...]) -> IngestArguments:
     """
     parsed = parse_arguments(IngestArguments, "ia-ingest", ["CAPTURE", *words])
     for each in fields(parsed):
-        if each.name in BATCH_OPTIONS and getattr(parsed, each.name) != each.default:
+        if (
+            each.name in ("out", "resume", "overwrite", "json", "view", "live", "realtime")
+            and getattr(parsed, each.name) != each.default
+        ):
             raise InputError(f"--{each.name} cannot be given for captures of a batch. Omit it.")
     parsed.validate()
     return parsed
@@ -120,7 +117,7 @@ def split_paths(words: Iterable[str], base: str) -> Options:
     while rest:
         word = rest.popleft()
         option, equals, value = word.partition("=")
-        if option in PATH_OPTIONS and (equals or rest):
+        if option in ("--poses", "--masks", "--cameras", "--body") and (equals or rest):
             paths[option] = _absolute(value if equals else rest.popleft(), base)
         else:
             others.append(word)
@@ -144,7 +141,8 @@ def _make_capture(
     chosen = {
         each.name: value
         for each in fields(parsed)
-        if (value := getattr(parsed, each.name)) != each.default and each.name not in COST_OPTIONS
+        if (value := getattr(parsed, each.name)) != each.default
+        and each.name not in ("video", "threads")
     }
     chosen |= {option: Path(path).name for option, path in paths.items()}
     return BatchCapture(

@@ -124,17 +124,6 @@ def install_advice(error: ModuleNotFoundError) -> str | None:
     )
 
 
-DISK_FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
-"""Disk full, quota exceeded, or file too large."""
-PATH_ERRNOS = frozenset(
-    {errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.EISDIR}
-    | {errno.ENAMETOOLONG, errno.ELOOP, errno.EEXIST}
-)
-"""Paths that cannot be read or written."""
-DEVICE_BUSY_PHRASES = ("out of memory", "busy or unavailable", "not enough memory")
-"""Phrases of torch for a device without memory or in use."""
-
-
 class CommandExit(Exception):  # noqa: N818 - an exit, not always an error
     """Ends the command with a message and an exit code."""
 
@@ -187,7 +176,10 @@ def describe_failure(error: BaseException) -> tuple[int, str] | None:
         failure = _system_failure(error)
     elif isinstance(error, RuntimeError | MemoryError):
         message = str(error).strip() or "out of memory"
-        is_busy = any(phrase in message.lower() for phrase in DEVICE_BUSY_PHRASES)
+        is_busy = any(
+            phrase in message.lower()
+            for phrase in ("out of memory", "busy or unavailable", "not enough memory")
+        )
         if is_busy or isinstance(error, MemoryError):
             reason = message.splitlines()[0]
             failure = (
@@ -205,14 +197,17 @@ def _system_failure(error: OSError) -> tuple[int, str] | None:
         return RESOURCE_UNAVAILABLE, f"the disk is full ({reason}). Free some space."
     if error.errno == errno.EBUSY:
         return RESOURCE_UNAVAILABLE, f"a device is busy ({reason})."
-    if error.errno in PATH_ERRNOS:
+    if error.errno in (
+        errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.EISDIR,
+        errno.ENAMETOOLONG, errno.ELOOP, errno.EEXIST,
+    ):  # fmt: skip
         return BAD_INPUT, f"cannot read or write ({reason}). Choose another path."
     return None
 
 
 def is_disk_full(error: OSError) -> bool:
     """True if a write failed because the disk is full."""
-    return error.errno in DISK_FULL_ERRNOS
+    return error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
 Arguments = TypeVar("Arguments")

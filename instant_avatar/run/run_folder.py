@@ -22,8 +22,6 @@ from instant_avatar.cli.shared_options import (
 
 LOCK_FILE_NAME = f"{RESERVED_PREFIX}lock"
 """Name of the locked file in a folder."""
-NO_LOCKS_ERRNOS = frozenset({errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP})
-"""Errors of file systems without locks."""
 
 
 @contextmanager
@@ -59,7 +57,7 @@ def _acquire(lock: BaseFileLock, folder: Path, console: Console) -> None:
             RESOURCE_UNAVAILABLE,
         ) from None
     except OSError as error:
-        if error.errno not in NO_LOCKS_ERRNOS:
+        if error.errno not in {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP}:
             raise
         console.warning(
             f"The file system of {folder} has no locks ({error.strerror}): make sure that no other "

@@ -29,16 +29,6 @@ MAX_UNMATCHED_OFFSETS = 24
 """Largest number of offsets to try where there are fewer poses than frames."""
 FRAME_RATES = (24.0, 25.0, 30.0, 50.0, 60.0)
 """Frame rates, Hz, that are mistaken for one another."""
-TRANSLATION_UNITS = {0.001: "millimetres", 0.01: "centimetres"}
-"""Metres in each unit that translations may wrongly be given in."""
-AXIS_FLIPS = {"y": (1.0, -1.0, 1.0), "z": (1.0, 1.0, -1.0), "y and z": (1.0, -1.0, -1.0)}
-"""Signs of the root translation's coordinates, by those that are wrong."""
-KNOWN_TURNS = {
-    ("x", 180): " (OpenGL's axes, y up and z back, not OpenCV's)",
-    ("x", 90): " (z up, not y)",
-    ("x", 270): " (y up, not z)",
-}
-"""Explanations of an axis and an angle in degrees by which poses are turned."""
 MIRROR_X = np.diag([-1.0, 1.0, 1.0])
 """Reflection that exchanges left and right."""
 MIRRORED_JOINTS = [
@@ -142,7 +132,11 @@ def _turn_entries(geometry: CaptureGeometry) -> CatalogEntries:
         if change is _rotate_world_space and _cameras_at_origin(geometry):
             continue  # the same as the camera space
         for axis, degrees in ((axis, degrees) for axis in "xyz" for degrees in (90, 180, 270)):
-            known = KNOWN_TURNS.get((axis, degrees), "")
+            known = {
+                ("x", 180): " (OpenGL's axes, y up and z back, not OpenCV's)",
+                ("x", 90): " (z up, not y)",
+                ("x", 270): " (y up, not z)",
+            }.get((axis, degrees), "")
             cause = "opengl_axes" if "OpenGL" in known else "root_rotation"
             turn = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
             description = f"{words} rotated by {360 - degrees}° about {axis}{known}"
@@ -162,7 +156,11 @@ def _pose_entries(motion: Motion, pelvis: Float[np.ndarray, "3"]) -> CatalogEntr
     def swapped(motion: Motion) -> Motion:
         return replace(motion, joint_rotations=motion.joint_rotations[:, MIRRORED_JOINTS])
 
-    for which, signs in AXIS_FLIPS.items():
+    for which, signs in {
+        "y": (1.0, -1.0, 1.0),
+        "z": (1.0, 1.0, -1.0),
+        "y and z": (1.0, -1.0, -1.0),
+    }.items():
         flipped = partial(_transform_translations, change=np.diag(np.array(signs)))
         yield "opengl_axes", f"the root's translation has the wrong sign of {which}", flipped
     both = "the joints of the left and the right side are exchanged"
@@ -174,7 +172,7 @@ def _pose_entries(motion: Motion, pelvis: Float[np.ndarray, "3"]) -> CatalogEntr
         (-1.0, "the root's translation was already converted from the origin to the pelvis"),
     ):
         yield "root_origin", words, _moves(partial(about_origin, sign=sign))
-    for factor, unit in TRANSLATION_UNITS.items():
+    for factor, unit in {0.001: "millimetres", 0.01: "centimetres"}.items():
         words = f"the poses' translations are in {unit}, not in metres"
         yield "body_scale", words, _moves(partial(scaled, factor=factor))
 

@@ -65,6 +65,10 @@ class RelativeFocalLength:
         return 0.4 <= self.ratio <= 2.5
 
 
+DIAGONAL_FOCAL = RelativeFocalLength(ratio=1.0, reference="diagonal")
+"""What CLIFF, WHAM and SAM 3D Body assume where nothing is known."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Motion:
     """Poses over time, as one pose file holds them.

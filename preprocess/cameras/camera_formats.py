@@ -42,8 +42,6 @@ from preprocess.cameras.named_camera import (
 )
 from preprocess.file_content import explain_damage, read_untrusted_file
 
-MODEL_SUBFOLDERS = (".", "sparse/0", "0", "sparse", "colmap/sparse/0", "dense/sparse")
-"""Places of models in a folder, as COLMAP, nerfstudio and others leave them."""
 CAMERA_MODELS = {
     "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8,
     "OPENCV_FISHEYE": 8, "FULL_OPENCV": 12,
@@ -83,8 +81,6 @@ EASYMOCAP_KEYS = (
     ("H", "H"),
 )  # fmt: skip
 """A camera's parts and their prefixes in EasyMocap's files; the last that is there counts."""
-IMAGE_SIZE_PATTERN = re.compile(r"^([HW]_\w+):\s*([0-9.]+)\s*$", re.MULTILINE)
-"""Width or height of a camera's images in OpenCV's YAML."""
 MAX_PARENT_FOLDERS = 3
 """Number of folders above an image whose names may be its camera's."""
 StudioCamera = Mapping[str, Float[np.ndarray, "rows columns"]]
@@ -133,7 +129,7 @@ def _read_folder(folder: Path, size_px: tuple[int, int] | None) -> list[NamedCam
 
 def find_colmap_model(folder: Path) -> Path | None:
     """The folder in which a COLMAP model lies, if there is one."""
-    for place in MODEL_SUBFOLDERS:
+    for place in (".", "sparse/0", "0", "sparse", "colmap/sparse/0", "dense/sparse"):
         for ending in (".bin", ".txt"):
             found = folder / place
             if all((found / f"{part}{ending}").is_file() for part in ("cameras", "images")):
@@ -415,7 +411,7 @@ def _read_easymocap(folder: Path) -> dict[str, StudioCamera]:
         for name, rows, columns, data in OPENCV_MATRIX_PATTERN.findall(text):
             numbers = [float(number) for number in data.split(",")]
             matrices[name] = np.array(numbers).reshape(int(rows), int(columns))
-        for name, number in IMAGE_SIZE_PATTERN.findall(text):
+        for name, number in re.findall(r"^([HW]_\w+):\s*([0-9.]+)\s*$", text, re.MULTILINE):
             matrices[name] = np.array([[float(number)]])
     cameras: dict[str, StudioCamera] = {}
     for name in (key.removeprefix("K_") for key in matrices if key.startswith("K_")):

@@ -68,12 +68,10 @@ NOISE_DEG_PER_CM = 1.5
 """Rotation by which the fit changes exact poses, degrees for each cm by which outlines still differ
 after it (1.4, 1.4 and 1.55 on three exact captures; a tracker's, real and simulated: 5 to 8)."""
 MIN_FRAMES = 4
-"""Fewest frames with a usable mask for which an alignment is attempted."""
+"""Fewest frames with a usable mask, or with key points, to which a person is fitted."""
 MOST_TRACKED_FRAMES = 80
 """Frames in which key points would be found if they alone counted, 30 core-ms each. The number is
 this times the weight that they are expected to get."""
-MIN_TRACKED_FRAMES = 4
-"""Fewest frames with key points that tell poses."""
 BESIDE_ITERATIONS = (4, 3)
 """Of those poses, iterations with key points alone, and then with outlines."""
 ERROR_PER_TURN = 1.2
@@ -160,10 +158,10 @@ def _take_keypoints(capture: Capture, fitter: ClipFitter, share: float) -> float
     """
     error2 = share * (ERROR_PER_TURN * _mean_turn(fitter.corrections)) ** 2
     count = round(MOST_TRACKED_FRAMES * error2 / (error2 + LEAST_ERROR_RAD**2))
-    if count < MIN_TRACKED_FRAMES:
+    if count < MIN_FRAMES:
         return 0.0
     track = _find_keypoints(capture, fitter, _choose_frames(fitter.frames, count))
-    if len(track) < MIN_TRACKED_FRAMES:
+    if len(track) < MIN_FRAMES:
         return 0.0
     rows = np.flatnonzero(np.isin(fitter.numbers, track.frames)).tolist()
     beside = ClipFitter(

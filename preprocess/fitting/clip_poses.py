@@ -44,8 +44,6 @@ SHARED_PRECISION = 0.1
 errs alike in all frames, and a turn that they share blurs nothing."""
 SIGMA_GUESSED_RAD = 0.12
 """Standard deviation of the given rotations of toes and hands, which trackers guess, radians."""
-GUESSED_JOINTS = (10, 11, 22, 23)
-"""Toes and hands."""
 TURN_FACTOR = 1.5
 """Standard deviation of a given rotation relative to the root, in `JOINT_SIGMAS_RAD`."""
 SHARED_ERROR = 0.5
@@ -382,7 +380,7 @@ def _given_precision() -> Float[np.ndarray, "75"]:
     """Precision of the given rotations relative to the root, in units of `POSE_SIGMA`."""
     precision = np.full((25, 3), TURN_FACTOR**-2.0)
     precision[[0, 24]] = 1.0
-    guessed = list(GUESSED_JOINTS)
+    guessed = [10, 11, 22, 23]  # toes and hands
     precision[guessed] = (POSE_SIGMA.reshape(25, 3)[guessed] / SIGMA_GUESSED_RAD) ** 2
     return precision.ravel()
 

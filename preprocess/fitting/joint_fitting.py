@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from capture.source import ASSUMED_FPS
 from preprocess.body.kinematics import JOINT_NAMES, rotation_matrices
 from preprocess.body.parametric_body import load_body_model
 from preprocess.body.proportion_space import ProportionSpace
@@ -46,8 +47,6 @@ ITERATIONS = 12
 """Gauss-Newton iterations of proportions and poses."""
 POSE_ITERATIONS = 6
 """Gauss-Newton iterations of poses alone."""
-FRAMES_PER_SECOND = 30.0
-"""Frame rate in which corrections of neighboring frames are alike."""
 MAX_TURN_STEP_RAD = 0.5
 """Largest change of a rotation's component in one iteration, radians."""
 
@@ -149,7 +148,7 @@ class _JointFitter:
         prior = (
             HumanPosePrior(still, times_s, settled=True)
             if self._turns is None
-            else GivenPosePrior(poses, still, FRAMES_PER_SECOND * times_s)
+            else GivenPosePrior(poses, still, ASSUMED_FPS * times_s)
         )
         for _ in range(ITERATIONS if proportions else POSE_ITERATIONS):
             fitted = self.space.count if proportions else 0

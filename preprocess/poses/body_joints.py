@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from preprocess.body.body_pose import Motion, PoseSpace, RelativeFocalLength
+from preprocess.body.body_pose import DIAGONAL_FOCAL, Motion, PoseSpace
 from preprocess.body.kinematics import JOINT_NAMES, axis_angles_from_matrices, rotation_matrices
 from preprocess.fitting.joint_fitting import (
     COMPARED_JOINTS,
@@ -120,18 +120,12 @@ are mirrored. GEM-X writes rotations alone. (Apache-2.0; github.com/NVlabs/SOMA-
 JOINT_KEYS = ("pred_joint_coords", "joint_coords", "joints_mhr", "joint_positions", "bone_poses",
               "bone_heads", "joints", "joints_3d", "joints3d")  # fmt: skip
 """Keys of the places of joints, best first."""
-MHR_KEYS = JOINT_KEYS[:4]
-"""Keys that SAM 3D Body and nodes of ComfyUI use for MHR's joints."""
 MIN_NAMED = 12
 """Fewest joints by whose names a body is recognised."""
 POINT_KEYS = ("pred_keypoints_3d", "keypoints_3d")
 """Keys of the places of key points."""
 POSE_KEYS = {"poses", "pose", "thetas", "smpl_thetas", "global_orient", "body_pose", "Rh"}
 """Keys of rotations: files with these are read by them, whatever joints they hold."""
-NAME_KEYS = ("joint_names", "bone_labels")
-"""Keys of the joints' names."""
-PLACE_KEYS = ("pred_cam_t", "cam_t", "camera")
-"""Keys of the body's place in the camera, metres: joints are relative to it."""
 FRAME_KEYS, PERSON_KEYS = ("frame_index", "frame_idx", "frame"), ("person_id", "track_id")
 """Keys of a frame's number and a person's name."""
 UNITS_M = (1.0, 0.01, 0.001)
@@ -140,8 +134,6 @@ USUAL_LEG_M = 0.75
 """Length of a leg, metres: of units the one is taken that brings a body's nearest to it."""
 MAX_DISTANCE_M = 0.1
 """Mean distance between our joints and a file's from which they are not those of a person."""
-SAM_FOCAL = RelativeFocalLength(ratio=1.0, reference="diagonal")
-"""SAM 3D Body's focal length where none was estimated."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -322,7 +314,10 @@ def _read_item(node: dict[str, Any], frame: int, person: str | None) -> _Item | 
         if points.ndim not in (2, 3) or points.shape[-1] != 3 or not points.size:
             raise ValueError(f"`{key}` has the shape {points.shape}; expected (joints, 3)")
         points = points.reshape(-1, *points.shape[-2:])
-        names = next((node[some] for some in NAME_KEYS if node.get(some) is not None), None)
+        names = next(
+            (node[some] for some in ("joint_names", "bone_labels") if node.get(some) is not None),
+            None,
+        )
         body = _known_body(key, points.shape[1], names if is_joints else None)
         columns = _columns(body, list(names) if is_joints and names is not None else None)
         columns = {point: column for point, column in columns.items() if column < points.shape[1]}
@@ -331,7 +326,9 @@ def _read_item(node: dict[str, Any], frame: int, person: str | None) -> _Item | 
         places[:, [POINT_NAMES.index(point) for point in columns]] = points[:, [*columns.values()]]
     if not body:
         return None
-    place = next((node[key] for key in PLACE_KEYS if node.get(key) is not None), None)
+    place = next(
+        (node[key] for key in ("pred_cam_t", "cam_t", "camera") if node.get(key) is not None), None
+    )
     if place is None:
         return _Item(frame, person, body, places, False, None)
     moved = np.asarray(place, dtype=np.float64).reshape(-1, 1, 3)
@@ -345,7 +342,7 @@ def _known_body(key: str, count: int, names: Any) -> str:
         best = max(counted, key=lambda body: counted[body])
         if counted[best] >= MIN_NAMED:
             return best
-    if count == 127 and key in MHR_KEYS:
+    if count == 127 and key in JOINT_KEYS[:4]:
         return "MHR"
     if count not in COUNTS:
         raise ValueError(
@@ -416,7 +413,7 @@ def _join(rows: list[_Item], fps: Any) -> JointTrack:
         frames=[row.frame for row in rows] if len(rows) > 1 else None,
         fps=None if fps is None else float(fps),
         space="camera" if in_camera else "world",
-        lens=(np.median(known, axis=0) if known else SAM_FOCAL) if in_camera else None,
+        lens=(np.median(known, axis=0) if known else DIAGONAL_FOCAL) if in_camera else None,
         program="SAM 3D Body" if rows[0].body.startswith("MHR") else None,
     )
 

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from capture.input_error import InputError
-from preprocess.body.body_pose import Motion, PoseSpace, RelativeFocalLength
+from preprocess.body.body_pose import DIAGONAL_FOCAL, Motion, PoseSpace
 from preprocess.body.kinematics import stack_axis_angles
 from preprocess.file_content import explain_damage
 from preprocess.frame_association import frame_numbers_from_names
@@ -65,8 +65,6 @@ RECOGNIZED_KEYS = (
     "time", "valid", "K", "model", "space", "scale", "proportions", "program", *KEYPOINT_SHAPES,
 )  # fmt: skip
 """Keys that are read of a file; all others are left there."""
-CLIFF_FOCAL = RelativeFocalLength(ratio=1.0, reference="diagonal")
-"""The camera in which CLIFF's `global_t` is."""
 SCALE_TOLERANCE = 0.01
 """A stated scale that is nearer to 1 says nothing."""
 ROTATION_MATRIX_SIZES = frozenset(9 * joints for joints in (1, 21, 22, 23, 24, 52, 55))
@@ -75,8 +73,6 @@ ROTATION_KEYS = ("global_orient", "body_pose", "thetas", "poses")
 """Keys of rotations."""
 ROW_SHAPES = {"transl": (3,), "K": (3, 3), "camera": (4, 4), "betas": (-1,)}
 """Shape of one row of each other array."""
-ROW_KEYS = (*ROTATION_KEYS, *ROW_SHAPES, "frame", "time", "valid")
-"""All keys that are read of one row."""
 
 
 def motion_from_arrays(arrays: Arrays, path: Path) -> Motion:
@@ -294,7 +290,7 @@ def parse_instant_avatar(content: Any, path: Path) -> MotionByPerson | None:
         return None
     motion = motion_from_arrays(collect_arrays(named, path), path)
     if "global_t" in held:
-        motion = replace(motion, assumed_focal=CLIFF_FOCAL, space="camera")
+        motion = replace(motion, assumed_focal=DIAGONAL_FOCAL, space="camera")
     return {"0": motion}
 
 
@@ -397,7 +393,7 @@ def _stack_items(rows: list[tuple[int, dict[str, Any]]], path: Path) -> Arrays:
     shared = set.intersection(*(set(item) for item in items))
     found = {
         key: np.stack([_reshape_row(key, item[key]) for item in items])
-        for key in ROW_KEYS
+        for key in (*ROTATION_KEYS, *ROW_SHAPES, "frame", "time", "valid")
         if key in shared
     }
     if "poses" in found:

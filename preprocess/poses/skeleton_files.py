@@ -13,16 +13,13 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 
+from capture.source import ASSUMED_FPS
 from preprocess.poses.body_joints import fit_mhr
 from preprocess.poses.motion_builder import MotionByPerson
 from preprocess.poses.skeleton_motion import SkeletonMotion
 
 BVH_START, GLB_START = b"HIERARCHY", b"glTF"
 """First bytes by which the content of either file is recognised."""
-NUMBERED_JOINT = r"(?:bone|[Jj]oint)_(\d{3})"
-"""Names of joints in the files that ComfyUI's nodes write of SAM 3D Body's MHR."""
-GLTF_FPS = 30.0
-"""Poses per second that are read of an animation whose keys lie farther apart."""
 MAX_KEY_STEP_S = 0.1
 """Longest time between two keys that is taken for the motion's own frame rate, seconds."""
 MAX_POSES = 100_000
@@ -32,8 +29,6 @@ MIN_FRAME_TIME_S = 1e-4
 GLTF_TYPES = {5126: ("<f4", 1.0), 5120: ("<i1", 127.0), 5121: ("<u1", 255.0),
               5122: ("<i2", 32767.0), 5123: ("<u2", 65535.0)}  # fmt: skip
 """numpy's types of glTF's codes, and what stands for 1 in them."""
-GLTF_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-"""Numbers an element by glTF's names."""
 
 
 def parse_bvh(content: Any, prefer_world: bool = False) -> MotionByPerson | None:
@@ -161,7 +156,7 @@ def _motions(name: str, skeleton: SkeletonMotion) -> MotionByPerson:
     """The motion of a skeleton, or those of several whose joints bear MHR's numbers (ComfyUI's)."""
     people: dict[str, dict[int, int]] = {}
     for joint, called in enumerate(skeleton.names):
-        numbered = re.fullmatch(NUMBERED_JOINT, called)
+        numbered = re.fullmatch(r"(?:bone|[Jj]oint)_(\d{3})", called)
         if numbered:
             root = joint
             while skeleton.parents[root] >= 0:
@@ -193,7 +188,7 @@ def _accessor(text: dict[str, Any], binary: bytes, number: int) -> Float[np.ndar
     if view.get("buffer", 0) != 0 or "uri" in text["buffers"][0] or "sparse" in accessor:
         raise ValueError("its keys are in another file, or sparse: export one whole .glb")
     kind, one = GLTF_TYPES[accessor["componentType"]]
-    width, count = GLTF_WIDTHS[accessor["type"]], accessor["count"]
+    width, count = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]], accessor["count"]
     size = width * np.dtype(kind).itemsize
     start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
     stride = view.get("byteStride", size)
@@ -228,7 +223,7 @@ def _gltf_motion(
     begin, end = min(each[2][0] for each in keyed), max(each[2][-1] for each in keyed)
     densest = max((each[2] for each in keyed), key=len)
     step = float(np.median(np.diff(densest))) if len(densest) > 1 else 0.0
-    step = step if MIN_FRAME_TIME_S < step <= MAX_KEY_STEP_S else 1.0 / GLTF_FPS
+    step = step if MIN_FRAME_TIME_S < step <= MAX_KEY_STEP_S else 1.0 / ASSUMED_FPS
     count = min(round((end - begin) / step) + 1, MAX_POSES)
     times_s = begin + np.arange(count) * step
     rotations = np.tile(rest, (count, 1, 1, 1))

@@ -33,10 +33,6 @@ LIMB_NAMES = {
     "wrist": ("wrist", "hand"),
 }
 """Names of joints that are needed on either side, without the side, the usual ones first."""
-END_NAMES = {"foot": ("toebase", "toe", "toes", "ball", "foot")}
-"""Names of joints that may be missing."""
-COLLAR_NAMES = ("collar", "clavicle", "shoulder")
-"""Names of the joint between chest and upper arm, which may be missing."""
 ROOT_NAMES, HEAD_NAMES = ("hips", "pelvis", "hip", "root"), ("head", "chead", "neck1", "neck")
 """Names of the joints on the body's axis; those between them are taken by their order."""
 MAX_CANDIDATES = 200
@@ -145,10 +141,12 @@ def match_joints(names: Sequence[str], parents: Int[np.ndarray, "joints"]) -> di
         for joint, known in LIMB_NAMES.items():
             matched[f"{side}_{joint}"] = find([side + name for name in known])
         taken = [matched[f"{side}_{joint}"] for joint in LIMB_NAMES]
-        for joint, known in END_NAMES.items():
+        for joint, known in (  # these may be missing
+            ("foot", ("toebase", "toe", "toes", "ball", "foot")),
+            ("collar", ("collar", "clavicle", "shoulder")),
+            ("hand", ("hand",)),
+        ):
             matched[f"{side}_{joint}"] = find([side + name for name in known], taken)
-        matched[f"{side}_collar"] = find([side + name for name in COLLAR_NAMES], taken)
-        matched[f"{side}_hand"] = find([f"{side}hand"], taken)
     needed = ["pelvis", "head", *(f"{s}_{j}" for s in ("left", "right") for j in LIMB_NAMES)]
     missing = [name for name in needed if matched[name] is None]
     if missing:

@@ -14,13 +14,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from preprocess.body.body_pose import Motion, RelativeFocalLength
+from preprocess.body.body_pose import DIAGONAL_FOCAL, Motion, RelativeFocalLength
 from preprocess.body.kinematics import rigid_transform
 from preprocess.frame_association import frame_numbers_from_names
 from preprocess.poses.motion_builder import MotionByPerson, build_motion, stack_rows
 
-WHAM_FOCAL = RelativeFocalLength(ratio=1.0, reference="diagonal")
-"""WHAM's focal length where none was given."""
 VIBE_FOCAL = RelativeFocalLength(ratio=0.85)
 """Any would do: weak perspective has none, and the depth follows from it. A phone's is taken."""
 GVHMR_VIEWS = ("smpl_params_incam", "smpl_params_global")
@@ -28,12 +26,6 @@ PROMPTHMR_VIEWS = ("smplx_cam", "smplx_world")
 """Keys of the poses in the camera and in the world."""
 TRAM_KEYS = {"pred_rotmat", "pred_trans", "frame"}
 """Keys by which a file of TRAM is recognised."""
-PHALP_FOCAL = RelativeFocalLength(ratio=5000.0 / 256.0)
-"""PHALP's focal length: 5,000 px on a square of 256 px."""
-ROMP_PERSPECTIVE_FOCAL = RelativeFocalLength(ratio=443.4 / 512.0)
-"""The camera of ROMP's and BEV's perspective fit: 60 degrees over the padded square."""
-ROMP_WEAK_PERSPECTIVE_FOCAL = RelativeFocalLength(ratio=1.0)
-"""The camera in which z = 2 / s puts a point where weak perspective with the scale s does."""
 MAX_LINK_STEP_M = 1.0
 """Largest step of one person between frames, metres; it separates people without track numbers."""
 AIST_FPS = 60.0
@@ -42,10 +34,6 @@ SMPLX_ROW_SIZE = 165
 """Numbers a row that only SMPL-X has: 55 joints."""
 EASYMOCAP_KEYS = {"Rh", "Th", "poses"}
 """Keys by which a file of EasyMocap is recognised."""
-SLAHMR_KEYS = frozenset({"root_orient", "pose_body", "trans"})
-"""Keys by which a file of SLAHMR is recognised."""
-DPW_KEYS = frozenset({"poses", "trans", "cam_poses", "cam_intrinsics"})
-"""Keys by which a file of 3DPW is recognised."""
 
 
 def _hold_keys(people: Any, keys: set[str]) -> bool:
@@ -79,7 +67,7 @@ def parse_wham(content: Any, prefer_world: bool = False) -> MotionByPerson | Non
             betas=rows.get("betas"),
             frames=rows["frame_ids"],
             space="world" if in_world else "camera",
-            lens=None if in_world else WHAM_FOCAL,
+            lens=None if in_world else DIAGONAL_FOCAL,
         )
     return people
 
@@ -237,7 +225,7 @@ def _phalp_person(rows: list[tuple[int, Any, Any]]) -> Motion:
         stack_rows([np.reshape(camera, 3) for _, _, camera in rows]),
         betas=stack_rows([np.reshape(pose["betas"], -1) for pose in poses]),
         frames=[number for number, _, _ in rows],
-        lens=PHALP_FOCAL,
+        lens=RelativeFocalLength(ratio=5000.0 / 256.0),  # 5,000 px on a square of 256 px
     )
 
 
@@ -279,11 +267,11 @@ def _romp_person(rows: dict[str, Any], frames: Any) -> Motion:
     thetas, places = stack_rows(list(rows["smpl_thetas"])), stack_rows(list(rows["cam_trans"]))
     betas = stack_rows(list(rows["smpl_betas"]))
     is_bev = betas.shape[-1] == 11
-    lens = ROMP_PERSPECTIVE_FOCAL
+    lens = RelativeFocalLength(ratio=443.4 / 512.0)  # 60 degrees over the padded square
     if not is_bev and "cam" in rows:
         scales = stack_rows(list(rows["cam"]))[:, 0]
         if np.allclose(places[:, 2] * scales, 2.0, rtol=1e-3):
-            lens = ROMP_WEAK_PERSPECTIVE_FOCAL
+            lens = RelativeFocalLength(ratio=1.0)  # z = 2 / s puts a point where it was seen
     return build_motion(
         [thetas], places, betas=betas[:, :10], frames=frames, lens=lens,
         lost=places[:, 2] <= 0.0,  # (-1, -1, -1) where their perspective fit has failed
@@ -452,7 +440,7 @@ def parse_slahmr(content: Any, prefer_world: bool = False) -> MotionByPerson | N
     """
     if not isinstance(content, dict):
         return None
-    if content.keys() >= DPW_KEYS:
+    if content.keys() >= {"poses", "trans", "cam_poses", "cam_intrinsics"}:
         rows = zip(content["poses"], content["trans"], strict=True)
         shapes = content.get("betas") or [None] * len(content["trans"])
         cameras = np.asarray(content["cam_poses"], dtype=np.float64)
@@ -463,7 +451,10 @@ def parse_slahmr(content: Any, prefer_world: bool = False) -> MotionByPerson | N
             )
             for number, ((poses, places), shape) in enumerate(zip(rows, shapes, strict=True))
         }
-    if not content.keys() >= SLAHMR_KEYS or np.ndim(content["trans"]) != 3:
+    if (
+        not content.keys() >= {"root_orient", "pose_body", "trans"}
+        or np.ndim(content["trans"]) != 3
+    ):
         return None
     return {str(number): _slahmr_motion(content, number) for number in range(len(content["trans"]))}
 

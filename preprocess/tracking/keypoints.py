@@ -29,8 +29,6 @@ KEYPOINT_SHAPES = {
     "keypoint_times": (-1,), "keypoint_problems": (-1,),
 }  # fmt: skip
 """Arrays that hold key points in a file, and their shapes (-1: one row a frame)."""
-OPTIONAL_KEYS = ("keypoint_times", "keypoint_problems")
-"""Arrays that may be missing."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -157,7 +155,7 @@ class KeypointTrack:
         count = arrays["keypoint_frames"].size
         found: dict[str, Shaped[np.ndarray, ...]] = {}
         for key, shape in KEYPOINT_SHAPES.items():
-            if key in OPTIONAL_KEYS and key not in arrays:
+            if key in ("keypoint_times", "keypoint_problems") and key not in arrays:
                 continue
             if key not in arrays or arrays[key].dtype.kind not in "iuf":
                 raise ValueError(f"it holds key points without numbers in `{key}`.")

@@ -39,10 +39,6 @@ NEAR_ROWS = 3
 """Rows before and after an exchange whose motion counts as usual."""
 MAX_GAP_FRAMES = 3
 """Frames between two rows beyond which they are not compared."""
-TRUNK_POINTS = (11, 12, *HIPS)
-"""Shoulders and hips."""
-TRUNK_JOINTS = (16, 17, 1, 2)
-"""The joints next to them."""
 LIMBS = (
     (16, 18, 20, 11, 13, 15, (0.0, -1.0, 0.0)), (17, 19, 21, 12, 14, 16, (0.0, 1.0, 0.0)),
     (1, 4, 7, 23, 25, 27, (1.0, 0.0, 0.0)), (2, 5, 8, 24, 26, 28, (1.0, 0.0, 0.0)),
@@ -148,7 +144,8 @@ def lift_keypoints(track: KeypointTrack, shaped: ShapedBody, camera: Camera) -> 
 def lift_pose(world_m: Float[np.ndarray, "33 3"], shaped: ShapedBody) -> BodyPose:
     """First guess of a pose by the shoulders, hips and limbs among the key points, unplaced."""
     rest, local = shaped.joints, np.tile(np.eye(3), (24, 1, 1))
-    local[0] = _trunk_turn(rest[list(TRUNK_JOINTS)], world_m[list(TRUNK_POINTS)])
+    shoulders_and_hips = rest[[16, 17, 1, 2]], world_m[[11, 12, *HIPS]]
+    local[0] = _trunk_turn(*shoulders_and_hips)
     for upper, middle, lower, *points, hinge in LIMBS:
         first, second = np.diff(world_m[points], axis=0)
         turned = _limb_turn(rest[middle] - rest[upper], np.array(hinge), local[0], first, second)

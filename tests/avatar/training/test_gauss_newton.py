@@ -12,9 +12,8 @@ from avatar.training.pose_correction import (
     RaySums,
     gauss_newton_step,
 )
-from avatar.training.pose_correction import PRIOR_SIGMAS as SCALE
 
-NONE = np.zeros((25, 3))
+NONE, SCALE = np.zeros((25, 3)), SIGMA_OF_ROW[:, None]
 
 
 @pytest.fixture

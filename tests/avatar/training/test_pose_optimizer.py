@@ -21,7 +21,7 @@ from avatar.render import correspondence_tables
 from avatar.training import checkpoint
 from avatar.training.frame_stream import prepare_stream
 from avatar.training.held_out_pose_fitting import fit_test_poses
-from avatar.training.pose_correction import MIN_RAY_LOSS, PRIOR_SIGMAS
+from avatar.training.pose_correction import MIN_RAY_LOSS, SIGMA_OF_ROW
 from avatar.training.pose_optimizer import (
     FIRST_CORRECTION_STEPS,
     FREEZE_AFTER_STEPS,
@@ -212,7 +212,7 @@ def test_sums_over_rays_are_those_of_their_own_gradients(rig, table, generator):
     felt[24, :, :, :3] = -np.eye(3)[:, None]
     wrenches, loss = torch.randn(40, 24, 6, generator=generator), torch.rand(40)
     table.accumulate(torch.ones(40, dtype=torch.int64), wrenches, loss)
-    scaled = np.einsum("jabq,rbq->rja", felt, wrenches.numpy()) * PRIOR_SIGMAS
+    scaled = np.einsum("jabq,rbq->rja", felt, wrenches.numpy()) * SIGMA_OF_ROW[:, None]
     scaled = scaled.reshape(40, 75)
     curved = scaled / (2.0 * (loss.numpy() + MIN_RAY_LOSS))[:, None]
     found = table._rays.equations(1)
