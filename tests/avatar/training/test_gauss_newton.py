@@ -7,6 +7,7 @@ from avatar.training.pose_correction import (
     FULL_EVIDENCE,
     MIN_EVIDENCE,
     MIN_RAY_LOSS,
+    SIGMA_OF_ROW,
     NormalEquations,
     PosePrior,
     RaySums,
