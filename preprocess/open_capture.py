@@ -20,6 +20,7 @@ from preprocess.cameras.camera_file import (
     assume_camera,
     assume_static_camera,
     read_cameras,
+    tracker_intrinsic_matrix,
 )
 from preprocess.capture_inputs import (
     CaptureInputs,
@@ -195,6 +196,10 @@ def _place(
         if named is None
         else read_cameras(named, source.size_px, source)
     )
+    if motion.is_fitted and not cameras.is_moving:  # with the focal length, at its distances
+        intrinsic = tracker_intrinsic_matrix(motion, source.size_px)
+        if intrinsic is not None:
+            cameras = cameras.scale_focal(float(intrinsic[0, 0]) / cameras[0].focal_px[0])
     posed = shape_for_motion(imported.body, motion)
     motion = place_in_camera_world(motion, posed, cameras, cameras_given=named is not None)
     person = _find_person(posed, imported.inputs, cameras, avatar_body)

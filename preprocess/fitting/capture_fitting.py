@@ -52,11 +52,11 @@ MAX_ITERATIONS = 12
 """Most Gauss-Newton iterations."""
 TRACKED_KEY_FRAMES = 300
 """Frames, evenly spread, whose masks are fitted together with key points."""
-KEYPOINT_ITERATIONS = 5
+KEYPOINT_ITERATIONS = 3
 """Iterations with key points alone, after which the body is near its outline."""
 TRACKED_ITERATIONS = 3
 """Iterations with outlines after that."""
-POSE_ITERATIONS = 2
+POSE_ITERATIONS = 1
 """Iterations over poses alone after those, with `TRACKED_POSE_WEIGHTS`."""
 TRACKED_POSE_WEIGHTS = EvidenceWeights(outline_rows=480.0, keypoints=0.6)
 """Weights while poses alone are fitted: with these, proportions would follow the clothes."""
