@@ -133,18 +133,6 @@ def test_clear_foggy_and_opaque_people_are_summed_as_exactly(altered, shot, log_
     np.testing.assert_allclose(picture[..., 3], alpha, atol=1e-5)
 
 
-def test_an_avatar_that_occupies_nothing_is_not_to_be_seen(avatar, shot):
-    pose, camera, cells = shot
-    occupancy = avatar.occupancy
-    empty = object.__new__(type(occupancy))
-    nothing = torch.zeros_like(occupancy.density_grid.occupied)
-    empty.__dict__.update(
-        occupancy.__dict__, density_grid=occupancy.density_grid._replace(occupied=nothing)
-    )
-    invisible = dataclasses.replace(avatar, occupancy=empty)
-    assert (render(invisible, pose, camera, cells=cells) == 0.0).all()
-
-
 # --- what is skipped --------------------------------------------------------------------------
 
 

@@ -9,12 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from avatar import render as render_module
-from avatar.config import TrainConfig
-from avatar.correspondence_grid import CorrespondenceCheck
-from avatar.kernels import operations
-from avatar.kernels.operands import MarchSettings
-from avatar.render import MIN_TRANSMITTANCE, body_frame_rays, correspondence_tables, render
-from avatar.training.trainer import Trainer
+from avatar.render import MIN_TRANSMITTANCE, render
 from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
 
@@ -57,45 +52,6 @@ def decibels(a, b):
 
 
 # --- what it is -------------------------------------------------------------------------------
-
-
-def test_a_fog_is_as_opaque_as_its_length_says(rig, shot):
-    """Constant density σ and color c: alpha = 1 - exp(-σ · step · samples), color = c · alpha.
-
-    Of samples that skinning carries to the ray: the others hold nothing.
-    """
-    config = TrainConfig(levels=2, table_size=1 << 10, sample_step_m=0.03)
-    avatar = Trainer(rig, config).avatar
-    weights, bias = avatar.field.layers[2:]
-    pose, camera = shot
-    with torch.no_grad():
-        weights.zero_()
-        bias.copy_(torch.tensor([-1.0, 0.0, 2.0, 1.5]))
-    got = render(avatar, pose, camera)
-    cells = render_module.CorrespondenceGrid.solve(rig, pose.joint_rotations)
-    pixels = camera.pixel_centers().reshape(-1, 2)
-    batch = body_frame_rays(pixels, camera, rig.world_from_body(pose))
-    how = MarchSettings(config.sample_step_m, np.inf, 512)
-    tables = correspondence_tables(cells)
-    samples = operations.march(batch, tables, avatar.rendering_grid(), how)
-    strays = CorrespondenceCheck.for_pose(rig, pose.joint_rotations, cells)
-    rays_of_strays = (
-        torch.searchsorted(samples.offsets, strays.find_spurious(samples, batch), right=True) - 1
-    )
-    count = samples.counts.numpy() - np.bincount(rays_of_strays, minlength=len(pixels))
-    alpha = 1.0 - np.exp(-np.exp(1.5) * config.sample_step_m * count.reshape(camera.size_px[::-1]))
-    color = 1.0 / (1.0 + np.exp(-np.array([-1.0, 0.0, 2.0])))
-    assert alpha.max() > 0.5
-    np.testing.assert_allclose(got[..., 3], alpha, atol=1e-5)
-    np.testing.assert_allclose(got[..., :3], alpha[..., None] * color, atol=1e-5)
-
-
-def test_pictures_are_premultiplied_and_within_range(picture):
-    assert picture.min() >= 0.0
-    assert picture[..., 3].max() <= 1.0
-    assert (picture[..., :3] <= picture[..., 3:] + 1e-6).all()
-    assert picture[..., 3].max() > 0.99
-    assert (picture[0] == 0.0).all()
 
 
 def test_the_image_is_empty_where_the_camera_looks_past_the_person(rig, avatar, shot):
@@ -165,29 +121,6 @@ def test_a_principal_point_that_moves_by_pixels_shifts_the_picture(avatar, shot,
     center = camera.center_px[0] + 3.0, camera.center_px[1] - 2.0
     shifted = render(avatar, pose, dataclasses.replace(camera, center_px=center))
     np.testing.assert_allclose(shifted[:-2, 3:], picture[2:, :-3], atol=1e-5)
-
-
-@pytest.mark.parametrize("axis", [0, 1])
-def test_a_person_who_moves_by_a_pixel_is_seen_a_pixel_farther(rig, avatar, shot, picture, axis):
-    """Perspective moves what is nearer a little more: by a twentieth of a pixel here."""
-    pose, camera = shot
-    world_from_camera = np.linalg.inv(camera.camera_from_world)
-    pelvis = rig.rest_joints[0] + pose.root_translation
-    depth = (camera.camera_from_world @ np.append(pelvis, 1.0))[2]
-    step = world_from_camera[:3, axis] * depth / camera.focal_px[axis] * 2.0
-    beside = render(avatar, moved(rig, pose, rigid(np.zeros(3), step)), camera)
-    shifted = np.roll(picture, 2, axis=1 - axis)
-    assert decibels(beside, shifted) > decibels(beside, picture) + 8.0
-    assert decibels(beside, shifted) > 30.0
-
-
-def test_a_larger_picture_shows_the_same_person(avatar, shot, picture):
-    pose, camera = shot
-    width, height = camera.size_px
-    large = render(avatar, pose, camera.resize((2 * width, 2 * height)))
-    small = large.reshape(height, 2, width, 2, 4).mean(axis=(1, 3))
-    assert decibels(small, picture) > 30.0
-    assert small[..., 3].sum() == pytest.approx(picture[..., 3].sum(), rel=0.01)
 
 
 def test_a_bent_knee_moves_the_leg_alone(avatar, shot, picture):

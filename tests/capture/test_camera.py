@@ -77,12 +77,6 @@ def test_the_intrinsic_matrix_goes_round():
     assert again.distortion == camera.distortion
 
 
-def test_without_distortion_the_lens_model_changes_nothing():
-    pixels = np.random.default_rng(0).uniform(0, 150, size=(9, 2))
-    bent = camera_at(1, (0.0, 0.0, 0.0, 0.0)).ray_directions(pixels)
-    np.testing.assert_allclose(bent, camera_at(1).ray_directions(pixels), atol=1e-9)
-
-
 def test_barrel_distortion_pulls_points_inwards():
     point = np.array([1.0, 0.0, 1.0])  # r = 1: r (1 + k1 r²) = 0.9
     camera = Camera(

@@ -33,16 +33,6 @@ def test_a_selection_of_pictures_keeps_their_numbers(write_images):
     assert source.frame_count == 3
 
 
-def test_an_alpha_channel_comes_along(tmp_path):
-    rgba = np.random.default_rng(0).integers(0, 255, (8, 6, 4), dtype=np.uint8)
-    Image.fromarray(rgba).save(tmp_path / "0.png")
-    source = open_source(tmp_path)
-    (frame,) = source.frames()
-    assert source.has_alpha
-    np.testing.assert_array_equal(frame.rgb, rgba[..., :3])
-    np.testing.assert_array_equal(frame.alpha, rgba[..., 3])
-
-
 @pytest.mark.parametrize("ending", ["png", "webp"])
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_colors_and_alpha_are_rotated_together(tmp_path, ending, orientation):

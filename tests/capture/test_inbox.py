@@ -91,18 +91,6 @@ def test_an_error_is_raised_after_the_items_before_it():
     assert inbox.take() == []
 
 
-def test_an_error_is_not_mistaken_for_the_end():
-    def items():
-        raise OSError("no such camera")
-        yield
-
-    inbox = Inbox(items())
-    time.sleep(0.02)
-    assert not inbox.finished
-    with pytest.raises(OSError, match="no such camera"):
-        taken(inbox)
-
-
 @pytest.mark.parametrize("capacity", [1, 1000])
 def test_closing_stops_a_producer_that_would_never_end(capacity):
     before = threading.active_count()

@@ -207,12 +207,6 @@ def test_colors_are_linear_light(file, mesh):
     assert (light[:, 3] == 1.0).all()
 
 
-def test_a_still_pose_is_a_motion_too(mesh, package, motion):
-    one = SkeletonAnimation.of(motion, (1,), 30.0, package.manifest.rest_joints[0])
-    read = Read(encode_glb(replace(mesh), package.manifest, one, name="x"))
-    assert read.skinned(0).shape == mesh.positions.shape
-
-
 @pytest.fixture(scope="module")
 def simple(package):
     """The same of three thousand triangles, with a texture."""

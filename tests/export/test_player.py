@@ -1,7 +1,6 @@
 import os
 import subprocess
 import sys
-import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -323,16 +322,6 @@ def test_sizes_may_be_numpys_integers(player, bent, camera):
     assert player.render(bent, camera(90, 60), size=np.int64(30)).shape == (20, 30, 4)
 
 
-def test_a_proof_looks_at_every_entry(exported, tmp_path):
-    """A lost graph of the other tier is noticed, though golden frames do not show it."""
-    path = tmp_path / "x.iavatar"
-    with zipfile.ZipFile(exported.path) as whole, zipfile.ZipFile(path, "w") as part:
-        for name in set(whole.namelist()) - {"lite/player.onnx"}:
-            part.writestr(name, whole.read(name))
-    with pytest.raises(InputError, match=r"lite/player\.onnx is missing"):
-        read_package(path, tier=None)
-
-
 def test_tetrahedra_reproduce_linear_colors_and_constant_density(tables):
     """One sample per ray: at any point of a brick a ramp of codes is read exactly."""
     i, j, k = np.meshgrid(*[np.arange(8)] * 3, indexing="ij")
@@ -398,10 +387,6 @@ sys.exit(f"the player pulls in {{heavy}}" if heavy else 0)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-
-
-def test_resting_is_a_pose_too(player, camera):
-    assert player.render(BodyPose.rest(), camera(60, 60)).any()
 
 
 def test_the_lite_tier_draws_the_same_avatar_with_fewer_samples(exported, player, views, truth):

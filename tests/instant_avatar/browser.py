@@ -10,13 +10,20 @@ import select
 import shutil
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import psutil
+import pytest
 from PIL import Image
+
+from capture.input_error import InputError
+from export import player_page
+from instant_avatar.animation.web_server import make_server
 
 FLAGS = [
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
@@ -41,6 +48,38 @@ def chromium() -> str | None:
     """Where it is, if it is here."""
     names = ("chromium", "chromium-browser", "google-chrome", "chrome")
     return next((path for name in names if (path := shutil.which(name))), None)
+
+
+def has_runtime() -> bool:
+    """Whether onnxruntime-web is here."""
+    try:
+        player_page.runtime_files()
+    except InputError:
+        return False
+    return True
+
+
+with_chromium = pytest.mark.skipif(chromium() is None, reason="there is no Chromium here")
+with_runtime = pytest.mark.skipif(
+    not has_runtime(), reason="onnxruntime-web is not here (make web)"
+)
+
+
+def in_browser(test: Any) -> Any:
+    """Marks a slow test of the player's page."""
+    return pytest.mark.slow(with_chromium(with_runtime(test)))
+
+
+@contextlib.contextmanager
+def serving(files: dict[str, bytes], port: int) -> Iterator[str]:
+    """The address of some files during a block."""
+    server = make_server(files, port)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}"
+    finally:
+        server.shutdown()
+        server.server_close()
 
 
 class Browser:

@@ -14,6 +14,7 @@ from avatar.training import held_out_pose_fitting, train
 from capture.atomic_files import write_text_atomically
 from export.bake import bake_tables, fine_tuning
 from export.build import ExportReport
+from export.player import Player
 from instant_avatar import ingest, play
 from instant_avatar.report import report_writer
 from instant_avatar.run import snapshot_writer, training_session
@@ -117,6 +118,22 @@ def run(film, tmp_path_factory) -> Path:
         patch.setattr(train, "warm_up", lambda trainer: 0.0)
         assert ingest.main([str(film), "--out", str(out), "--steps", str(ENOUGH_STEPS)]) == 0
     return out
+
+
+@pytest.fixture(scope="session")
+def package(run) -> Path:
+    return run / "avatar.iavatar"
+
+
+@pytest.fixture(scope="session")
+def player(package) -> Player:
+    return Player.load(package)
+
+
+@pytest.fixture(scope="session")
+def novel(film) -> Path:
+    """Twelve poses that the film does not show, thirty a second."""
+    return film / "truth" / "novel" / "poses.npz"
 
 
 @pytest.fixture(scope="session")

@@ -165,7 +165,8 @@ def test_a_body_with_code_in_it_is_not_run(refused, capture, tmp_path):
     [
         ("--size", "3"), ("--threads", "0"), ("--seed", "-1"), ("--frames", "last"),
         ("--frames", "9:3"), ("--frames", "100:"), ("--seconds", "0"), ("--seconds", "1e-9"),
-        ("--steps", "0"), ("--steps", "9", "--seconds", "9"),
+        ("--steps", "0"), ("--steps", "9", "--seconds", "9"), ("--view", "70000"),
+        ("--height-cm", "12"), ("--height-cm", "900"),
     ],
 )  # fmt: skip
 def test_numbers_that_cannot_be_are_refused_by_their_flag(capture, tmp_path, capsys, words):

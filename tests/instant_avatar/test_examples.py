@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from instant_avatar import export
-from tests.instant_avatar.browser import Browser, chromium, until
+from tests.instant_avatar.browser import Browser, until, with_chromium
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 PACKAGES = EXAMPLES.parent / "build" / "npm" / "node_modules"
@@ -113,7 +113,7 @@ def site(run, film, tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(chromium() is None, reason="there is no Chromium here")
+@with_chromium
 @pytest.mark.skipif(not PACKAGES.is_dir(), reason="`make test-all` fetches three.js and Spark")
 def test_mesh_in_three_and_splats_in_spark_are_one_figure_and_move(site):
     """Both pages have the same camera; splats follow the skeleton of the mesh."""

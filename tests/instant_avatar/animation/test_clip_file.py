@@ -23,7 +23,7 @@ from instant_avatar.animation.driving_motion import FollowingCamera, canonical_p
 from instant_avatar.animation.play_arguments import Viewpoint
 from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
 from preprocess.poses.pose_format_registry import read_poses
-from tests.instant_avatar.browser import Browser, chromium
+from tests.instant_avatar.browser import Browser, with_chromium
 
 
 def disc(count, *, height=60, width=80):
@@ -124,7 +124,7 @@ SHOWN_IN_A_PAGE = """(async (url, kind) => {
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(chromium() is None, reason="there is no Chromium here")
+@with_chromium
 def test_clips_play_in_a_browser_with_their_alpha(tmp_path):
     white = background_compositor("white")
     with Browser(tmp_path / "browser") as browser:
@@ -213,22 +213,6 @@ def test_nothing_but_frames_is_replaced(tmp_path):
 
 
 SIZE = 96
-
-
-@pytest.fixture(scope="session")
-def package(run):
-    return run / "avatar.iavatar"
-
-
-@pytest.fixture(scope="session")
-def player(package):
-    return Player.load(package)
-
-
-@pytest.fixture(scope="session")
-def novel(film):
-    """Twelve poses that the film does not show, thirty a second."""
-    return film / "truth" / "novel" / "poses.npz"
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from capture.input_error import InputError
-from export.player import Player
 from instant_avatar.animation.driving_motion import (
     DISTANCE_HEIGHTS,
     FollowingCamera,
@@ -17,11 +16,6 @@ from instant_avatar.animation.play_arguments import CLOSE_UP_ZOOM, Viewpoint
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import rotation_matrices
 from tests.motions import make_motion
-
-
-@pytest.fixture(scope="module")
-def player(run):
-    return Player.load(run / "avatar.iavatar")
 
 
 @pytest.fixture

@@ -29,17 +29,6 @@ from preprocess.poses.pose_format_registry import read_poses
 SIZE = 96
 
 
-@pytest.fixture(scope="session")
-def package(run):
-    return run / "avatar.iavatar"
-
-
-@pytest.fixture(scope="session")
-def novel(film):
-    """Twelve poses that the film does not show."""
-    return film / "truth" / "novel" / "poses.npz"
-
-
 def frames_of(video):
     reader, frames = cv2.VideoCapture(str(video)), []
     while True:
@@ -76,24 +65,6 @@ def test_frames_replace_frames_but_nothing_else(call_play, package, novel, tmp_p
     assert "notes.txt" in outcome.complaint("ia-play")
     assert len(list(out.iterdir())) == 12 + len({"notes.txt", LIST})
     assert [file.name for file in tmp_path.iterdir()] == ["frames"]
-
-
-@pytest.mark.parametrize("suffix", [".webm", ".mp4"])
-def test_clips_show_what_the_player_draws(call_play, package, novel, tmp_path, suffix):
-    out = tmp_path / f"clip{suffix}"
-    outcome = call_play(
-        package, "--poses", novel, "--out", out, "--size", SIZE, "--background", "#4080c0"
-    )
-    assert outcome.code == 0
-    frames = frames_of(out)
-    assert len(frames) == 12
-    player, motion = Player.load(package), read_poses(novel)
-    camera = FollowingCamera.of(player, motion, SIZE)
-    rgba = player.render(motion[0], camera.camera_for(motion[0])).astype(np.float64)
-    alpha = rgba[..., 3:] / 255.0
-    expected = rgba[..., :3] * alpha + np.array([64, 128, 192]) * (1.0 - alpha)
-    assert np.abs(frames[0][..., ::-1] - expected).mean() < 6.0
-    assert [file.name for file in tmp_path.iterdir()] == [out.name]
 
 
 def test_a_clip_without_a_name_lies_beside_the_package(call_play, package, novel):
@@ -220,17 +191,6 @@ def test_warnings_of_the_package_are_printed(call_play, package, tmp_path, mode)
     write_package(replace(sound, manifest=manifest), path)
     more = ["--size", SIZE] if mode == "--bench" else []
     assert "It is fog." in call_play(path, mode, *more).err
-
-
-def test_an_altered_package_is_refused(call_play, package, novel, tmp_path):
-    content = bytearray(package.read_bytes())
-    content[len(content) // 2] ^= 0xFF
-    spoilt = tmp_path / "avatar.iavatar"
-    spoilt.write_bytes(content)
-    outcome = call_play(spoilt, "--poses", novel, "--out", tmp_path / "clip.webm")
-    assert outcome.code == 2
-    outcome.complaint("ia-play")
-    assert [file.name for file in tmp_path.iterdir()] == ["avatar.iavatar"]
 
 
 @pytest.mark.parametrize(

@@ -7,14 +7,12 @@ import re
 import signal
 import subprocess
 import sys
-import threading
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from capture.input_error import InputError
 from export import player_page
 from export.package.package_file import read_package
 from export.player import PictureDifference, Player, premultiply
@@ -22,9 +20,8 @@ from export.player_inputs import graph_initializers
 from instant_avatar.animation import web_server
 from instant_avatar.animation.driving_motion import FollowingCamera, demo_motion
 from instant_avatar.animation.sample_motions import sample_motions
-from instant_avatar.animation.web_server import make_server
 from preprocess.poses.pose_format_registry import read_poses
-from tests.instant_avatar.browser import Browser, chromium, until
+from tests.instant_avatar.browser import Browser, in_browser, serving, until, with_runtime
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 SIZE = (900, 700)
@@ -32,40 +29,10 @@ STAGE = (slice(60, 600), slice(4, -4))
 """Between the page's head and its bar, inside of the ring that marks the focus."""
 
 
-def is_here():
-    try:
-        player_page.runtime_files()
-    except InputError:
-        return False
-    return True
-
-
-with_runtime = pytest.mark.skipif(not is_here(), reason="onnxruntime-web is not here (make web)")
-with_chromium = pytest.mark.skipif(chromium() is None, reason="there is no Chromium here")
-
-
-@pytest.fixture(scope="module")
-def package(run):
-    return run / "avatar.iavatar"
-
-
-@pytest.fixture(scope="module")
-def novel(film):
-    return film / "truth" / "novel" / "poses.npz"
-
-
 @pytest.fixture(scope="module")
 def served(package, novel):
     """Where ia-play --web says that the page is."""
-    command = [
-        sys.executable,
-        "-m",
-        "instant_avatar.play",
-        str(package),
-        "--poses",
-        str(novel),
-        "--web",
-    ]
+    command = [sys.executable, "-m", "instant_avatar.play", package, "--poses", novel, "--web"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     address = process.stdout.readline().strip()
     yield address
@@ -123,18 +90,14 @@ def test_only_this_machine_is_answered(served):
         http.client.HTTPConnection("127.0.0.2", port, timeout=5.0).connect()
 
 
-@with_runtime
-@with_chromium
-@pytest.mark.slow
+@in_browser
 def test_the_browser_draws_the_golden_frames_again(page):
     found = page.run("player.verify()", seconds=240.0)
     assert len(found) > 0
     assert all(frame["alike"] for frame in found), found
 
 
-@with_runtime
-@with_chromium
-@pytest.mark.slow
+@in_browser
 @pytest.mark.parametrize("subdivision", [1, 2])
 def test_the_browser_decodes_the_tables_that_python_decodes(page, package, subdivision):
     found = page.run(
@@ -188,9 +151,7 @@ def shown_by(page, tier, row, view):
     return premultiply(shown)
 
 
-@with_runtime
-@with_chromium
-@pytest.mark.slow
+@in_browser
 def test_the_browser_draws_what_the_player_draws(page, package, novel):
     motion, row, size = read_poses(novel), 7, 96
     for tier in ("hq", "lite"):
@@ -205,9 +166,7 @@ def test_the_browser_draws_what_the_player_draws(page, package, novel):
         assert PictureDifference.of(shown_by(page, tier, row, view), expected).matches
 
 
-@with_runtime
-@with_chromium
-@pytest.mark.slow
+@in_browser
 def test_the_page_plays_pauses_turns_and_zooms(page):
     page.run("document.getElementById('picture').focus()")
     until(lambda: moves(page), 30.0)
@@ -231,9 +190,7 @@ def test_the_page_plays_pauses_turns_and_zooms(page):
     until(lambda: page.run("Number(document.getElementById('timeline').value)") == after, 30.0)
 
 
-@with_runtime
-@with_chromium
-@pytest.mark.slow
+@in_browser
 def test_a_motion_plays_once_it_is_chosen_beside_the_given_one(page):
     def choose(file, count):
         page.run(
@@ -254,9 +211,7 @@ def test_a_motion_plays_once_it_is_chosen_beside_the_given_one(page):
     choose("motion.npz", given)
 
 
-@with_runtime
-@with_chromium
-@pytest.mark.slow
+@in_browser
 def test_the_page_is_dark_for_those_who_like_it_and_fits_a_phone(page):
     paused(page)
     page.emulate(scheme="dark", size=(390, 700))
@@ -270,9 +225,7 @@ def test_the_page_is_dark_for_those_who_like_it_and_fits_a_phone(page):
     until(lambda: page.picture()[70, 10].min() > 200, 30.0)
 
 
-@with_runtime
-@with_chromium
-@pytest.mark.slow
+@in_browser
 def test_keys_turn_it_before_anything_was_clicked(page):
     paused(page)
     page.run("document.activeElement.blur()")
@@ -284,9 +237,7 @@ def test_keys_turn_it_before_anything_was_clicked(page):
     until(lambda: np.array_equal(drawn(page), before), 30.0)
 
 
-@with_runtime
-@with_chromium
-@pytest.mark.slow
+@in_browser
 @pytest.mark.parametrize("size", [(640, 300), (390, 700)])
 def test_the_person_stands_above_the_bar_however_low_the_screen(page, size):
     paused(page)
@@ -310,9 +261,7 @@ def test_the_person_stands_above_the_bar_however_low_the_screen(page, size):
     assert 0.5 * bar < feet < bar
 
 
-@with_runtime
-@with_chromium
-@pytest.mark.slow
+@in_browser
 def test_what_is_too_near_for_surfels_is_drawn_with_fewer_pixels(page):
     far, near, beside = page.run(
         """(async () => {
@@ -339,9 +288,7 @@ def edited_page(package, file, before, after):
     return page | {file: page[file].replace(before, after)}
 
 
-@with_runtime
-@with_chromium
-@pytest.mark.slow
+@in_browser
 @pytest.mark.parametrize(
     ("isolated", "cores", "pays", "threads"),
     [(True, 6, 1e9, 3), (True, 6, 0, 1), (True, 2, 1e9, 1), (False, 6, 1e9, 1)],
@@ -356,12 +303,10 @@ def test_an_isolated_page_draws_with_more_threads_where_they_pay(
     page["playback.js"] = edited
     if not isolated:
         monkeypatch.delitem(web_server.HEADERS, "Cross-Origin-Embedder-Policy")
-    server = make_server(page, 8098)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    with Browser(tmp_path, size=(360, 400)) as browser:
+    with serving(page, 8098) as address, Browser(tmp_path, size=(360, 400)) as browser:
         browser.emulate(scheme="light", size=(360, 400))
         browser.claim_cores(cores)
-        browser.go(f"http://127.0.0.1:{server.server_port}/?start=hq")
+        browser.go(f"{address}/?start=hq")
         until(lambda: browser.run("!!window.player"), 120.0)
         assert browser.run("crossOriginIsolated") is isolated
         if threads == 1:
@@ -370,41 +315,29 @@ def test_an_isolated_page_draws_with_more_threads_where_they_pay(
         until(lambda: browser.worker_threads() == 1 + threads, 60.0)
         found = browser.run("player.verify()", seconds=240.0)
         assert all(frame["alike"] for frame in found), found
-    server.shutdown()
-    server.server_close()
 
 
-@with_runtime
-@with_chromium
-@pytest.mark.slow
+@in_browser
 def test_full_replaces_lite_without_a_word_where_the_device_is_fast(package, tmp_path):
     page = edited_page(package, "playback.js", b"QUICK_MS = 45", b"QUICK_MS = 1e9")
-    server = make_server(page, 8095)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    with Browser(tmp_path, size=(360, 400)) as browser:
+    with serving(page, 8095) as address, Browser(tmp_path, size=(360, 400)) as browser:
         browser.emulate(scheme="light", size=(360, 400))
-        browser.go(f"http://127.0.0.1:{server.server_port}/?start=lite")
+        browser.go(f"{address}/?start=lite")
         chosen = "document.querySelector('#tiers input:checked')?.value"
         until(lambda: browser.run(chosen) == "lite", 60.0)
         assert browser.run("document.getElementById('status').hidden")
         until(lambda: browser.run(chosen) == "hq", 120.0)
         assert browser.run("document.getElementById('status').hidden")
-    server.shutdown()
-    server.server_close()
 
 
-@with_runtime
-@with_chromium
-@pytest.mark.slow
+@in_browser
 def test_nothing_came_from_anywhere_else(page, served):
     names = page.run("performance.getEntriesByType('resource').map((entry) => entry.name)")
     assert len(names) > 5
     assert all(name.startswith(served + "/") for name in names)
 
 
-@with_runtime
-@with_chromium
-@pytest.mark.slow
+@in_browser
 def test_the_folder_plays_below_any_address(call_play, package, tmp_path):
     """Python's own server stands for any static host; without --poses the avatar turns round."""
     out = tmp_path / "host" / "people" / "actor"
@@ -442,9 +375,7 @@ def test_the_folder_plays_below_any_address(call_play, package, tmp_path):
             process.terminate()
 
 
-@with_runtime
-@with_chromium
-@pytest.mark.slow
+@in_browser
 def test_the_element_plays_in_a_page_of_ones_own(call_play, package, novel, tmp_path):
     """The example: one avatar dances, another one is loaded when it is scrolled near."""
     words = ("--poses", novel, "--web", "--out", tmp_path / "player")
@@ -452,33 +383,28 @@ def test_the_element_plays_in_a_page_of_ones_own(call_play, package, novel, tmp_
     files = {"index.html": (EXAMPLES / "4_avatar_in_a_page.html").read_bytes()}
     for file in (tmp_path / "player").rglob("*.*"):
         files[str(file.relative_to(tmp_path))] = file.read_bytes()
-    server = make_server(files, 8390)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    try:
-        with Browser(tmp_path / "browser", size=SIZE) as browser:
-            for motion in ("reduce", ""):
-                browser.emulate(scheme="light", size=SIZE, motion=motion)
-                browser.go(f"http://127.0.0.1:{server.server_port}/?{motion}")
-                until(lambda: browser.run("!!window.dancer?.playback?.shown.length"), 120.0)
-                assert browser.run("dancer.state.playing") is (motion == "")
-            assert browser.run("stander.loading === undefined")
-            browser.run("dancer.pause(); dancer.focus()")
-            before = browser.run("dancer.orbit.yaw")
-            browser.press("ArrowLeft")
-            until(lambda: browser.run("dancer.orbit.yaw") > before, 30.0)
-            browser.run(
-                "stander.preview = (blob) => { early = [blob.type, !stander.playback]; };"
-                "stander.scrollIntoView()"
-            )
-            until(lambda: browser.run("!!stander.playback?.shown.length"), 120.0)
-            assert browser.run("early") == ["image/png", True]
-            assert browser.run("dancer.state.inSight") is False
-            assert browser.run("stander.player.count") == 1
-            browser.run("stander.setAttribute('src', 'player/none.iavatar')")
-            until(lambda: "404" in browser.run("stander.message.textContent"), 30.0)
-    finally:
-        server.shutdown()
-        server.server_close()
+    folder = tmp_path / "browser"
+    with serving(files, 8390) as address, Browser(folder, size=SIZE) as browser:
+        for motion in ("reduce", ""):
+            browser.emulate(scheme="light", size=SIZE, motion=motion)
+            browser.go(f"{address}/?{motion}")
+            until(lambda: browser.run("!!window.dancer?.playback?.shown.length"), 120.0)
+            assert browser.run("dancer.state.playing") is (motion == "")
+        assert browser.run("stander.loading === undefined")
+        browser.run("dancer.pause(); dancer.focus()")
+        before = browser.run("dancer.orbit.yaw")
+        browser.press("ArrowLeft")
+        until(lambda: browser.run("dancer.orbit.yaw") > before, 30.0)
+        browser.run(
+            "stander.preview = (blob) => { early = [blob.type, !stander.playback]; };"
+            "stander.scrollIntoView()"
+        )
+        until(lambda: browser.run("!!stander.playback?.shown.length"), 120.0)
+        assert browser.run("early") == ["image/png", True]
+        assert browser.run("dancer.state.inSight") is False
+        assert browser.run("stander.player.count") == 1
+        browser.run("stander.setAttribute('src', 'player/none.iavatar')")
+        until(lambda: "404" in browser.run("stander.message.textContent"), 30.0)
 
 
 @with_runtime

@@ -9,15 +9,13 @@ import av
 import numpy as np
 import pytest
 
-from capture.input_error import InputError
 from capture.source_opening import open_source
-from export import player_page
 from instant_avatar.phone import film_queue
 from instant_avatar.phone.access_control import AccessControl, made_certificate
 from instant_avatar.phone.film_queue import FilmQueue
 from instant_avatar.phone.phone_server import PhoneServer
 from instant_avatar.studio.shoot import ShootConfig, film_capture
-from tests.instant_avatar.browser import Browser, chromium, until
+from tests.instant_avatar.browser import Browser, until, with_chromium, with_runtime
 
 pytest.importorskip("aiohttp")
 pytest.importorskip("segno")
@@ -27,19 +25,7 @@ PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACwAAAAAAQABAAAC"
 """A picture of one pixel."""
 
 
-def has_runtime():
-    try:
-        player_page.runtime_files()
-    except InputError:
-        return False
-    return True
-
-
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(chromium() is None, reason="there is no Chromium here"),
-    pytest.mark.skipif(not has_runtime(), reason="onnxruntime-web is not here (make web)"),
-]
+pytestmark = [pytest.mark.slow, with_chromium, with_runtime]
 
 
 @pytest.fixture(scope="module")

@@ -218,20 +218,6 @@ def test_a_failure_names_what_was_seen_and_what_to_do():
     assert diagnose_failure(report()) is None
 
 
-def test_frames_add_up_in_a_sentence():
-    stats = replace(
-        report().frames, read=23, near_duplicates=1,
-        dropped=tuple(
-            DroppedFrame(index=i, reason=reason)
-            for i, reason in enumerate(["no pose", "person not found", "another person near"])
-        ),
-    )  # fmt: skip
-    assert stats.sentence() == (
-        "23 frames read: 17 learnt from, 2 held out for scores, 1 almost like the one before, "
-        "3 left out (1 without a pose, 1 without the person, 1 with another person near)."
-    )
-
-
 def test_a_video_whose_name_says_nothing_is_called_by_its_folder():
     assert capture_name(Path("films/anna/video.MP4")) == "anna"
     assert capture_name(Path("films/anna turning.mov")) == "anna turning"

@@ -121,10 +121,3 @@ def test_a_frame_that_scores_lower_in_its_fitted_pose_keeps_the_given_one(score)
 def test_a_run_with_counted_steps_does_not_depend_on_the_machine(score):
     whole = ~np.isnan([one.ssim for one in score(steps=10, limit_s=0.0).given])
     assert whole.sum() == MAX_WHOLE_IMAGES
-
-
-def test_a_sample_of_all_pixels_scores_like_the_whole_image(score):
-    """The frames are small enough to be sampled whole, up to the border."""
-    scores = score(steps=10, limit_s=0.0)
-    for whole, sampled in zip(scores.given, scores.sampled, strict=True):
-        assert sampled.psnr_mask == pytest.approx(whole.psnr_mask, abs=1e-4)

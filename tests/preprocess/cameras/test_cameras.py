@@ -2,7 +2,6 @@
 
 import json
 import zipfile
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -313,19 +312,3 @@ def test_counts_that_a_damaged_colmap_model_claims_are_not_believed(colmap):
     (folder / "cameras.bin").write_bytes(huge)
     with pytest.raises(InputError, match="COLMAP"):
         read_named_cameras(folder)
-
-
-def test_a_world_that_is_turned_with_its_cameras_looks_the_same(cameras, points, tmp_path):
-    turn = np.eye(4)
-    turn[:3, :3] = Rotation.from_rotvec([0.3, -0.8, 0.1]).as_matrix()
-    turned = [
-        replace(camera, camera_from_world=camera.camera_from_world @ np.linalg.inv(turn))
-        for camera in cameras
-    ]
-    path = transforms(tmp_path / "transforms.json", turned, [f"f{n}" for n in range(COUNT)])
-    track = read_cameras(path, SIZE)
-    for frame, camera in enumerate(cameras):
-        there = points @ turn[:3, :3].T
-        np.testing.assert_allclose(
-            track[frame].project(there), replace(camera, focal_px=(500.0, 500.0)).project(points)
-        )

@@ -211,16 +211,6 @@ def test_the_number_of_joints_tells_the_body(world, numbers, model):
     assert read_poses(rated).body_model == (model if numbers == 165 else "smpl")
 
 
-@pytest.mark.parametrize(
-    "content", [{"mhr_model_params": np.zeros(204)}, [{"keypoints": [0.0] * 51}], np.zeros((4, 72))]
-)
-def test_what_is_no_pose_of_smpl_is_refused(tmp_path, content):
-    path = tmp_path / "poses.pkl"
-    path.write_bytes(pickle.dumps(content))
-    with pytest.raises(InputError, match=r"poses\.pkl holds no poses"):
-        read_poses(path)
-
-
 def test_frames_whose_poses_have_other_shapes_do_not_fit_together(world):
     rows = json.loads(list_of_frames(world).read_text())
     rows[3]["body_pose"] = rows[3]["body_pose"][:21]

@@ -270,12 +270,20 @@ def fitted_m(motion, truth):
     return np.linalg.norm(ours - theirs, axis=-1)[:, limbs].mean()
 
 
-@pytest.mark.usefixtures("our_joints")
-def test_people_of_comfyuis_glb_are_kept_apart(truth, tmp_path):
-    data = Rig(numbered("bone_{:03d}"), twist=0.7).glb(*truth)
+def edited(path, data, change):
+    """Writes a .glb whose JSON went through `change`."""
     size = struct.unpack_from("<I", data, 12)[0]
-    text = json.loads(data[20 : 20 + size])
-    nodes, (animation,) = text["nodes"], text["animations"]
+    content = json.loads(data[20 : 20 + size])
+    change(content)
+    text = json.dumps(content).encode()
+    text += b" " * (-len(text) % 4)
+    path.write_bytes(data[:12] + struct.pack("<I4s", len(text), b"JSON") + text + data[20 + size :])
+    return path
+
+
+def add_person(content):
+    """The same person once more, 2 m aside."""
+    nodes, (animation,) = content["nodes"], content["animations"]
     count, channels = len(nodes), animation["channels"]
     moved = json.loads(json.dumps(nodes))
     for node in moved:
@@ -286,10 +294,12 @@ def test_people_of_comfyuis_glb_are_kept_apart(truth, tmp_path):
         each | {"target": each["target"] | {"node": each["target"]["node"] + count}}
         for each in channels
     ]
-    text = json.dumps(text).encode()
-    text += b" " * (-len(text) % 4)
-    path = tmp_path / "all_tracks.glb"
-    path.write_bytes(data[:12] + struct.pack("<I4s", len(text), b"JSON") + text + data[20 + size :])
+
+
+@pytest.mark.usefixtures("our_joints")
+def test_people_of_comfyuis_glb_are_kept_apart(truth, tmp_path):
+    data = Rig(numbered("bone_{:03d}"), twist=0.7).glb(*truth)
+    path = edited(tmp_path / "all_tracks.glb", data, add_person)
     rotations, places = truth
     for person, aside in (("track00", 0.0), ("track01", 2.0)):
         motion = read_poses(path, person=person)
@@ -373,44 +383,30 @@ def test_a_file_cut_short_gives_the_frames_that_it_has(truth, tmp_path):
 
 def test_a_model_without_an_animation_is_named(truth, tmp_path):
     data = Rig(VRM).glb(*truth)
-    size = struct.unpack_from("<I", data, 12)[0]
-    text = json.loads(data[20 : 20 + size]) | {"animations": []}
-    whole = json.dumps(text).encode().ljust(size)
-    path = tmp_path / "still.vrm"
-    path.write_bytes(data[:20] + whole + data[20 + size :])
+    path = edited(tmp_path / "still.vrm", data, lambda content: content["animations"].clear())
     with pytest.raises(InputError, match="no animation"):
         read_poses(path)
 
 
 def test_a_vrma_is_read_by_its_humanoid_bones_whatever_the_nodes_are_called(truth, tmp_path):
-    data = Rig(VRM, twist=1.0).glb(*truth)
-    size = struct.unpack_from("<I", data, 12)[0]
-    text = json.loads(data[20 : 20 + size])
-    bones = {node["name"]: {"node": number} for number, node in enumerate(text["nodes"])}
-    for number, node in enumerate(text["nodes"]):
-        node["name"] = f"Knochen {number}"
-    animation = {"specVersion": "1.0", "humanoid": {"humanBones": bones}}
-    text |= {"extensionsUsed": ["VRMC_vrm_animation"]}
-    text |= {"extensions": {"VRMC_vrm_animation": animation}}
-    whole = json.dumps(text).encode()
-    path = tmp_path / "walk.vrma"
-    path.write_bytes(
-        data[:12] + struct.pack("<I4s", len(whole), b"JSON") + whole + data[20 + size :]
-    )
+    def as_vrma(content):
+        bones = {node["name"]: {"node": number} for number, node in enumerate(content["nodes"])}
+        for number, node in enumerate(content["nodes"]):
+            node["name"] = f"Knochen {number}"
+        animation = {"specVersion": "1.0", "humanoid": {"humanBones": bones}}
+        content["extensionsUsed"] = ["VRMC_vrm_animation"]
+        content["extensions"] = {"VRMC_vrm_animation": animation}
+
+    path = edited(tmp_path / "walk.vrma", Rig(VRM, twist=1.0).glb(*truth), as_vrma)
     metres, degrees = errors(read_poses(path), truth)
     assert metres < 0.005
     assert degrees < 0.5
 
 
 def test_nodes_that_are_their_own_ancestors_are_refused(truth, tmp_path):
-    data = Rig(VRM).glb(*truth)
-    size = struct.unpack_from("<I", data, 12)[0]
-    text = json.loads(data[20 : 20 + size])
-    text["nodes"][-1]["children"] = [0]
-    whole = json.dumps(text, separators=(",", ":")).encode()
-    path = tmp_path / "circle.glb"
-    path.write_bytes(
-        data[:12] + struct.pack("<I4s", len(whole), b"JSON") + whole + data[20 + size :]
-    )
+    def in_a_circle(content):
+        content["nodes"][-1]["children"] = [0]
+
+    path = edited(tmp_path / "circle.glb", Rig(VRM).glb(*truth), in_a_circle)
     with pytest.raises(InputError, match="their own ancestors"):
         read_poses(path)

@@ -69,14 +69,6 @@ def instant_avatar(w: World) -> Path:
     return w.write("poses.npz", npz(**arrays))
 
 
-def animation(w: World) -> Path:
-    return w.write("dance.npz", npz(poses=f32(w.thetas), trans=f32(w.places)))
-
-
-def thetas(w: World) -> Path:
-    return w.write("poses.npz", npz(thetas=f32(w.thetas), transl=f32(w.places)))
-
-
 def superset(w: World) -> Path:
     """Our own: rows in any order, one of them lost, each seen by a camera that moves."""
     turn = Rotation.from_rotvec(np.linspace([0.1, 0.0, 0.2], [0.3, 2.0, -0.1], 40))
@@ -329,7 +321,7 @@ def aist(w: World) -> Path:
 
 
 TRACKERS = [
-    instant_avatar, animation, thetas, superset, matrices_without_hands, human_data, phalp,
+    instant_avatar, superset, matrices_without_hands, human_data, phalp,
     wham, vibe, gvhmr, tram_track, tram, prompthmr, prompthmr_numbers, romp, romp_folder, bev,
     easymocap, easymocap_annots, easymocap_short, zju, amass, amass_smplx, aist,
 ]  # fmt: skip
@@ -486,6 +478,7 @@ def wham_rows(joints: int, places: int, frames: int) -> dict:
     ("content", "message"),
     [
         ({"theta": np.zeros((3, 72))}, "theta"), ([1, 2, 3], "list"),
+        (np.zeros((4, 72)), "holds no poses"), ([{"keypoints": [0.0] * 51}], "holds no poses"),
         (wham_rows(20, 3, 3), "20 j"), (wham_rows(24, 2, 3), "WHAM"),
         (wham_rows(24, 3, 1), "1 frame n"),
     ],

@@ -136,8 +136,9 @@ def problems_of(*found):
     return [set(finder.problems(each, SIZE)) for each in found]
 
 
-def test_a_person_well_inside_the_frame_is_no_problem():
+def test_a_person_well_inside_the_frame_is_no_problem_and_another_one_nearby_is():
     assert problems_of(*[person()] * 3) == [set()] * 3
+    assert problems_of(person(crowded=True)) == [{TrackingProblem.CROWDED}]
 
 
 @pytest.mark.parametrize(
@@ -147,9 +148,6 @@ def test_a_mask_that_reaches_a_border_touches_it(x, problem):
     assert touched_borders(person(x), SIZE) == {problem}
     inside = 100 + 0.85 * (x - 100)
     assert touched_borders(person(inside), SIZE) == set()
-
-
-def test_a_mask_as_high_as_the_frame_touches_both_borders():
     both = {TrackingProblem.TOP, TrackingProblem.BOTTOM}
     assert touched_borders(person(radius=51.0), SIZE) == both
 
@@ -166,7 +164,3 @@ def test_a_person_found_far_from_the_last_place_may_be_another():
     assert far == [set(), set(), {TrackingProblem.ELSEWHERE}, set()]
     assert problems_of(person(40.0), None, person(80.0)) == [set()] * 3
     assert problems_of(None, person(150.0)) == [set()] * 2
-
-
-def test_another_person_nearby_is_a_problem():
-    assert problems_of(person(crowded=True)) == [{TrackingProblem.CROWDED}]
