@@ -13,8 +13,6 @@ from rich.table import Column
 
 MAX_PRINTED_WARNINGS = 5
 """Warnings, and notes, that are printed; the report lists all of them."""
-MAX_KEPT_WARNINGS = 500
-"""Warnings, and notes, that are kept, so that memory stays bounded for any length of video."""
 LOG_INTERVAL_S = 10.0
 """Seconds between two progress lines in a log."""
 MIN_ELAPSED_FOR_ESTIMATE_S = 2.0
@@ -48,8 +46,8 @@ class Console:
     """Messages on stderr; stdout is for results.
 
     Attributes:
-        warnings: What asks the user for something; the first `MAX_KEPT_WARNINGS`.
-        notes: What asks for nothing, as many.
+        warnings: What asks the user for something.
+        notes: What asks for nothing.
     """
 
     def __init__(self, console: RichConsole | None = None) -> None:
@@ -88,7 +86,7 @@ class Console:
 
     def _keep(self, message: str, messages: list[str]) -> bool:
         """Keep a message unless it is among `messages`; return whether to print it."""
-        if message in messages or len(messages) == MAX_KEPT_WARNINGS:
+        if message in messages:
             return False
         messages.append(message)
         return len(messages) <= MAX_PRINTED_WARNINGS
