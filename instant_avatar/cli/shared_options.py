@@ -53,7 +53,7 @@ class CaptureArguments:
     body: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Your own SMPL body, .npz or .pkl (nothing in it is executed; default: the embedded body)."""
     frames: str = "::"
-    """Frames to use: START:STOP:STEP, counted from 0."""
+    """Frames to use: START:STOP:STEP, counted from 0; ::1 for all, where poses are tracked."""
     rotate: Literal[0, 90, 180, 270] = 0
     """Turn each frame clockwise by this many degrees, where the video lies on its side or upside
     down. Poses, masks and cameras that are given must be those of the turned frames."""

@@ -47,6 +47,10 @@ MAX_PRINTED_STRETCHES = 8
 """Doubtful stretches that are printed; reports hold all of them."""
 MAX_FRAMES = 600
 """Most frames that are tracked unless --frames says which; of longer videos every nth."""
+LEARNT_FPS = 14.0
+"""Frames of a second of film that are enough to learn from: of 30 those between show the same."""
+FEW_FRAMES = 120
+"""Frames of a film that are used before any is left out, if it has as many."""
 SAME_PERSON = 0.15
 """Mean distance of one person's key points, found twice in a frame, in the person's size."""
 
@@ -69,12 +73,21 @@ class PersonTracking:
         return align_capture(self.imported, skip_checks=True)
 
 
-def limit_frames(inputs: CaptureInputs, source: FrameSource) -> CaptureInputs:
-    """Choose every nth frame of a long recording, unless the user chose some."""
+def limit_frames(
+    inputs: CaptureInputs, source: FrameSource, *, for_learning: bool = False
+) -> CaptureInputs:
+    """Choose every nth frame of a long recording, unless the user chose some.
+
+    `for_learning` also leaves out frames of a video between which a person hardly moves.
+    """
     count = source.frame_count or 0
-    if inputs.frames is not None or count <= MAX_FRAMES:
+    step = max(1, -(-count // MAX_FRAMES))
+    if for_learning and source.duration_s and not source.path.is_dir():
+        enough = max(FEW_FRAMES, LEARNT_FPS * source.duration_s)
+        step = max(step, int(count / enough))
+    if inputs.frames is not None or step == 1:
         return inputs
-    return replace(inputs, frames=slice(None, None, -(-count // MAX_FRAMES)))
+    return replace(inputs, frames=slice(None, None, step))
 
 
 def track_person(
@@ -84,18 +97,20 @@ def track_person(
     *,
     stop: threading.Event | None = None,
     resume: bool = False,
+    for_learning: bool = False,
 ) -> PersonTracking:
     """Track the person, and write poses, and masks to the folder masks/ beside them.
 
     Masks that were given, or lie beside the video, are used instead of tracked ones (see
     `masks_to_use`); so are cameras. Setting `stop` ends tracking early; what was found until then
     is written. With `resume`, `poses` and its masks hold the first frames, after which to go on.
+    `for_learning` leaves out frames that an avatar does not need (see `limit_frames`).
 
     Raises:
         InputError: If the recording cannot be read, or no person is found in it.
         KeyboardInterrupt: If it was stopped before the person was found.
     """
-    inputs, source = _open_video(inputs, console, look=not resume)
+    inputs, source = _open_video(inputs, console, look=not resume, for_learning=for_learning)
     folder = poses.parent / "masks"
     given, names_segmenter = masks_to_use(inputs, folder), segmenter_name(inputs.masks) is not None
     own_masks = given is None and (names_segmenter or not source.has_alpha)
@@ -126,11 +141,11 @@ def track_person(
 
 
 def _open_video(
-    inputs: CaptureInputs, console: Console, *, look: bool
+    inputs: CaptureInputs, console: Console, *, look: bool, for_learning: bool
 ) -> tuple[CaptureInputs, FrameSource]:
     """Open the frames that are to be tracked; with `look` print what a few of them show."""
     source = open_source(inputs.video, frames=inputs.frames, rotate=inputs.rotate)
-    inputs, step = limit_frames(inputs, source), source.selection.step
+    inputs, step = limit_frames(inputs, source, for_learning=for_learning), source.selection.step
     source = reopen(source, inputs.frames)
     if source.selection.step != step:
         console.info(

@@ -106,7 +106,9 @@ def _track(
     OutputFileList(run.tracking).create()
     OutputFileList(run.tracking).remove_temporaries()
     try:
-        return track_person(inputs, run.tracked_poses, console, stop=stop, resume=resume)
+        return track_person(
+            inputs, run.tracked_poses, console, stop=stop, resume=resume, for_learning=True
+        )
     finally:
         OutputFileList(run.tracking).remove_if_empty()
         with suppress(OSError):  # not empty

@@ -133,7 +133,8 @@ def _color_likelihood(
 ) -> Float32[np.ndarray, "pixels tried"]:
     """Density of a color at a squared distance from the mixture, up to a factor."""
     variance = noise + (alpha * spread) ** 2
-    return np.exp(-0.5 * squared / variance) * (np.float32(16.0) / variance) ** np.float32(1.5)
+    ratio = np.float32(16.0) / variance
+    return np.exp(np.float32(-0.5) * squared / variance) * ratio * np.sqrt(ratio)
 
 
 def border_distance_px(alpha: Plane) -> Plane:

@@ -301,21 +301,19 @@ def refine(
     """Move points, pixels of the crop, to the centroid of their heat maps (logits) nearby."""
     cells = heatmaps.shape[1]
     cell_px = size / cells
-    refined = crop_px.copy()
+    reach = np.arange(-HEATMAP_REACH, HEATMAP_REACH + 1)
     middle = np.floor(crop_px / cell_px).astype(int)
-    for index, (column, row) in enumerate(middle.tolist()):
-        if not (0 <= column < cells and 0 <= row < cells):
-            continue
-        left, top = max(0, column - HEATMAP_REACH), max(0, row - HEATMAP_REACH)
-        heat = sigmoid(
-            heatmaps[
-                index, top : row + HEATMAP_REACH + 1, left : column + HEATMAP_REACH + 1
-            ].astype(np.float64)
-        )
-        if heat.max() < MIN_HEAT:
-            continue
-        columns = left + np.arange(heat.shape[1])
-        rows = top + np.arange(heat.shape[0])
-        centroid = np.array([heat.sum(axis=0) @ columns, heat.sum(axis=1) @ rows])
-        refined[index] = centroid / heat.sum() * cell_px
+    columns, rows = (middle[:, axis, None] + reach for axis in (0, 1))
+    # all windows at once: small operations wait for Python's lock, which masks hold beside it
+    points = np.arange(len(middle))[:, None, None]
+    near = np.clip(rows, 0, cells - 1)[:, :, None], np.clip(columns, 0, cells - 1)[:, None]
+    heat = sigmoid(heatmaps[points, *near].astype(np.float64))
+    for axis, places in ((1, columns), (2, rows)):
+        heat *= np.expand_dims((places >= 0) & (places < cells), axis)
+    use = ((middle >= 0) & (middle < cells)).all(axis=1) & (heat.max(axis=(1, 2)) >= MIN_HEAT)
+    total = heat.sum(axis=(1, 2))
+    refined = crop_px.copy()
+    for axis, places in ((0, columns), (1, rows)):
+        centroid = (heat.sum(axis=axis + 1) * places).sum(axis=1)
+        refined[use, axis] = centroid[use] / total[use] * cell_px
     return refined

@@ -152,6 +152,16 @@ def test_of_a_long_video_every_nth_frame_is_tracked(video, monkeypatch):
     assert person_tracking.limit_frames(chosen, open_source(video)) == chosen
 
 
+def test_of_a_video_to_learn_from_half_of_thirty_frames_a_second_are_tracked(video, monkeypatch):
+    inputs, source = CaptureInputs(video=video), open_source(video)
+    assert source.frame_count / source.duration_s == pytest.approx(30.0)
+    assert person_tracking.limit_frames(inputs, source, for_learning=True) == inputs  # it is short
+    monkeypatch.setattr(person_tracking, "FEW_FRAMES", 4)
+    limited = person_tracking.limit_frames(inputs, source, for_learning=True)
+    assert limited.frames == slice(None, None, 2)
+    assert person_tracking.limit_frames(inputs, source) == inputs
+
+
 def test_what_was_found_before_ctrl_c_is_kept(video, tmp_path):
     stop = threading.Event()
 
