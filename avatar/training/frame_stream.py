@@ -117,6 +117,8 @@ JOINT_ANGLE_WEIGHT = 0.5
 """Weight of a radian of joint rotation relative to a radian of view direction."""
 MIN_KEYFRAME_DISTANCE = 0.05
 """Descriptor distance below which two frames show the same view, about 3°."""
+INITIAL_KEYFRAMES = TrainConfig.replay_capacity
+"""Number of frames that are accepted whatever they show: the default replay capacity."""
 MAX_KEYFRAME_INTERVAL_S = 0.5
 """Longest time between keyframes of a person who stands still, seconds."""
 
@@ -140,7 +142,7 @@ class KeyframeSelector:
 
     def __init__(self, rig: Rig) -> None:
         """Starts without keyframes; the first `INITIAL_KEYFRAMES` frames are all accepted."""
-        self._rig, self._initial_left = rig, TrainConfig.replay_capacity
+        self._rig, self._initial_left = rig, INITIAL_KEYFRAMES
         self._last: tuple[float, Float[np.ndarray, " 72"]] | None = None
 
     def accepts(self, observation: Observation) -> bool:
