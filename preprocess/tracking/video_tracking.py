@@ -35,7 +35,8 @@ ELSEWHERE = 0.6
 MIN_FOUND = 8
 """Fewest frames in which the person must be found; 4 of fewer than 16 frames."""
 FRAMES_REFINED_AGAIN = 60
-"""First frames whose masks are made again in the end, when the background behind them is known."""
+"""First frames of a film, of which those that are used have their masks made again in the end, when
+the background behind them is known."""
 APPROACH_FRAMES = 4
 """Frames before another person is seen to be near in which it may have come near."""
 QUEUED_MASKS = 8
@@ -218,8 +219,8 @@ class VideoTracking:
 
     def _refine_again(self) -> None:
         """Make the masks of the first frames again, by what later frames have shown."""
-        left = set(list(self._found)[:FRAMES_REFINED_AGAIN])
-        for frame in self._source.frames() if left else ():
+        left = set(list(self._found)[: -(-FRAMES_REFINED_AGAIN // self._source.selection.step)])
+        for frame in read_ahead(self._source.frames()) if left else ():
             if frame.index in left:
                 self._write_mask(frame, self._found[frame.index])
                 left.remove(frame.index)
