@@ -42,7 +42,10 @@ from preprocess.observation import associate_cameras
 from preprocess.tracking.keypoints import MIN_PRESENCE, KeypointTrack, PersonKeypoints
 
 KEY_FRAMES = 50
-"""Frames, evenly spread, whose masks are fitted."""
+"""Frames, evenly spread, whose masks given poses are fitted to; more if `MORE_MASKS` tell."""
+MORE_MASKS = 100
+"""Number of frames that are to tell beside given poses from which the masks of all of these are
+fitted: reading them again takes 20 core-ms each."""
 CHAIN_FRAMES = 150
 """Frames, evenly spread, whose given poses are fitted: those without a mask follow their neighbors
 and are human; poses between them follow."""
@@ -51,7 +54,7 @@ MIN_ITERATIONS = 4
 MAX_ITERATIONS = 12
 """Most Gauss-Newton iterations."""
 TRACKED_KEY_FRAMES = 300
-"""Frames, evenly spread, whose masks are fitted together with key points."""
+"""Most frames, evenly spread, whose masks are fitted together with key points."""
 KEYPOINT_ITERATIONS = 3
 """Iterations with key points alone, after which the body is near its outline."""
 TRACKED_ITERATIONS = 3
@@ -69,9 +72,9 @@ NOISE_DEG_PER_CM = 1.5
 after it (1.4, 1.4 and 1.55 on three exact captures; a tracker's, real and simulated: 5 to 8)."""
 MIN_FRAMES = 4
 """Fewest frames with a usable mask, or with key points, to which a person is fitted."""
-MOST_TRACKED_FRAMES = 80
-"""Frames in which key points would be found if they alone counted, 30 core-ms each. The number is
-this times the weight that they are expected to get."""
+EQUAL_TRACKED_FRAMES = 60
+"""Frames in which key points are found if they are expected to count as much as the given poses,
+30 core-ms each. The number is this times the ratio of both's expected weights."""
 BESIDE_ITERATIONS = (4, 3)
 """Of those poses, iterations with key points alone, and then with outlines."""
 ERROR_PER_TURN = 1.2
@@ -113,7 +116,7 @@ def apply_fit(capture: Capture, fit: CaptureFit, *, height_m: float | None = Non
 
 
 def fit_capture(capture: Capture, *, fit_body: bool = True) -> CaptureFit | None:
-    """Fit a capture to the masks of a few frames, and to its key points if its poses have some.
+    """Fit a capture to the masks of some frames, and to its key points if its poses have some.
 
     Poses with key points are a first guess made of these alone, and are always changed. Without
     `fit_body` proportions stay, as those of an avatar's person.
@@ -124,20 +127,26 @@ def fit_capture(capture: Capture, *, fit_body: bool = True) -> CaptureFit | None
     tracked = capture.motion.keypoints is not None
     if fit_body and capture.motion.is_fitted:
         return None
-    fitter = make_fitter(capture)
+    fitter = make_fitter(capture, TRACKED_KEY_FRAMES if tracked else KEY_FRAMES)
     if fitter is None:
         return None
     everything = FitParameters(proportions=fit_body, focal=not capture.cameras.is_moving)
+    pixel_cm = 100.0 * capture.pixel_footprint_m() * _reduction(capture, fitter)
+    share, keypoint_share = 1.0, 0.0
     if tracked:
         settling = _fit_tracked(fitter, everything)
     else:
         settling = _iterate_until_settled(fitter, everything)
+        share = share_beyond_noise(fitter.corrections, settling[-1] * pixel_cm)
+        error_rad = math.sqrt(share) * _expected_error_rad(fitter)
+        count = min(_count_telling_frames(error_rad), capture.source.frame_count or 1)
+        further = _take_masks(capture, fitter, count) if count >= MORE_MASKS else None
+        if further is not None:
+            fitter = further
+            settling += _iterate_until_settled(fitter, everything)
+            error_rad = math.sqrt(share) * _expected_error_rad(fitter)
+        keypoint_share = _take_keypoints(capture, fitter, error_rad)
     before, after = settling[0], settling[-1]
-    pixel_cm = 100.0 * capture.pixel_footprint_m() * _reduction(capture, fitter)
-    share = 1.0 if tracked else share_beyond_noise(fitter.corrections, after * pixel_cm)
-    keypoint_share = 0.0
-    if not tracked and share:
-        keypoint_share = _take_keypoints(capture, fitter, share)
     return CaptureFit(
         coefficients=share * fitter.coefficients,
         focal_factor=float(np.exp(share * fitter.log_focal)),
@@ -150,14 +159,13 @@ def fit_capture(capture: Capture, *, fit_body: bool = True) -> CaptureFit | None
     )
 
 
-def _take_keypoints(capture: Capture, fitter: ClipFitter, share: float) -> float:
+def _take_keypoints(capture: Capture, fitter: ClipFitter, error_rad: float) -> float:
     """Fit given poses once more, near them and those by key points; return the latter's weight.
 
-    `share` of the fit's changes is no noise. The weight, the joints' mean, is 0 if the person is
-    not found, or if key points would count by less than a twentieth.
+    The given poses are expected to err by `error_rad`. The weight, the joints' mean, is 0 if the
+    person is not found, or if key points would count by less than a twentieth.
     """
-    error2 = share * (ERROR_PER_TURN * _mean_turn(fitter.corrections)) ** 2
-    count = round(MOST_TRACKED_FRAMES * error2 / (error2 + LEAST_ERROR_RAD**2))
+    count = _count_telling_frames(error_rad)
     if count < MIN_FRAMES:
         return 0.0
     track = _find_keypoints(capture, fitter, _choose_frames(fitter.frames, count))
@@ -175,7 +183,7 @@ def _take_keypoints(capture: Capture, fitter: ClipFitter, share: float) -> float
     beside.poses = fitter.poses.rows(rows)
     beside.iterate_stages(POSES_ALONE, *BESIDE_ITERATIONS)
     steps = beside.poses.steps_from(fitter.poses.rows(rows), beside.camera_rotations)
-    weights = weigh_joints(steps, math.sqrt(error2))
+    weights = weigh_joints(steps, error_rad)
     each_weight = np.repeat(np.append(weights, weights[0]), 3)  # the root's place as it turns
     each_step = [np.interp(fitter.numbers, beside.numbers, each) for each in steps.T]
     turns, further = fitter.camera_rotations, np.column_stack(each_step)
@@ -184,6 +192,27 @@ def _take_keypoints(capture: Capture, fitter: ClipFitter, share: float) -> float
     fitter.poses = fitter.poses.moved(each_weight * further, turns)
     fitter.iterate_stages(POSES_ALONE, 0, BLENDED_ITERATIONS)
     return float(weights[1:22].mean())
+
+
+def _expected_error_rad(fitter: ClipFitter) -> float:
+    """Error that outlines leave in given poses, mean over the joints, by how far they turned."""
+    return ERROR_PER_TURN * _mean_turn(fitter.corrections)
+
+
+def _count_telling_frames(error_rad: float) -> int:
+    """Number of frames that are to tell beside given poses: the worse these are, the more."""
+    ratio = (error_rad / LEAST_ERROR_RAD) ** 2
+    return min(round(EQUAL_TRACKED_FRAMES * ratio), TRACKED_KEY_FRAMES)
+
+
+def _take_masks(capture: Capture, fitter: ClipFitter, count: int) -> ClipFitter | None:
+    """The problem of more frames' masks, begun where the fit of fewer ended."""
+    further = make_fitter(capture, count)
+    if further is not None:
+        further.take_person(fitter)
+        steps = [np.interp(further.numbers, fitter.numbers, each) for each in fitter.corrections.T]
+        further.poses = further.given.moved(np.column_stack(steps), further.camera_rotations)
+    return further
 
 
 def weigh_joints(
@@ -229,14 +258,13 @@ def _iterate_until_settled(fitter: ClipFitter, fitted: FitParameters) -> list[fl
     return errors
 
 
-def make_fitter(capture: Capture) -> ClipFitter | None:
+def make_fitter(capture: Capture, mask_count: int = TRACKED_KEY_FRAMES) -> ClipFitter | None:
     """The problem of a capture's spread masks and key points; None without enough of them."""
     track = capture.motion.keypoints
     geometry, space = capture.geometry(), ProportionSpace.around(capture.shaped)
-    count = TRACKED_KEY_FRAMES if track else KEY_FRAMES
     samples = {
         sample.index: sample
-        for sample in read_silhouettes(capture, count)
+        for sample in read_silhouettes(capture, mask_count)
         if geometry.row_for_frame(sample.index) is not None
     }
     others = _spread_frames(capture.source) if track is None else track.frames.tolist()

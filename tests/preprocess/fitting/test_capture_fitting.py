@@ -172,6 +172,17 @@ def test_key_points_bring_coarse_poses_nearer_to_the_truth(coarse, monkeypatch):
     assert by_both < 0.85 * by_outlines
 
 
+@pytest.mark.slow
+def test_coarse_poses_are_fitted_to_the_masks_of_more_frames(coarse, monkeypatch):
+    capture, truth = coarse
+    monkeypatch.setattr(capture_fitting, "KEY_FRAMES", 6)
+    monkeypatch.setattr(capture_fitting, "MORE_MASKS", 12)
+    by_all = error_deg(apply_fit(capture, fit_capture(capture)).motion, truth)
+    monkeypatch.setattr(capture_fitting, "_take_masks", lambda *evidence: None)
+    by_six = error_deg(apply_fit(capture, fit_capture(capture)).motion, truth)
+    assert by_all < by_six
+
+
 def test_no_key_points_are_looked_for_where_given_poses_are_exact(capture, monkeypatch):
     monkeypatch.delattr(capture_fitting, "_find_keypoints")
     assert fit_capture(capture).share == 0.0
