@@ -12,7 +12,7 @@ from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 from capture.source import Frame, FrameSource, RgbImage
 from capture.source_opening import glance
@@ -33,8 +33,11 @@ FITTING_STEP = 0.1
 """Way and growth of a person, in sides of its square, up to which an earlier square fits."""
 BACKGROUND_PX = 480
 """Longer side of the images in which the background is followed, px."""
-MAX_CORNERS = 200
-"""Most corners of the background that are followed."""
+CELL_PX = 24
+"""Side of the squares of which each has one corner that is followed, px: all parts of the picture
+count alike, however much stronger a title's corners are."""
+MIN_GRADIENT = 1.5
+"""Least change of gray along and across a corner, levels a pixel: noise is below it."""
 MIN_CORNERS = 12
 """Fewest corners of the background of which a motion is believed."""
 PERSON_MARGIN = 0.1
@@ -282,9 +285,11 @@ def camera_motion(
         return CameraMotion.STILL if shift < STILL_SHARE else CameraMotion.HELD, shift
     planes = [each.plane for each in followed if each.share > MIN_PARALLAX_SHARE]
     shift = max(each.share for each in followed)
-    if not stays and shift < STILL_FRAME_SHARE:  # too plain to be recognized from far
+    if (
+        max(stays, default=0.0) < STILL_SHARE and shift < STILL_FRAME_SHARE
+    ):  # too plain to be recognized from far
         return CameraMotion.STILL, shift
-    if not planes or WALKING_SHARE < np.median(planes) < TURNING_SHARE:
+    if len(planes) < 2 or WALKING_SHARE < np.median(planes) < TURNING_SHARE:
         return CameraMotion.MOVES, shift
     turns = np.median(planes) >= TURNING_SHARE
     return CameraMotion.TURNS if turns else CameraMotion.WALKS, shift
@@ -304,14 +309,29 @@ def _reduced_gray(rgb: RgbImage) -> UInt8[np.ndarray, "rows columns"]:
     return cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
 
 
+def _corners(
+    gray: UInt8[np.ndarray, "rows columns"], mask: UInt8[np.ndarray, "rows columns"]
+) -> Float32[np.ndarray, "corners 1 2"]:
+    """The sharpest corner of each square of the background that has one, (column, row)."""
+    sharpness = np.where(mask > 0, cv2.cornerMinEigenVal(gray, blockSize=3), 0.0)
+    corners = []
+    for top in range(0, gray.shape[0], CELL_PX):
+        for left in range(0, gray.shape[1], CELL_PX):
+            cell = sharpness[top : top + CELL_PX, left : left + CELL_PX]
+            row, column = np.unravel_index(cell.argmax(), cell.shape)
+            if 255.0 / 2.0 * np.sqrt(cell[row, column]) > MIN_GRADIENT:
+                corners.append((left + column, top + row))
+    return np.array(corners, np.float32).reshape(-1, 1, 2)
+
+
 def _shift(
     one: UInt8[np.ndarray, "rows columns"],
     other: UInt8[np.ndarray, "rows columns"],
     mask: UInt8[np.ndarray, "rows columns"],
 ) -> _Shift | None:
     """The motion of the background between two images; None if it cannot be followed."""
-    corners = cv2.goodFeaturesToTrack(one, MAX_CORNERS, 0.01, 7, mask=mask)
-    if corners is None or len(corners) < MIN_CORNERS:
+    corners = _corners(one, mask)
+    if len(corners) < MIN_CORNERS:
         return None
     moved, ahead, _ = cv2.calcOpticalFlowPyrLK(one, other, corners, corners.copy(), maxLevel=4)
     back, behind, _ = cv2.calcOpticalFlowPyrLK(other, one, moved, moved.copy(), maxLevel=4)

@@ -114,6 +114,22 @@ def test_a_camera_that_is_carried_past_near_and_far_things_walks():
     assert 8 / 480 < shift < 32 / 480
 
 
+def test_a_title_that_stands_over_a_pan_is_no_camera_that_stands():
+    """Its corners are the strongest ones by far, but cover a small part of the picture."""
+    noise = np.random.default_rng(0).integers(90, 150, (60, 480), dtype=np.uint8)
+    ground = cv2.resize(noise, (3840, 480), interpolation=cv2.INTER_CUBIC)
+
+    def frame(index):
+        rgb = np.repeat(ground[:, 40 * index :][:, :480, None].copy(), 3, axis=2)
+        cv2.putText(rgb, "FINAL 100 m", (10, 40), cv2.FONT_HERSHEY_SIMPLEX, 1.2, (255,) * 3, 6)
+        return Frame(index=index, time_s=0.2 * index, rgb=rgb)
+
+    pairs = [(frame(12 * place), frame(12 * place + 1)) for place in range(6)]
+    motion, shift = camera_motion(pairs, [np.full((480, 480), 255, np.uint8)] * 6)
+    assert motion is CameraMotion.TURNS
+    assert shift == pytest.approx(40 / 480, abs=1e-3)
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("without_baking")
 def test_a_film_with_poses_is_looked_at_too(
