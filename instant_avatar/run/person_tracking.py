@@ -338,7 +338,9 @@ def _grade(capture: Capture, frame_times_s: Mapping[int, float]) -> TrackingGrad
     source, keypoints = capture.source, capture.motion.keypoints
     assert keypoints is not None
     skin = SkinPoints.of(capture.shaped)
-    sampled = sample_masks(source, capture.masks, capture.cameras, skin, count=GRADED_FRAMES)
+    sampled = sample_masks(
+        source, capture.masks, capture.cameras, skin, count=GRADED_FRAMES, track=keypoints
+    )
     scores = sampled.frame_scores(capture.geometry())
     return grade_tracking(
         capture.motion,

@@ -20,6 +20,7 @@ from preprocess.body.body_surface import (
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.masks.mask_sources import MaskSource
 from preprocess.observation import associate_cameras
+from preprocess.tracking.keypoints import KeypointTrack
 
 GOOD_IOU = 0.7
 """Mean IoU of body and masks from which a capture is good."""
@@ -171,13 +172,17 @@ def sample_masks(
     *,
     count: int = SAMPLED_FRAMES,
     person_px: int = SILHOUETTE_PERSON_PX,
+    track: KeypointTrack | None = None,
 ) -> SilhouetteObjective:
     """Read a few given masks; images are decoded only where their alpha channel is the mask.
 
-    `person_px` is the height of the person in the reduced masks.
+    `person_px` is the height of the person in the reduced masks. Masks are those of frames with key
+    points in `track`, if there is one: a file may claim more frames than can be decoded.
     """
     start, step = source.selection.start, source.selection.step
     usable = [start + step * n for n in range(source.frame_count or 1)]
+    if track is not None:
+        usable = [int(n) for n in track.frames if source.selection.contains(int(n))] or usable
     usable = [frame for frame in usable if frame not in cameras.frames_without_camera] or usable
     frames = [usable[n] for n in spaced_indices(len(usable), count)]
     size_px, camera_row = (

@@ -52,7 +52,7 @@ def _read_given(capture: Capture, count: int) -> tuple[MaskSample, ...]:
     skin = SkinPoints.of(capture.shaped, 1)
     return sample_masks(
         capture.source, capture.masks, capture.cameras, skin,
-        count=count, person_px=OUTLINE_PERSON_PX,
+        count=count, person_px=OUTLINE_PERSON_PX, track=capture.motion.keypoints,
     ).samples  # fmt: skip
 
 

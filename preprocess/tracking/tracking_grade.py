@@ -16,7 +16,7 @@ from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import rotation_matrices
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.tracking.keypoints import HIPS, KeypointTrack
-from preprocess.tracking.video_tracking import PROBLEM_BITS, TrackingProblem
+from preprocess.tracking.video_tracking import MIN_FRAMES, PROBLEM_BITS, TrackingProblem
 
 MIN_IOU = 0.7
 """Least mean IoU of body and mask of poses that are good enough for an avatar."""
@@ -37,8 +37,6 @@ BRIDGED_S = 0.35
 """Gap between two doubtful stretches with the same reason that are joined, seconds."""
 MIN_STRETCH_FRAMES = 3
 """Fewest frames of a doubtful stretch that is reported."""
-MIN_FRAMES = 4
-"""Fewest frames with the person of poses that are good enough for an avatar."""
 BREADTHS = (0.78, 1.17)
 """Least and largest breadth of shoulders and hips to the height, relative to the mean body's: in 40
 videos 0.82 to 1.10, in videos stretched by a third 1.3."""

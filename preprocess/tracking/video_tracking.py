@@ -32,6 +32,8 @@ CUT_MARGIN = 0.05
 heights. Shoes and fingertips that touch a border are farther: they cut nothing off."""
 ELSEWHERE = 0.6
 """Distance from the last place, in sides of the square around the person, that is worth a word."""
+MIN_FRAMES = 4
+"""Fewest frames with the person of poses that are good enough for an avatar."""
 MIN_FOUND = 8
 """Fewest frames in which the person must be found; 4 of fewer than 16 frames."""
 FRAMES_REFINED_AGAIN = 60
@@ -212,7 +214,7 @@ class VideoTracking:
         track = replace(track, problems=_mark_approach(np.array(self._problems, dtype=np.int64)))
         if self._before is not None:
             track = self._before.keypoints.join(track)
-        _require_person(self._source, len(track), len(times_s))
+        _require_person(self._source, len(track), len(times_s), self._is_complete)
         return TrackedVideo(
             keypoints=track, frame_times_s=times_s, interrupted=not self._is_complete
         )
@@ -254,8 +256,13 @@ def reason_left_out(track: KeypointTrack, frame: int) -> str:
     return ANOTHER_NEAR if is_crowded else DISAGREEING
 
 
-def _require_person(source: FrameSource, found: int, total: int) -> None:
-    """Raise InputError if the person was found in too few of the frames."""
+def _require_person(source: FrameSource, found: int, total: int, is_complete: bool) -> None:
+    """Raise InputError if the person was found in too few of the frames, or few could be read."""
+    if is_complete and total < MIN_FRAMES <= (source.frame_count or 0):
+        raise InputError(
+            f"{source.path} breaks off after {total} of {source.frame_count} frames; an avatar "
+            f"needs {MIN_FRAMES} at least. Copy it again from the camera."
+        )
     if found and found >= min(MIN_FOUND, max(1, total // 4)):
         return
     where = "none" if not found else f"only {found}"

@@ -2,6 +2,7 @@
 
 import json
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -50,6 +51,24 @@ def track_film(tmp_path, capsys):
 
 def reasons(grade):
     return {each["reason"] for each in grade["doubtful"]}
+
+
+def test_a_film_that_breaks_off_after_two_frames_is_named_so(frames, tmp_path, capsys):
+    whole, path = tmp_path / "whole.mp4", tmp_path / "film.mp4"
+    sizes = []
+    with av.open(str(whole), "w", options={"movflags": "faststart"}) as container:
+        stream = container.add_stream("mjpeg", rate=15)  # each frame is whole
+        stream.height, stream.width = frames[0].shape[:2]
+        stream.pix_fmt = "yuvj420p"
+        for place in range(300):
+            frame = av.VideoFrame.from_ndarray(frames[place % 20], format="bgr24")
+            for packet in stream.encode(frame):
+                sizes.append(packet.size)
+                container.mux(packet)
+    data = whole.read_bytes()
+    path.write_bytes(data[: data.index(b"mdat") + 4 + sum(sizes[:2])])
+    assert track.main([str(path), "--out", str(tmp_path / "out" / "poses.npz"), "--no-film"]) == 2
+    assert "breaks off after 2 of 300 frames" in " ".join(capsys.readouterr().err.split())
 
 
 def test_legs_below_the_picture_are_the_first_cause_of_the_verdict(track_film, frames):

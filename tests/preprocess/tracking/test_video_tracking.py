@@ -80,6 +80,15 @@ def test_a_video_without_persons_is_bad_input(pictures):
         track(pictures, FakeTracker(darkest=200))
 
 
+def test_a_file_that_breaks_off_is_named_with_its_frames(pictures):
+    source = open_source(pictures.path, frames=slice(0, 2))
+    source.frame_count = 300  # as its header claims
+    tracking = VideoTracking(source, FakeTracker(), plain, None)
+    assert list(tracking.run()) == [1, 2]
+    with pytest.raises(InputError, match="breaks off after 2 of 300 frames"):
+        tracking.result()
+
+
 def test_a_stop_keeps_what_was_found(pictures):
     tracking = VideoTracking(pictures, FakeTracker(), plain, None)
     for done in tracking.run():
