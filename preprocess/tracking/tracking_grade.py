@@ -247,7 +247,7 @@ def _reasons_by_frame(
     for problem, bit in PROBLEM_BITS.items():
         if keypoints.problems is not None:
             note((keypoints.problems & bit) > 0, problem.value)
-    note(_jumps(keypoints), JUMPED)
+    note(_jumps(keypoints) & ~_crowded(keypoints), JUMPED)
     return reasons
 
 
@@ -273,9 +273,15 @@ def _frames_to_leave_out(
     """Frames in which another person is near, or body and mask disagree; none if most are such."""
     numbers = keypoints.frames
     doubtful = np.array([iou_of_frame.get(int(each), 1.0) < DOUBTFUL_IOU for each in numbers], bool)
-    if keypoints.problems is not None:
-        doubtful |= (keypoints.problems & PROBLEM_BITS[TrackingProblem.CROWDED]) > 0
+    doubtful |= _crowded(keypoints)
     return tuple(numbers[doubtful].tolist()) if doubtful.sum() <= 0.5 * len(doubtful) else ()
+
+
+def _crowded(keypoints: KeypointTrack) -> Bool[np.ndarray, "rows"]:
+    """Rows in which another person is near."""
+    if keypoints.problems is None:
+        return np.zeros(len(keypoints), dtype=bool)
+    return (keypoints.problems & PROBLEM_BITS[TrackingProblem.CROWDED]) > 0
 
 
 def _jumps(keypoints: KeypointTrack) -> Bool[np.ndarray, "rows"]:

@@ -13,13 +13,13 @@ from typing import Protocol, final, runtime_checkable
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Int
+from jaxtyping import Bool, Float32, Int
 
 from capture.input_error import InputError
 from capture.source import Frame, FrameSource, RgbImage
 from capture.work_ahead import read_ahead
 from preprocess.plugins import PersonTracker
-from preprocess.tracking.keypoints import CroppedMask, KeypointTrack, PersonKeypoints
+from preprocess.tracking.keypoints import HIPS, CroppedMask, KeypointTrack, PersonKeypoints
 
 BORDER_SAMPLES = 128
 """Places along each border of a frame at which the mask is read."""
@@ -41,6 +41,14 @@ FRAMES_REFINED_AGAIN = 60
 the background behind them is known."""
 APPROACH_FRAMES = 4
 """Frames before another person is seen to be near in which it may have come near."""
+RETURN_FRAMES = 20
+"""Frames around those with another person in which a jump of the hips is from or to that one."""
+HIP_ACCELERATION = 9.0
+"""Largest acceleration of a person's hips, body heights per second squared: 15 m/s²."""
+HIP_NOISE = 0.02
+"""Change of the hips' way from frame to frame by errors of key points, body heights."""
+USUAL_CHANGES = 4.0
+"""Largest change of that way, in medians of it: errors are larger in one of 60,000 frames."""
 QUEUED_MASKS = 8
 """Most masks that wait to be written."""
 
@@ -212,6 +220,7 @@ class VideoTracking:
             frames, list(self._found.values()), self._source.size_px, [times_s[n] for n in frames]
         )
         track = replace(track, problems=_mark_approach(np.array(self._problems, dtype=np.int64)))
+        track = mark_passers_by(track)
         if self._before is not None:
             track = self._before.keypoints.join(track)
         _require_person(self._source, len(track), len(times_s), self._is_complete)
@@ -244,6 +253,41 @@ def _mark_approach(problems: Int[np.ndarray, "rows"]) -> Int[np.ndarray, "rows"]
     crowded = (problems & PROBLEM_BITS[TrackingProblem.CROWDED]) > 0
     near = [crowded[row : row + APPROACH_FRAMES + 1].any() for row in range(len(crowded))]
     return problems | np.array(near, dtype=np.int64) * PROBLEM_BITS[TrackingProblem.CROWDED]
+
+
+def mark_passers_by(track: KeypointTrack) -> KeypointTrack:
+    """Mark frames between another person and a jump of the hips: the other one was taken over.
+
+    A person who jumps beside another one is that one, until the hips jump back, or twenty frames
+    pass.
+    """
+    assert track.problems is not None
+    bit, frames = PROBLEM_BITS[TrackingProblem.CROWDED], track.frames
+    crowded, landings = (track.problems & bit) > 0, frames[_hip_jumps(track)]
+    marked = crowded.copy()
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], crowded, [False]])))
+    for first, last in frames[edges.reshape(-1, 2) - [0, 1]]:
+        before = landings[(landings >= first - RETURN_FRAMES) & (landings <= first)]
+        after = landings[(landings > last) & (landings <= last + RETURN_FRAMES)]
+        start, end = min(before, default=first), max(after, default=last + 1)
+        marked |= (frames >= start) & (frames < end)
+    return replace(track, problems=track.problems | marked * bit)
+
+
+def _hip_jumps(track: KeypointTrack) -> Bool[np.ndarray, "rows"]:
+    """Rows to which the hips come by a change of their speed that is more than a person's."""
+    jumps = np.zeros(len(track), dtype=bool)
+    if len(track) < 3 or track.times_s is None:
+        return jumps
+    hips = track.image_px[:, HIPS].mean(axis=1)
+    tall = max(1.0, float(np.median(np.ptp(track.image_px[:, :, 1], axis=1))))
+    apart = np.diff(track.frames)
+    ways = np.diff(hips, axis=0) / tall / apart[:, None]
+    changes = np.linalg.norm(np.diff(ways, axis=0), axis=1)
+    frame_s = float(np.median(np.diff(track.times_s) / apart))
+    usual = max(HIP_NOISE, USUAL_CHANGES * float(np.median(changes)))
+    jumps[2:] = changes > usual + HIP_ACCELERATION * frame_s**2 * apart[1:]
+    return jumps
 
 
 def reason_left_out(track: KeypointTrack, frame: int) -> str:

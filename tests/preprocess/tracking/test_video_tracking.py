@@ -9,7 +9,7 @@ import pytest
 from capture.input_error import InputError
 from capture.source_opening import open_source
 from preprocess.tracking import video_tracking
-from preprocess.tracking.keypoints import CroppedMask, PersonKeypoints
+from preprocess.tracking.keypoints import CroppedMask, KeypointTrack, PersonKeypoints
 from preprocess.tracking.video_tracking import (
     ProblemFinder,
     TrackingProblem,
@@ -173,3 +173,45 @@ def test_a_person_found_far_from_the_last_place_may_be_another():
     assert far == [set(), set(), {TrackingProblem.ELSEWHERE}, set()]
     assert problems_of(person(40.0), None, person(80.0)) == [set()] * 3
     assert problems_of(None, person(150.0)) == [set()] * 2
+
+
+def walking_track(hips_x, crowded):
+    """A person 200 px tall whose hips are at some places, and frames with another one near."""
+    image = np.zeros((len(hips_x), 33, 2))
+    image[:, 0, 1], image[:, 31:, 1] = 100.0, 300.0
+    image[..., 0] = np.asarray(hips_x)[:, None]
+    image += np.random.default_rng(0).normal(0.0, 1.0, image.shape)
+    problems = np.zeros(len(hips_x), np.int64)
+    problems[crowded] = video_tracking.PROBLEM_BITS[TrackingProblem.CROWDED]
+    return KeypointTrack(
+        frames=np.arange(len(hips_x)), image_px=image, world_m=np.zeros((len(hips_x), 33, 3)),
+        visibility=np.ones((len(hips_x), 33)), presence=np.ones(len(hips_x)), size_px=(640, 400),
+        times_s=np.arange(len(hips_x)) / 30.0, problems=problems,
+    )  # fmt: skip
+
+
+def frames_with_another(track):
+    bit = video_tracking.PROBLEM_BITS[TrackingProblem.CROWDED]
+    return np.flatnonzero(video_tracking.mark_passers_by(track).problems & bit).tolist()
+
+
+def test_a_passer_by_who_is_taken_over_is_left_out_until_the_hips_jump_back():
+    """The other runs 16 px a frame; that a person is near is seen in two frames alone."""
+    hips = np.full(90, 300.0)
+    hips[40:52] -= 16.0 * np.arange(1, 13)
+    found = frames_with_another(walking_track(hips, slice(41, 43)))
+    assert set(range(40, 52)) <= set(found)
+    assert set(found) <= set(range(40, 54))
+
+
+@pytest.mark.parametrize("speed_px", [0.0, 12.0])
+def test_a_person_who_walks_past_another_one_is_no_other(speed_px):
+    track = walking_track(speed_px * np.arange(90), slice(40, 50))
+    assert frames_with_another(track) == list(range(40, 50))
+
+
+def test_of_few_frames_a_second_a_person_moves_farther_from_one_to_the_next():
+    hips = 300.0 + 60.0 * np.sin(0.4 * np.arange(90))  # 1 m to and fro in 3 s
+    track = walking_track(hips, slice(40, 50))
+    slow = replace(track, times_s=np.arange(90) / 5.0)
+    assert frames_with_another(slow) == list(range(40, 50))
