@@ -194,8 +194,8 @@ def _train_method(
 ) -> None:
     """Trains a method, and writes its folder whole; nothing if it is stopped."""
     from baselines.comparison_scores import curve_point, score_all
+    from baselines.hardware import Hardware
     from baselines.systems.compared_systems import make_system, train_config
-    from benchmarks.hardware import Hardware
 
     made_on = asdict(Hardware.here())
     config = train_config(data, arguments.seconds, arguments.steps, seed=arguments.seed)

@@ -34,8 +34,8 @@ from avatar.evaluation.unfilmed_views import (
 )
 from avatar.training.held_out_pose_fitting import fit_test_poses
 from avatar.training.trainer import Trainer, cosine_decay
+from baselines.hardware import ROOT, Hardware
 from baselines.systems.compared_capture import ComparedCapture
-from benchmarks.hardware import ROOT, Hardware
 from benchmarks.head_scores import score_heads
 from benchmarks.real import SUBJECTS, Figures, RealJob, film_phone_capture, table_lines
 from benchmarks.stopwatch import limit_threads

@@ -21,7 +21,7 @@ import tyro
 from jaxtyping import Float
 from tyro.conf import Positional
 
-from benchmarks.hardware import Hardware
+from baselines.hardware import Hardware
 from benchmarks.measurements import Measurement, markdown_rows
 from benchmarks.stopwatch import limit_threads
 from export.package.player_tables import QUALITY_TIERS

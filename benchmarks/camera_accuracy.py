@@ -20,7 +20,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.hardware import Hardware
+from baselines.hardware import Hardware
 from capture.camera import Camera
 from capture.input_error import InputError
 from instant_avatar.studio.shoot import ShootConfig, film_capture

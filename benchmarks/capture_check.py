@@ -13,9 +13,9 @@ import tempfile
 import time
 from pathlib import Path
 
+from baselines.hardware import Hardware
 from benchmarks import capture_corruptions as corrupt
 from benchmarks.capture_corruptions import CorruptedCapture, Corruption
-from benchmarks.hardware import Hardware
 from instant_avatar.capture_validation import check_capture
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.capture_inputs import CaptureInputs

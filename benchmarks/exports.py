@@ -29,7 +29,7 @@ from tyro.conf import Positional
 from avatar.avatar_model import Avatar
 from avatar.evaluation.image_metrics import composite_on_white, psnr
 from avatar.training import checkpoint
-from benchmarks.hardware import Hardware
+from baselines.hardware import Hardware
 from benchmarks.measurements import Measurement, markdown_rows
 from benchmarks.player_fidelity import ComparedView, filmed_view, held_out_observations
 from benchmarks.sample_training import open_sample

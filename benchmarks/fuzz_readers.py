@@ -24,9 +24,9 @@ from typing import Any
 
 import numpy as np
 
+from baselines.hardware import Hardware
 from benchmarks.fuzz_mutations import mutate_file
 from benchmarks.fuzz_seeds import make_seeds
-from benchmarks.hardware import Hardware
 
 FILES_PER_HUNDRED = {
     "pickles": 30, "poses": 25, "masks": 12, "cameras": 12, "bodies": 7, "captures": 6,

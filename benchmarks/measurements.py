@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from benchmarks.hardware import Hardware
+from baselines.hardware import Hardware
 
 
 @dataclass(frozen=True, kw_only=True)

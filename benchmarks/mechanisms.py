@@ -22,8 +22,8 @@ from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.evaluation.unfilmed_views import half_transparent_share, render_unfilmed_views
 from avatar.training.held_out_pose_fitting import fit_test_poses
 from avatar.training.trainer import Trainer, cosine_decay
+from baselines.hardware import Hardware
 from baselines.systems.compared_capture import ComparedCapture
-from benchmarks.hardware import Hardware
 from benchmarks.stopwatch import limit_threads
 from instant_avatar.run.session_start import new_trainer
 

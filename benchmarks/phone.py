@@ -29,7 +29,7 @@ import numpy as np
 import psutil
 import tyro
 
-from benchmarks.hardware import ROOT, Hardware
+from baselines.hardware import ROOT, Hardware
 from benchmarks.measurements import Measurement, markdown_rows
 
 FPS, SIZE_PX, FILMED_PX = 30, (720, 1280), 240

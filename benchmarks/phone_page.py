@@ -22,7 +22,7 @@ import psutil
 import tyro
 from jaxtyping import Float
 
-from benchmarks.hardware import ROOT, Hardware
+from baselines.hardware import ROOT, Hardware
 from benchmarks.measurements import Measurement, markdown_rows
 from benchmarks.phone import FILMED_PX, FPS, SIZE_PX, command
 from tests.instant_avatar.browser import Browser, until

@@ -21,7 +21,7 @@ import tyro
 
 from avatar.training import checkpoint
 from avatar.training.trainer import Trainer
-from benchmarks.hardware import ROOT
+from baselines.hardware import ROOT
 from benchmarks.measurements import Measurement, print_measurements
 from benchmarks.player_cost import frame_time_marks, load_time_marks, package_marks, time_bake
 from benchmarks.player_fidelity import (

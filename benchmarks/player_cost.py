@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from avatar.training.trainer import Trainer
-from benchmarks.hardware import ROOT
+from baselines.hardware import ROOT
 from benchmarks.measurements import Measurement
 from benchmarks.player_fidelity import ComparedView
 from export.package.player_tables import QUALITY_TIERS

@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from benchmarks.hardware import ROOT, Hardware
+from baselines.hardware import ROOT, Hardware
 from benchmarks.measurements import format_value
 from benchmarks.real_scores import (
     given_pose_error_deg,

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks.hardware import ROOT
+from baselines.hardware import ROOT
 from benchmarks.measurements import Measurement
 from preprocess.poses.pose_format_registry import read_poses
 

@@ -20,7 +20,7 @@ from typing import Any, Literal
 import cv2
 import tyro
 
-from benchmarks.hardware import ROOT
+from baselines.hardware import ROOT
 from benchmarks.results_page import BEGIN, END, ComparedSample, results_lines
 from capture.atomic_files import write_text_atomically
 from capture.input_error import InputError

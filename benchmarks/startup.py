@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from benchmarks.hardware import ROOT
+from baselines.hardware import ROOT
 from benchmarks.measurements import Measurement
 
 STARTS = 3

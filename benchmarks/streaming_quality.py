@@ -14,7 +14,7 @@ from avatar.rig import Rig
 from avatar.training.frame_stream import is_held_out, prepare_stream
 from avatar.training.train import train, warm_up
 from avatar.training.trainer import Trainer, cosine_decay
-from benchmarks.hardware import Hardware
+from baselines.hardware import Hardware
 from benchmarks.measurements import Measurement
 from benchmarks.sample_training import load_trainer, open_sample, training_config
 from benchmarks.stopwatch import limit_threads

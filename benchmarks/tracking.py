@@ -19,7 +19,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from benchmarks.hardware import ROOT
+from baselines.hardware import ROOT
 from benchmarks.measurements import Measurement, print_measurements
 from benchmarks.real import SUBJECTS, IngestRun, RealJob, film_phone_capture, ingest_command
 from benchmarks.real_scores import score_novel_poses

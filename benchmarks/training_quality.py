@@ -14,7 +14,7 @@ from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.rig import Rig
 from avatar.training.frame_stream import prepare_stream
 from avatar.training.train import Trainer, train, warm_up
-from benchmarks.hardware import Hardware
+from baselines.hardware import Hardware
 from benchmarks.measurements import Measurement
 from benchmarks.sample_training import (
     film_sample,

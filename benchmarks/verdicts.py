@@ -23,9 +23,9 @@ from avatar.evaluation.coverage import Coverage
 from avatar.evaluation.held_out import HeldOutFrame
 from avatar.evaluation.image_metrics import better_verdict, overall_verdict
 from avatar.training.trainer import Trainer
+from baselines.hardware import Hardware
 from baselines.systems.compared_capture import ComparedCapture
 from benchmarks.any_film import train_for_steps
-from benchmarks.hardware import Hardware
 from benchmarks.measurements import format_value
 from benchmarks.real import SUBJECTS, RealJob, film_phone_capture
 from benchmarks.sample_training import film_sample
