@@ -149,8 +149,8 @@ def _open_video(
     source = reopen(source, inputs.frames)
     if source.selection.step != step:
         console.info(
-            f"One in {source.selection.step} frames is used, {source.frame_count} in all (--frames "
-            "names others)."
+            f"One in {source.selection.step} frames is used, {source.frame_count} in all (all: "
+            "--frames ::1)."
         )
     if look:
         print_first_look(look_at(source), inputs, console, tracks=True)
