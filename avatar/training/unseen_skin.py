@@ -160,6 +160,7 @@ class UnseenSkin:
         """Starts with everything unseen, and so without any source."""
         self.evidence = SkinEvidence(rig)
         self._rig, self._frames = rig, _BoneFrames.of(rig)
+        # left and right hips, knees, shoulders, elbows
         sides = rig.rest_joints[np.array([(1, 2), (4, 5), (16, 17), (18, 19)])][..., 0]
         self._middle_x = float(sides.mean())
         self._cells, self._shape = rig.clothing_cells, rig.skin_distance.shape

@@ -48,9 +48,9 @@ MAX_PRINTED_STRETCHES = 8
 MAX_FRAMES = 600
 """Most frames that are tracked unless --frames says which; of longer videos every nth."""
 LEARNT_FPS = 14.0
-"""Frames of a second of film that are enough to learn from: of 30 those between show the same."""
+"""Frames a second that are enough to learn from: those between them are nearly alike."""
 FEW_FRAMES = 120
-"""Frames of a film that are used before any is left out, if it has as many."""
+"""Number of a film's frames below which none is left out, and that are left at least."""
 SAME_PERSON = 0.15
 """Mean distance of one person's key points, found twice in a frame, in the person's size."""
 

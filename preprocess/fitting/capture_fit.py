@@ -26,7 +26,7 @@ class CaptureFit:
         corrections: Correction of each row of the motion: root and joint rotations, root position.
         error_before_cm: Root mean square distance between outlines of body and masks, cm; of poses
             that were made of key points: after a fit to these alone.
-        error_after_cm: The same with the whole of the changes.
+        error_after_cm: The same before the fit's last iteration, with the whole of the changes.
         share: Share of the changes that is made, in [0, 1], and how far the given poses are
             estimates: none where they are exact, 1 where they were made of key points.
         keypoint_share: Mean weight of joints by the built-in tracker's key points beside the given

@@ -42,10 +42,10 @@ from preprocess.observation import associate_cameras
 from preprocess.tracking.keypoints import MIN_PRESENCE, KeypointTrack, PersonKeypoints
 
 KEY_FRAMES = 50
-"""Frames, evenly spread, whose masks given poses are fitted to; more if `MORE_MASKS` tell."""
+"""Frames, evenly spread, to whose masks given poses are fitted at first."""
 MORE_MASKS = 100
-"""Number of frames that are to tell beside given poses from which the masks of all of these are
-fitted: reading them again takes 20 core-ms each."""
+"""Fewest frames with key points (`_count_keypoint_frames`) from which given poses are fitted to as
+many masks, too: reading a mask takes 20 core-ms."""
 CHAIN_FRAMES = 150
 """Frames, evenly spread, whose given poses are fitted: those without a mask follow their neighbors
 and are human; poses between them follow."""
@@ -139,8 +139,8 @@ def fit_capture(capture: Capture, *, fit_body: bool = True) -> CaptureFit | None
         settling = _iterate_until_settled(fitter, everything)
         share = share_beyond_noise(fitter.corrections, settling[-1] * pixel_cm)
         error_rad = math.sqrt(share) * _expected_error_rad(fitter)
-        count = min(_count_telling_frames(error_rad), capture.source.frame_count or 1)
-        further = _take_masks(capture, fitter, count) if count >= MORE_MASKS else None
+        count = min(_count_keypoint_frames(error_rad), capture.source.frame_count or 1)
+        further = _with_more_masks(capture, fitter, count) if count >= MORE_MASKS else None
         if further is not None:
             fitter = further
             settling += _iterate_until_settled(fitter, everything)
@@ -165,7 +165,7 @@ def _take_keypoints(capture: Capture, fitter: ClipFitter, error_rad: float) -> f
     The given poses are expected to err by `error_rad`. The weight, the joints' mean, is 0 if the
     person is not found, or if key points would count by less than a twentieth.
     """
-    count = _count_telling_frames(error_rad)
+    count = _count_keypoint_frames(error_rad)
     if count < MIN_FRAMES:
         return 0.0
     track = _find_keypoints(capture, fitter, _choose_frames(fitter.frames, count))
@@ -199,14 +199,14 @@ def _expected_error_rad(fitter: ClipFitter) -> float:
     return ERROR_PER_TURN * _mean_turn(fitter.corrections)
 
 
-def _count_telling_frames(error_rad: float) -> int:
-    """Number of frames that are to tell beside given poses: the worse these are, the more."""
+def _count_keypoint_frames(error_rad: float) -> int:
+    """Number of frames in which key points are found: the further given poses err, the more."""
     ratio = (error_rad / LEAST_ERROR_RAD) ** 2
     return min(round(EQUAL_TRACKED_FRAMES * ratio), TRACKED_KEY_FRAMES)
 
 
-def _take_masks(capture: Capture, fitter: ClipFitter, count: int) -> ClipFitter | None:
-    """The problem of more frames' masks, begun where the fit of fewer ended."""
+def _with_more_masks(capture: Capture, fitter: ClipFitter, count: int) -> ClipFitter | None:
+    """A fit to the masks of more frames, from where that of fewer ended; None without enough."""
     further = make_fitter(capture, count)
     if further is not None:
         further.take_person(fitter)

@@ -304,7 +304,6 @@ def refine(
     reach = np.arange(-HEATMAP_REACH, HEATMAP_REACH + 1)
     middle = np.floor(crop_px / cell_px).astype(int)
     columns, rows = (middle[:, axis, None] + reach for axis in (0, 1))
-    # all windows at once: small operations wait for Python's lock, which masks hold beside it
     points = np.arange(len(middle))[:, None, None]
     near = np.clip(rows, 0, cells - 1)[:, :, None], np.clip(columns, 0, cells - 1)[:, None]
     heat = sigmoid(heatmaps[points, *near].astype(np.float64))

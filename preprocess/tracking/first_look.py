@@ -285,9 +285,8 @@ def camera_motion(
         return CameraMotion.STILL if shift < STILL_SHARE else CameraMotion.HELD, shift
     planes = [each.plane for each in followed if each.share > MIN_PARALLAX_SHARE]
     shift = max(each.share for each in followed)
-    if (
-        max(stays, default=0.0) < STILL_SHARE and shift < STILL_FRAME_SHARE
-    ):  # too plain to be recognized from far
+    # a background too plain to be recognized from far
+    if max(stays, default=0.0) < STILL_SHARE and shift < STILL_FRAME_SHARE:
         return CameraMotion.STILL, shift
     if len(planes) < 2 or WALKING_SHARE < np.median(planes) < TURNING_SHARE:
         return CameraMotion.MOVES, shift
