@@ -178,7 +178,7 @@ def test_coarse_poses_are_fitted_to_the_masks_of_more_frames(coarse, monkeypatch
     monkeypatch.setattr(capture_fitting, "KEY_FRAMES", 6)
     monkeypatch.setattr(capture_fitting, "MORE_MASKS", 12)
     by_all = error_deg(apply_fit(capture, fit_capture(capture)).motion, truth)
-    monkeypatch.setattr(capture_fitting, "_take_masks", lambda *evidence: None)
+    monkeypatch.setattr(capture_fitting, "_with_more_masks", lambda *evidence: None)
     by_six = error_deg(apply_fit(capture, fit_capture(capture)).motion, truth)
     assert by_all < by_six
 
