@@ -26,7 +26,7 @@ demo: install
 web: install # what `ia-play --web` needs: onnxruntime-web, pinned, through npm
 	$(BIN)/python -m instant_avatar.animation.web_server
 
-results: install # docs/results.md: about an hour on two cores (calculated from its parts); MOTION=track.npz films a track of poses
+results: install # docs/results.md: 16 minutes of training on two cores, and scoring; MOTION=track.npz films a track of poses
 	$(BIN)/python -m benchmarks.results --write docs/results.md $(if $(MOTION),--motion $(MOTION))
 
 test: install # on one thread: these tests are small, a second thread costs more CPU time than it saves

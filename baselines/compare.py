@@ -27,7 +27,7 @@ if TYPE_CHECKING:  # torch is loaded after --help has been answered
     from baselines.systems.compared_capture import ComparedCapture
 
 PROGRAM = "python -m baselines.compare"
-Method = Literal["anim-nerf", "neural-body", "snarf", "instant-ngp", "ours"]
+Method = Literal["anim-nerf", "ours"]
 MARKS_S = (5.0, 10.0, 30.0, 60.0, 180.0, 300.0)
 """Core seconds after which the curve is scored."""
 STEP_MARKS = (1 / 12, 1 / 6, 1 / 2)
@@ -53,11 +53,8 @@ class CompareArguments:
     and in poses fitted to the scored pictures; the fit is the same for all systems, has the same
     budget, and uses nothing of a system but its pictures.
 
-        anim-nerf     inverse skinning by the nearest vertices, a NeRF, poses optimized
-        neural-body   a code for every vertex, diffused by a sparse 3-D network
-        snarf         learnt skinning weights, inverted by root finding, a NeRF
-        instant-ngp   our hash grid without articulation
-        ours          the product
+        anim-nerf   inverse skinning by the nearest vertices, a NeRF, poses optimized
+        ours        the product
 
     The preset "small" is each method at the size that learns most in a minute of one core; "paper"
     has the paper's sizes, of which a step takes seconds to minutes (Anim-NeRF: 8 GB of memory).
@@ -72,7 +69,7 @@ class CompareArguments:
 
     capture: Annotated[Positional[Path], arg(metavar="CAPTURE", help_behavior_hint="")]
     """Folder of a capture: a sample, or what ia-ingest takes (poses included)."""
-    methods: tuple[Method, ...] = ("anim-nerf", "neural-body", "snarf", "instant-ngp", "ours")
+    methods: tuple[Method, ...] = ("anim-nerf", "ours")
     """What is compared, in the order of the table."""
     seconds: float = 60.0
     """Core seconds of each method."""

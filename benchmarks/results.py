@@ -27,10 +27,8 @@ from capture.input_error import InputError
 from instant_avatar.cli.command_line import run_command
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 
-ORDER = ("anim-nerf", "neural-body", "snarf", "instant-ngp", "ours")
-"""Methods, in the order of the tables."""
-MAIN = ("anim-nerf", "ours")
-"""What is compared first, and on all subjects."""
+METHODS = ("anim-nerf", "ours")
+"""In the order of the tables."""
 PICTURES = {"exact": "results.webp", "phone": "results-phone.webp"}
 """Beside the page: the truth and each method, of the first sample of each kind."""
 
@@ -39,8 +37,8 @@ PICTURES = {"exact": "results.webp", "phone": "results-phone.webp"}
 class ResultsJob:
     """Films the samples, compares the systems on each, and writes the page.
 
-    Anim-NeRF and ours on S1 to S3 for a minute, all methods on S1, and five minutes on S1: about
-    110 core-minutes.
+    Anim-NeRF and ours on S1 to S3 for a minute, and five minutes on S1: 32 core-minutes of
+    training, and scoring.
     """
 
     motion: Path | None = None
@@ -58,14 +56,6 @@ class ResultsJob:
     """Markdown file whose tables are replaced; its pictures lie beside it."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlannedComparison:
-    """Methods that are to be compared on a sample."""
-
-    sample: ComparedSample
-    methods: tuple[str, ...]
-
-
 def main() -> None:
     """The benchmark."""
     job = tyro.cli(ResultsJob, prog="python -m benchmarks.results", description=__doc__)
@@ -78,17 +68,16 @@ def run(job: ResultsJob) -> int:
     Raises:
         InputError: If OUT holds samples that were filmed otherwise.
     """
-    planned = plan()
-    samples = list(dict.fromkeys(each.sample for each in planned))
+    samples = plan()
     _claim(job)
     for sample in samples:
         film(job, sample)
     codes, pool = [0], ThreadPoolExecutor(job.jobs)
-    running = [pool.submit(compare, job, each) for each in planned]
+    running = [pool.submit(compare, job, each) for each in samples]
     try:
         for finished in as_completed(running):
             codes.append(finished.result())
-            print(f"{len(codes) - 1} of {len(planned)} comparisons", file=sys.stderr, flush=True)
+            print(f"{len(codes) - 1} of {len(samples)} comparisons", file=sys.stderr, flush=True)
             write_page(job, samples)
     finally:  # Ctrl-C reaches those that are running, too
         pool.shutdown(cancel_futures=True)
@@ -96,30 +85,14 @@ def run(job: ResultsJob) -> int:
     return max(codes)
 
 
-def plan() -> list[PlannedComparison]:
-    """The comparisons, the most important ones first; later ones may repeat methods."""
+def plan() -> list[ComparedSample]:
+    """The samples, the most important ones first."""
     kinds: tuple[Literal["phone", "exact"], ...] = ("phone", "exact")
-
-    def planned(
-        methods: tuple[str, ...], seconds: float = 60.0, subjects: tuple[int, ...] = (1,)
-    ) -> list[PlannedComparison]:
-        samples = (
-            ComparedSample(subject=subject, kind=kind, seconds=seconds)
-            for subject in subjects
-            for kind in kinds
-        )
-        return [PlannedComparison(sample=sample, methods=methods) for sample in samples]
-
     return [
-        *planned(MAIN, subjects=(1, 2, 3)),
-        *planned(_without("snarf")),
-        *planned(MAIN, seconds=300.0),
-        *planned(ORDER),
+        ComparedSample(subject=subject, kind=kind, seconds=seconds)
+        for subject, seconds in ((1, 60.0), (2, 60.0), (3, 60.0), (1, 300.0))
+        for kind in kinds
     ]
-
-
-def _without(method: str) -> tuple[str, ...]:
-    return tuple(each for each in ORDER if each != method)
 
 
 def _claim(job: ResultsJob) -> None:
@@ -150,13 +123,12 @@ def film(job: ResultsJob, sample: ComparedSample) -> None:
     film_capture(place, config)
 
 
-def compare(job: ResultsJob, planned: PlannedComparison) -> int:
+def compare(job: ResultsJob, sample: ComparedSample) -> int:
     """Compares the methods on a sample; the exit code."""
-    sample = planned.sample
     command = [
         sys.executable, "-m", "baselines.compare", str((job.out / sample.name).resolve()),
         "--seconds", f"{sample.seconds:g}", "--out", str(folder_of(job, sample)),
-        "--methods", *planned.methods,
+        "--methods", *METHODS,
     ]  # fmt: skip
     code = subprocess.run(command, cwd=ROOT, stdout=subprocess.DEVNULL, check=False).returncode
     return code if code >= 0 else 128 - code  # as a shell tells a signal
@@ -196,7 +168,7 @@ def write_page(job: ResultsJob, samples: list[ComparedSample]) -> None:
 
 def _scores(job: ResultsJob, sample: ComparedSample) -> list[dict[str, Any]]:
     """What the score files of a sample hold, in the order of the methods."""
-    paths = [folder_of(job, sample) / name / "scores.json" for name in ORDER]
+    paths = [folder_of(job, sample) / name / "scores.json" for name in METHODS]
     return [json.loads(path.read_text()) for path in paths if path.is_file()]
 
 

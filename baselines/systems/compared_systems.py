@@ -1,7 +1,6 @@
-"""The systems by name: the product, and each baseline in a preset."""
+"""The systems by name: the product, and Anim-NeRF in a preset."""
 
-from collections.abc import Callable
-from typing import Any, Protocol, final, runtime_checkable
+from typing import Protocol, final, runtime_checkable
 
 import numpy as np
 import torch
@@ -10,12 +9,10 @@ from jaxtyping import Float32
 from avatar.config import TrainConfig
 from avatar.render import render
 from avatar.training.trainer import Trainer, cosine_decay
-from baselines.systems import anim_nerf, instant_ngp, neural_body, snarf
+from baselines.systems.anim_nerf import PRESETS, AnimNerf
 from baselines.systems.baseline_training import BaselineSystem
 from baselines.systems.compared_capture import ComparedCapture
-from baselines.systems.method_settings import MethodSettings
-from baselines.systems.posed_person import PoseTable, SkinnedPerson
-from baselines.systems.ray_rendering import PosedRadiance
+from baselines.systems.posed_person import SkinnedPerson
 from preprocess.observation import Observation
 
 
@@ -79,46 +76,20 @@ def train_config(
     )  # fmt: skip
 
 
-FieldMaker = Callable[[SkinnedPerson, ComparedCapture, MethodSettings, TrainConfig], PosedRadiance]
-
-
-def _make_ngp(
-    person: SkinnedPerson, data: ComparedCapture, settings: MethodSettings, config: TrainConfig
-) -> PosedRadiance:
-    with torch.no_grad():
-        bodies = PoseTable(person, data.frames).bodies(torch.arange(len(data.frames)))
-    return instant_ngp.InstantNgp(bodies.vertices, settings, config)
-
-
-METHODS: dict[str, tuple[Any, FieldMaker]] = {
-    "anim-nerf": (anim_nerf, lambda person, data, how, _: anim_nerf.AnimNerf(person, how)),
-    "neural-body": (
-        neural_body,
-        lambda person, data, how, _: neural_body.NeuralBody(person, len(data.frames), how),
-    ),
-    "snarf": (snarf, lambda person, data, how, _: snarf.Snarf(person, how)),
-    "instant-ngp": (instant_ngp, _make_ngp),
-}
-"""Modules of the baselines, with their `PRESETS`, and what makes their fields."""
-
-
 def make_system(
     name: str, data: ComparedCapture, config: TrainConfig, *, preset: str, seed: int
 ) -> ComparedSystem:
     """An untrained system.
 
     Args:
-        name: "ours", or a key of `METHODS`.
+        name: "ours" or "anim-nerf".
         data: What it will be trained on.
-        config: The product's configuration; Instant-NGP takes its hash grid from it.
-        preset: "small" or "paper", of a baseline.
-        seed: Of all random numbers of a baseline; the product's lies in `config`.
+        config: The product's configuration.
+        preset: "small" or "paper", of Anim-NeRF.
+        seed: Of all random numbers of Anim-NeRF; the product's lies in `config`.
     """
     if name == "ours":
         return ProductSystem(data, config)
-    module, make = METHODS[name]
-    settings: MethodSettings = module.PRESETS[preset]
     torch.manual_seed(seed)
-    person = SkinnedPerson(data.rig, data.capture.shaped)
-    field = make(person, data, settings, config)
-    return BaselineSystem(field, person, data.frames, settings)
+    person, settings = SkinnedPerson(data.rig, data.capture.shaped), PRESETS[preset]
+    return BaselineSystem(AnimNerf(person, settings), person, data.frames, settings)

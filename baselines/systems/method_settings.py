@@ -1,4 +1,4 @@
-"""Sizes and rates of a method, and the network that two of them share."""
+"""Sizes and rates of a method, and its network."""
 
 from dataclasses import dataclass
 from typing import final
@@ -26,8 +26,6 @@ class MethodSettings:
         pose_rate: Learning rate of the poses, radians and metres; 0 keeps them as given.
         alpha_weight: Weight of the L1 loss on alpha.
         reach_m: Distance from the skin within which there may be density, metres.
-        voxel_m: Edge of the voxels that hold codes, metres.
-        channels: Channels of the codes.
     """
 
     frames: int
@@ -41,8 +39,6 @@ class MethodSettings:
     pose_rate: float = 0.0
     alpha_weight: float = 0.1
     reach_m: float = 0.08
-    voxel_m: float = 0.005
-    channels: int = 16
 
 
 def encode_positions(
