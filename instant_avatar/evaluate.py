@@ -105,11 +105,6 @@ def _evaluate_all(session: "EvaluationSession") -> "Iterator[AvatarEvaluation]":
 
 def _evaluate_package(path: Path, session: "EvaluationSession") -> "AvatarEvaluation":
     """Score the player alone, on the capture of --on."""
-    if session.arguments.on is None:
-        raise InputError(
-            f"{path} is a package, which holds no frames: pass a capture of the same person with "
-            "--on, or the run's folder."
-        )
     return session.evaluate_package(path, session.frames_of_capture(RunFolder(path=path.parent)))
 
 

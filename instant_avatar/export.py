@@ -230,10 +230,11 @@ def _encode_static(mesh: SkinnedMesh, kind: str) -> bytes:
 
 def _export_package(folder: Path, out: Path, console: Console, *, fine_tune: bool = True) -> None:
     """Write a package of a run's checkpoint, fine-tuned unless it only becomes a mesh."""
-    if folder.is_file():
+    if not folder.is_dir():
+        found = "is a file" if folder.is_file() else "does not exist"
         raise InputError(
-            f"{folder} is a file, but must be a folder written by ia-ingest. A package can be "
-            "converted with --to glb, vrm, ply and obj."
+            f"{folder} {found}; a folder written by ia-ingest was expected, or a package "
+            "(.iavatar) with --to glb, vrm, ply, obj or splats."
         )
     run = RunFolder(path=folder)
     if not run.has_checkpoint():

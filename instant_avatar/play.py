@@ -57,6 +57,7 @@ def _render_clip(arguments: PlayArguments, console: Console) -> int:
     )
     from instant_avatar.cli.command_line import stop_on_interrupt
 
+    player = Player.load(arguments.avatar, tier=arguments.tier, provider=arguments.provider)
     out = arguments.output_path
     suffix = out.suffix.lower()
     check_clip_path(out, arguments.inputs, overwrite=arguments.overwrite)
@@ -67,7 +68,6 @@ def _render_clip(arguments: PlayArguments, console: Console) -> int:
     )
     blend = None if clear else background_compositor(arguments.background or "white")
     description = clip_format(out, transparent=blend is None).description
-    player = Player.load(arguments.avatar, tier=arguments.tier, provider=arguments.provider)
     _print_package_warnings(player, console)
     shots, fps = plan_render(
         arguments, player, console, max_fps=MAX_GIF_FPS if suffix == ".gif" else np.inf

@@ -148,7 +148,7 @@ def _decode(data: bytes, path: Path) -> Any:
     except UnsafePickleError:
         raise
     except Exception as cause:
-        raise ValueError(f"it is of no kind that is known (as a pickle: {cause})") from cause
+        raise ValueError("it is of no kind that is known") from cause
 
 
 def _decode_zip(data: bytes) -> Any:

@@ -263,7 +263,7 @@ def _describe_difference(posed: ShapedBody, person: ShapedBody) -> str:
     ratio = posed.height_m / person.height_m
     doubt = " Is it the same person?" if abs(ratio - 1.0) > MAX_HEIGHT_DIFFERENCE else ""
     return (
-        f"Their betas state a body of {100.0 * posed.height_m:.0f} cm, the avatar's has "
+        f"The body of these poses is {100.0 * posed.height_m:.0f} cm tall, the avatar's "
         f"{100.0 * person.height_m:.0f} cm: it keeps its own, and these poses follow.{doubt}"
     )
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
+from zipfile import is_zipfile
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
@@ -110,6 +111,13 @@ class EvaluateArguments:
         for path in self.targets:
             if not path.exists():
                 raise InputError(f"{path} does not exist; expected a run, a package or a data set.")
+            if path.is_file() and not is_zipfile(path):
+                raise InputError(f"{path} is no package; expected a run, a package or a data set.")
+            if path.is_file() and self.on is None:
+                raise InputError(
+                    f"{path} is a package, which holds no frames: pass a capture of the same "
+                    "person with --on, or the run's folder."
+                )
         for flag, path in (("--json", self.json), ("--card", self.card)):
             if path is not None:
                 check_output_file(path, flag, self._inputs(), overwrite=self.overwrite)

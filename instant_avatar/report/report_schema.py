@@ -33,6 +33,7 @@ DROP_REASONS = {
     "pose invalid": "without a pose",
     "no camera": "without a camera",
     "mask empty": "with an empty mask",
+    "mask unusable": "with no mask or an unusable one",
     "picture damaged": "damaged",
 }
 """Reasons for which frames are left out, as an attribute of the frames."""
@@ -67,7 +68,8 @@ class FrameStats:
             parts.append(f"{self.near_duplicates} almost like the one before")
         left_out = self.read - self.used - self.held_out - self.near_duplicates
         if left_out:
-            words = [DROP_REASONS.get(drop.reason, f"with {drop.reason}") for drop in self.dropped]
+            causes = [drop.reason.partition(":")[0] for drop in self.dropped]
+            words = [DROP_REASONS.get(cause, f"with {cause}") for cause in causes]
             reasons = ", ".join(f"{count} {word}" for word, count in Counter(words).most_common())
             parts.append(f"{left_out} left out ({reasons})")
         return f"{self.read} frames read: {', '.join(parts)}."

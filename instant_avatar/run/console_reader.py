@@ -63,7 +63,9 @@ class ConsoleReader:
         session, trainer = self._session, self._session.trainer
         elapsed_s, budget_s = trainer.wall_seconds, trainer.config.seconds
         if trainer.config.steps:
-            position = f"step {trainer.steps} of {trainer.config.steps}, {elapsed_s:.0f} s"
+            left = trainer.steps <= trainer.config.steps  # streams make more, after a short film
+            total = f" of {trainer.config.steps}" if left else ""
+            position = f"step {trainer.steps}{total}, {elapsed_s:.0f} s"
         elif session.meter.grows:
             position = f"{elapsed_s:.0f} s"
         elif elapsed_s <= budget_s:

@@ -8,7 +8,7 @@ from typing import final
 import cv2
 import numpy as np
 
-from capture.atomic_files import OutputFileList
+from capture.atomic_files import RESERVED_PREFIX, OutputFileList
 from capture.camera import Camera, same_aspect_ratio
 from capture.image_folder import has_cutout_alpha, list_images, read_image
 from capture.input_error import InputError
@@ -214,7 +214,8 @@ def associate_masks(masks: Masks, source: FrameSource) -> Callable[[int], int]:
             "cropped, rotated or stretched (ffmpeg -vf "
             f"scale={masks.size_px[0]}:{masks.size_px[1]} undoes that)?"
         )
-    if masks.names is not None and OutputFileList(masks.path).exists():  # ia-track's own
+    unfinished = masks.path.name.startswith(RESERVED_PREFIX)
+    if masks.names is not None and (unfinished or OutputFileList(masks.path).exists()):  # our own
         rows = {int(name): row for row, name in enumerate(masks.names) if name.isdecimal()}
         if len(rows) == masks.count and max(rows) < source.frames_in_file:
             return _row_by_name(rows, masks)

@@ -214,7 +214,7 @@ def grade_tracking(
         doubtful_share=sum(doubts.values()) / max(1.0, shown),
         iou_mean=float(ious.mean()) if len(ious) else float("nan"),
         iou_worst=float(ious.min()) if len(ious) else float("nan"),
-        jitter_mm=_jitter_mm(motion, shaped),
+        jitter_mm=_jitter_mm(motion, keypoints.frames, shaped),
         person_px=float(np.median(heights)) if len(heights) else 0.0,
         directions_seen=view_sector_share(views),
         breadth=_breadth(shaped) / _breadth(shaped.body.with_shape()),
@@ -305,20 +305,22 @@ def _breadth(shaped: ShapedBody) -> float:
     return float(np.sqrt(shoulders * hips) / np.ptp(joints[:, 1]))
 
 
-def _jitter_mm(motion: Motion, shaped: ShapedBody) -> float:
-    """Median second difference of joints relative to the root, of three frames in a row, mm."""
-    joints = np.stack(
-        [shaped.with_pose(motion[row]).joints() for row in range(len(motion))]
-        or [np.zeros((24, 3))]
-    )
-    relative = joints - joints[:, :1]
+def _jitter_mm(motion: Motion, tracked: Int[np.ndarray, "tracked"], shaped: ShapedBody) -> float:
+    """Median second difference of joints relative to the root, mm per frame squared.
+
+    Of three tracked frames at equal distances; poses between them are interpolated.
+    """
     rows = np.arange(len(motion)) if motion.frames is None else motion.frames
-    inner = motion.valid[:-2] & motion.valid[1:-1] & motion.valid[2:]
-    inner &= np.diff(rows)[:-1] == np.diff(rows)[1:]
-    if not inner.any():
+    own = np.flatnonzero(motion.valid & np.isin(rows, tracked))
+    steps = np.diff(rows[own])
+    even = np.flatnonzero(steps[:-1] == steps[1:])
+    if not len(even):
         return float("nan")
-    bend = relative[2:] - 2.0 * relative[1:-1] + relative[:-2]
-    return 1000.0 * float(np.median(np.linalg.norm(bend[inner][:, 1:], axis=2)))
+    joints = np.stack([shaped.with_pose(motion[int(row)]).joints() for row in own])
+    relative = joints - joints[:, :1]
+    bend = (relative[2:] - 2.0 * relative[1:-1] + relative[:-2])[even, 1:]
+    per_frame = np.linalg.norm(bend, axis=2) / steps[even, None] ** 2
+    return 1000.0 * float(np.median(per_frame))
 
 
 def _views(motion: Motion, camera: Camera) -> Float[np.ndarray, "views 3"]:

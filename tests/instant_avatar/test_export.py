@@ -94,6 +94,7 @@ def test_the_whole_person_is_in_the_views(rig):
     ("change", "told"),
     [
         (lambda run, out: (out.parent, out), "checkpoint"),
+        (lambda run, out: (out.parent / "none", out), "none does not exist"),
         (lambda run, out: (run, out.with_suffix(".zip")), "iavatar"),
         (lambda run, out: (run / "avatar.iavatar", out), "--to glb"),
         (lambda run, out: (run, out.parent / "none" / "a.iavatar"), "does not exist"),

@@ -1,5 +1,6 @@
 """Frames, poses, masks and cameras joined by order, time or name, or refused for a reason."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -224,6 +225,16 @@ def test_frames_whose_mask_is_missing_are_left_out_where_names_tell(parts, image
     assert "holds none for frame 2" in reasons[2]
     seen = {r.frame.index: r.alpha.max() for r in results if isinstance(r, Observation)}
     assert seen == {n: pytest.approx((200 + n) / 255) for n in (0, 1, 3, 4, 5, 6)}
+
+
+def test_tracked_masks_of_few_frames_belong_to_these_while_they_are_being_written(parts, images):
+    """Most pictures may be of another size, or damaged."""
+    source, _, cameras = parts()
+    (unfinished := images / ".instant-avatar-masks.part").mkdir()
+    for number in (2, 5):
+        shutil.copyfile(images / "masks" / f"{number}.png", unfinished / f"{number:06d}.png")
+    results = observe(source, moving(COUNT), open_masks(unfinished), cameras)
+    assert [r.frame.index for r in results if isinstance(r, Observation)] == [2, 5]
 
 
 def test_masks_that_are_turned_among_others_are_left_out_and_obeyed_where_told(parts, images):

@@ -219,6 +219,11 @@ def test_wrong_wishes(call_play, package, novel, tmp_path, monkeypatch, argument
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_video_is_named_as_no_package(call_play, tmp_path):
+    (video := tmp_path / "video.mp4").write_bytes(b"\0" * 100)
+    assert "video.mp4 is not a package" in call_play(video).complaint("ia-play")
+
+
 @pytest.mark.parametrize("words", [["--out", "a.webm"], ["--bench"], ["--web", "--out", "page"]])
 def test_poses_in_other_units_are_refused(
     call_play, package, novel, tmp_path, monkeypatch, changed, words

@@ -238,6 +238,7 @@ def test_a_run_is_found_again_from_another_folder(run, film, call_evaluate, tmp_
         (["{run}", "--rotate", "90"], "--on"),
         (["{run}", "--lpips-weights", "{tmp}/nothing"], "--lpips-weights"),
         (["{run}/avatar.iavatar"], "--on"),
+        (["{run}/report.html"], "is no package"),
         (["{tmp}"], "neither a run"),
         (["{data}", "--on", "{film}"], "omit --on"),
         (["{lost}"], "report.json"),

@@ -97,6 +97,14 @@ def scores(*values):
     )
 
 
+def test_frames_of_one_cause_are_counted_once_whatever_each_adds():
+    lost = ("mask unusable: none for 3", "mask unusable: none for 4", "pose invalid")
+    dropped = tuple(DroppedFrame(index=n, reason=reason) for n, reason in enumerate(lost))
+    frames = replace(report().frames, used=15, dropped=dropped)
+    told = "3 left out (2 with no mask or an unusable one, 1 without a pose)."
+    assert frames.sentence().endswith(told)
+
+
 def test_a_frame_without_a_person_has_no_masked_score():
     note = HeldOutStats.of(scores((30.0, 20.0), (32.0, float("nan"))), (64, 48))
     assert (note.psnr, note.psnr_mask) == (31.0, 20.0)

@@ -79,6 +79,14 @@ def test_jitter_grows_with_noise(shaped):
     assert noisy.jitter_mm > 4.0 * calm.jitter_mm
 
 
+def test_jitter_is_that_of_tracked_frames_not_of_poses_interpolated_between_them(shaped):
+    """Of a spin, whose second difference is the same everywhere, every third frame was tracked."""
+    third, spin, image = np.arange(0, FRAMES, 3), a_motion(turns=0.5), some_keypoints().image_px
+    held = replace(spin, root_rotations=np.repeat(spin.root_rotations[third], 3, axis=0))
+    found = grade(shaped, make_track(third, (600, 600), image_px=image[third]), held)
+    assert found.jitter_mm == pytest.approx(grade(shaped, motion=spin).jitter_mm, rel=0.1)
+
+
 def test_disagreeing_masks_are_an_objection(shaped):
     found = grade(shaped, iou=0.4)
     assert not found.is_good_enough
