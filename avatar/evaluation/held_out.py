@@ -34,6 +34,7 @@ from avatar.evaluation.image_metrics import (
 from avatar.events import HeldOutScore
 from avatar.render import PosedAvatar, render
 from avatar.rig import Rig
+from preprocess.body.body_pose import BodyPose
 from preprocess.observation import Observation
 
 Item = TypeVar("Item")
@@ -70,6 +71,19 @@ class HeldOutFrame:
         if self.gain is None:
             return rendering
         return rendering * np.append(self.gain, np.float32(1.0))
+
+    def moved(
+        self, pose: BodyPose, correspondences: CorrespondenceGrid, gain: Float32[np.ndarray, "3"]
+    ) -> "HeldOutFrame":
+        """The frame in another pose and exposure; what was measured of its image is kept."""
+        moved = HeldOutFrame(
+            observation=replace(self.observation, pose=pose),
+            correspondences=correspondences,
+            gain=gain,
+        )
+        if "blur_calibration" in vars(self):
+            vars(moved)["blur_calibration"] = self.blur_calibration
+        return moved
 
     def with_correspondences(self, rig: Rig) -> "HeldOutFrame":
         """The frame with its correspondence grid, for repeated rendering."""
@@ -206,9 +220,9 @@ class PixelSample:
         """Renders the pixels and compares them with the frame."""
         return self.score_colors(self.render_colors(avatar))
 
-    def psnr(self, avatar: Avatar) -> float:
-        """The score's PSNR alone, dB: blur takes as long to measure as the pixels to render."""
-        return psnr_of_errors(self._errors(self.render_colors(avatar)), self.areas)
+    def psnr(self, colors: Float32[np.ndarray, "pixels 4"]) -> float:
+        """PSNR alone of colors in the frame's exposure, dB: blur takes as long as rendering."""
+        return psnr_of_errors(self._errors(colors), self.areas)
 
     def render_colors(self, avatar: Avatar) -> Float32[np.ndarray, "pixels 4"]:
         """The avatar's premultiplied colors of the pixels, in the frame's pose."""
@@ -225,7 +239,7 @@ class PixelSample:
 
     def score_colors(self, colors: Float32[np.ndarray, "pixels 4"]) -> HeldOutScore:
         """Compares premultiplied colors of the pixels with the frame; SSIM is not measured."""
-        errors, inside = self._errors(colors), self._alpha > MASK_THRESHOLD
+        errors, inside = self._errors(self.frame.expose(colors)), self._alpha > MASK_THRESHOLD
         psnr_mask = psnr_of_errors(errors[inside], self.areas[inside])
         return HeldOutScore(
             frame=self.frame.observation.frame.index,
@@ -237,8 +251,8 @@ class PixelSample:
         )
 
     def _errors(self, colors: Float32[np.ndarray, "pixels 4"]) -> Float64[np.ndarray, "pixels"]:
-        """Squared errors of colors on white, the mean over channels."""
-        image = np.clip(composite_on_white(self.frame.expose(colors)), 0.0, 1.0)
+        """Squared errors of exposed colors on white, the mean over channels."""
+        image = np.clip(composite_on_white(colors), 0.0, 1.0)
         return ((image.astype(np.float64) - self._truth) ** 2).mean(axis=-1)
 
     @cached_property
@@ -253,8 +267,3 @@ class PixelSample:
 def score_fine_sample(avatar: Avatar, frame: HeldOutFrame) -> HeldOutScore:
     """Scores a frame by 4,096 of its pixels: about 0.1 dB off, and SSIM is not measured."""
     return PixelSample.of(frame, density=FINE_DENSITY).score(avatar)
-
-
-def fine_sample_psnr(avatar: Avatar, frame: HeldOutFrame) -> float:
-    """PSNR of `score_fine_sample`, dB."""
-    return PixelSample.of(frame, density=FINE_DENSITY).psnr(avatar)

@@ -5,11 +5,11 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
-import numpy as np
 import torch
 
+from avatar.avatar_model import Avatar
 from avatar.correspondence_grid import CorrespondenceGrid
-from avatar.evaluation.held_out import HeldOutFrame, fine_sample_psnr
+from avatar.evaluation.held_out import HeldOutFrame, PixelSample
 from avatar.training.frame_exposure import FrameExposures
 from avatar.training.frame_stream import prepare_frame
 from avatar.training.pose_correction import interpolate_correction
@@ -18,8 +18,8 @@ from avatar.training.replay_buffer import ReplayBuffer
 from avatar.training.trainer import Trainer, correct_one_pose, cosine_decay, resolve_correspondences
 from avatar.training.training_step import OccupancySampler, compute_gradients
 
-MIN_SCORED_GAIN = 0.01
-"""Difference of a gain from 1 up to which the given pose is not scored again with it."""
+COMPARED_DENSITY = 2
+"""Density of the pixels by which the given pose and the fitted one are compared."""
 CORRECTIONS_PER_FRAME = 12
 """Corrections of each frame's pose."""
 RAYS_PER_CORRECTION = 4096
@@ -56,14 +56,20 @@ def fit_test_poses(
     for slot, frame in enumerate(frames):
         pose, gain = poses.pose(slot), exposures.gains[slot].numpy()
         cells = CorrespondenceGrid.solve(avatar.rig, pose.joint_rotations)
-        moved = HeldOutFrame(
-            observation=replace(frame.observation, pose=pose), correspondences=cells, gain=gain
-        )
-        options = [frame, moved]
-        if np.abs(gain - 1.0).max() > MIN_SCORED_GAIN:
-            options.append(replace(frame, gain=gain))
         progress(FITTING_SHARE + (1.0 - FITTING_SHARE) * (slot + 1) / len(frames))
-        yield max(options, key=lambda option: fine_sample_psnr(avatar, option))
+        yield _choose(avatar, frame, frame.moved(pose, cells, gain))
+
+
+def _choose(avatar: Avatar, given: HeldOutFrame, moved: HeldOutFrame) -> HeldOutFrame:
+    """The frame as given, in the other's exposure, or moved: where its pixels score best."""
+    sample = PixelSample.of(given, density=COMPARED_DENSITY)
+    colors = sample.render_colors(avatar)
+    options = [
+        (given, colors),
+        (replace(given, gain=moved.gain), colors),
+        (moved, replace(sample, frame=moved).render_colors(avatar)),
+    ]
+    return max(options, key=lambda option: sample.psnr(option[0].expose(option[1])))[0]
 
 
 def _fit_frames(

@@ -60,7 +60,7 @@ MAX_WHOLE_IMAGES = 12
 """Frames that are scored as whole images, at most."""
 UNFILMED_REDUCTION = 2
 """Factor by which pictures of views that were not filmed are reduced."""
-FRAMES_PER_FIT = 6
+FRAMES_PER_FIT = 4
 """Frames whose poses are fitted together; no more are fitted once the time is up."""
 KEPT_RENDERINGS = 6
 """Renderings that are kept for the report's page."""
