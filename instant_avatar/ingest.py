@@ -4,7 +4,8 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
+from functools import partial
 from typing import TYPE_CHECKING
 
 from capture.hardware import usable_cores
@@ -20,19 +21,18 @@ from instant_avatar.cli.command_line import (
 from instant_avatar.cli.console import Console
 from instant_avatar.cli.shared_options import open_recording
 from instant_avatar.run.ingest_arguments import PROGRAM, VIEW_PORT, IngestArguments
-from instant_avatar.run.run_folder import RunFolder
 from instant_avatar.run.start_up import (
     FitProcess,
-    can_fit_beside,
     fitting_beside,
     preparing_to_train,
 )
 from preprocess.capture_inputs import CaptureInputs, InputKind
 
 if TYPE_CHECKING:  # it imports torch
-    from capture.source import Frame, FrameSource
+    from capture.source import Frame
     from instant_avatar.run.session_events import EventReader
     from preprocess.capture_session import Capture
+    from preprocess.fitting.capture_fit import CaptureFit
     from preprocess.tracking.keypoints import PersonKeypoints
 
 
@@ -57,35 +57,46 @@ def ingest(
     arguments.validate()
     inputs = arguments.capture_inputs()
     inputs.check_named()
-    source = None if inputs.is_live else open_recording(inputs, console)
+    if not inputs.is_live:
+        open_recording(inputs, console)
     run, read = arguments.run_folder(), inputs.input_paths()
     run.check_usable(read, resume=arguments.resume, overwrite=arguments.overwrite)
     with (
         run.claim(console, resume=arguments.resume, overwrite=arguments.overwrite),
         ExitStack() as cleanup,
     ):
-        fitting = _fit_beside(arguments, inputs, source, cleanup)
+        fitting = _fit_beside(arguments, inputs, cleanup)
         wait = cleanup.enter_context(preparing_to_train(console))
         with without_garbage_collection():
             from instant_avatar.run.run_capture import open_observations, write_solved_cameras
 
         command = arguments.as_json()
+        leaving = partial(exit_on_interrupt, console, PROGRAM, run.release)
         threads = None
         if inputs.kind is InputKind.STREAMED:  # its frames come as soon as it is open
-            threads = _load_trainer_code(arguments, run, console, wait)
+            with leaving():
+                threads = _load_trainer_code(arguments, console, wait)
 
-        def prepare(capture: "Capture") -> None:
+        def fit_beside(capture: "Capture", console: Console) -> "CaptureFit | None":
             nonlocal threads
-            threads = _load_trainer_code(arguments, run, console, wait)
-            _load_kernels(capture, run, console)
+            assert fitting is not None
+            is_posed = inputs.kind is InputKind.POSED
+            fitting.send(capture, inputs.height_m, with_rig=is_posed)
+            with leaving() if is_posed else nullcontext():  # what was tracked is kept
+                threads = _load_trainer_code(arguments, console, wait)
+                _load_kernels(capture, console)
+            with console.status("fitting body and poses"):
+                return fitting.fit(capture)
 
-        beside = {} if fitting is None else {"fit": fitting.fit, "prepare": prepare}
         observations, before_fit = open_observations(
             arguments, inputs, run, console,
             lambda frame, person: _show_tracked(frame, person, readers),
-            background=cleanup.enter_context(ThreadPoolExecutor(1)), **beside,
+            background=cleanup.enter_context(ThreadPoolExecutor(1)),
+            **({} if fitting is None else {"fit": fit_beside}),
         )  # fmt: skip
-        threads = threads or _load_trainer_code(arguments, run, console, wait)
+        if threads is None:
+            with leaving():
+                threads = _load_trainer_code(arguments, console, wait)
         from instant_avatar.report.report_writer import ReportWriter
         from instant_avatar.run.session_start import run_session
 
@@ -97,46 +108,42 @@ def ingest(
         is_interrupted = run_session(
             arguments, observations, run, console, [*readers, report],  # its page takes seconds
             on_start=lambda: write_solved_cameras(before_fit, run, console),
-            rig=None if fitting is None else fitting.rig,
+            rig=None if fitting is None else fitting.rig(),
         )  # fmt: skip
         code = report.exit_code()
         return INTERRUPTED if is_interrupted else code
 
 
 def _fit_beside(
-    arguments: IngestArguments,
-    inputs: CaptureInputs,
-    source: "FrameSource | None",
-    cleanup: ExitStack,
+    arguments: IngestArguments, inputs: CaptureInputs, cleanup: ExitStack
 ) -> FitProcess | None:
-    """Begin to fit a recording in another process, if there is a second core and nothing kept."""
+    """Start a process that fits a recording, if there is a second core and nothing is kept."""
     cores = min(arguments.threads or usable_cores(), usable_cores())
-    if cores < 2 or arguments.resume or not arguments.refine_poses:
+    if cores < 2 or arguments.resume or inputs.kind is InputKind.STREAMED:
         return None
-    if source is None or not can_fit_beside(inputs, source):
+    is_posed = inputs.kind is InputKind.POSED
+    if is_posed and (inputs.cameras == "solve" or not arguments.refine_poses):
         return None
-    return cleanup.enter_context(fitting_beside(inputs, arguments.longer_side_px(source)))
+    return cleanup.enter_context(fitting_beside())
 
 
 def _load_trainer_code(
-    arguments: IngestArguments, run: RunFolder, console: Console, wait: Callable[[], None]
+    arguments: IngestArguments, console: Console, wait: Callable[[], None]
 ) -> int:
     """Import torch, and set and return the number of threads; `wait` for the kernels first."""
-    with exit_on_interrupt(console, PROGRAM, run.release):
-        wait()
-        with console.status("loading torch"), without_garbage_collection():
-            from instant_avatar.report import report_writer  # noqa: F401
-            from instant_avatar.run.session_start import set_threads
+    wait()
+    with console.status("loading torch"), without_garbage_collection():
+        from instant_avatar.report import report_writer  # noqa: F401
+        from instant_avatar.run.session_start import set_threads
 
-            return set_threads(arguments.threads)
+        return set_threads(arguments.threads)
 
 
-def _load_kernels(capture: "Capture", run: RunFolder, console: Console) -> None:
+def _load_kernels(capture: "Capture", console: Console) -> None:
     """Load the kernels, or compile them, while another process fits the capture."""
     from instant_avatar.run.session_start import warm_up_for
 
-    with exit_on_interrupt(console, PROGRAM, run.release):
-        warm_up_for(capture, console)
+    warm_up_for(capture, console)
 
 
 def _show_tracked(

@@ -31,7 +31,7 @@ def associate_by_order(rows: int, source: FrameSource, things: str) -> Callable[
     for total in (source.frames_in_file, None):
         count = source.count_frames() if total is None else total
         if rows == count:
-            return lambda index: index
+            return int
         if rows == source.selection.count(count):
             return source.selection.position
     hint = (

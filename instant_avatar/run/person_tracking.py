@@ -3,7 +3,7 @@
 import os
 import shutil
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,6 +27,7 @@ from preprocess.capture_inputs import (
     find_stream_cameras,
 )
 from preprocess.capture_session import Capture
+from preprocess.fitting.capture_fit import CaptureFit
 from preprocess.fitting.capture_fitting import fit_capture, fitted_motion
 from preprocess.masks.mask_files import open_masks
 from preprocess.masks.mask_refinement import MaskRefiner
@@ -51,6 +52,8 @@ LEARNT_FPS = 14.0
 """Frames a second that are enough to learn from: those between them are nearly alike."""
 FEW_FRAMES = 120
 """Number of a film's frames below which none is left out, and that are left at least."""
+FitFunction = Callable[[Capture, Console], CaptureFit | None]
+"""Fits body and poses of a capture, and shows that it does."""
 SAME_PERSON = 0.15
 """Mean distance of one person's key points, found twice in a frame, in the person's size."""
 
@@ -71,6 +74,12 @@ class PersonTracking:
     def capture(self) -> Capture:
         """The recording, aligned as it is."""
         return align_capture(self.imported, skip_checks=True)
+
+
+def fit_in_process(capture: Capture, console: Console) -> CaptureFit | None:
+    """Fit body and poses of a capture to what was seen of the person."""
+    with console.status("fitting body and poses"):
+        return fit_capture(capture)
 
 
 def limit_frames(
@@ -98,6 +107,7 @@ def track_person(
     stop: threading.Event | None = None,
     resume: bool = False,
     for_learning: bool = False,
+    fit: FitFunction = fit_in_process,
 ) -> PersonTracking:
     """Track the person, and write poses, and masks to the folder masks/ beside them.
 
@@ -127,11 +137,12 @@ def track_person(
             until = slice(chosen.start, max(tracked.frame_times_s) + 1, chosen.step)
             inputs = replace(inputs, frames=until)
             source = reopen(source, inputs.frames)
-        with console.status("fitting body and poses to key points and masks"):
-            there = tracked_inputs(replace(inputs, height_m=None), poses, part)
-            capture = fit_tracked_video(source, tracked, there, given)
-            grade = _grade(capture, tracked.frame_times_s)
-            capture = replace(capture, motion=_without(capture.motion, grade.left_out))
+        there = tracked_inputs(replace(inputs, height_m=None), poses, part)
+        capture = fit_tracked_video(
+            source, tracked, there, given, fit=lambda capture: fit(capture, console)
+        )
+        grade = _grade(capture, tracked.frame_times_s)
+        capture = replace(capture, motion=_without(capture.motion, grade.left_out))
         with atomic_file(poses) as unfinished:
             write_motion(unfinished, capture.motion)
     learnt = folder if own_masks and not names_segmenter else None
@@ -283,6 +294,8 @@ def fit_tracked_video(
     tracked: TrackedVideo,
     inputs: CaptureInputs,
     masks_beside: Path | None = None,
+    *,
+    fit: Callable[[Capture], CaptureFit | None] = fit_capture,
 ) -> Capture:
     """The recording with poses lifted from the key points and fitted to them and to the masks.
 
@@ -298,14 +311,14 @@ def fit_tracked_video(
         masks_beside,
     )
     capture = align_capture(imported, skip_checks=True)
-    fit = fit_capture(capture)
-    if fit is None:
+    fitted = fit(capture)
+    if fitted is None:
         return capture
     return replace(
         capture,
-        motion=fitted_motion(capture, fit),
-        cameras=capture.cameras.scale_focal(fit.focal_factor),
-        shaped=fit.shape(capture.shaped),
+        motion=fitted_motion(capture, fitted),
+        cameras=capture.cameras.scale_focal(fitted.focal_factor),
+        shaped=fitted.shape(capture.shaped),
     )
 
 

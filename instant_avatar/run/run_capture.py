@@ -12,7 +12,12 @@ from capture.source import Frame, FrameSource
 from instant_avatar.capture_validation import correction_hint, preflight_check
 from instant_avatar.cli.console import Console
 from instant_avatar.run.ingest_arguments import IngestArguments
-from instant_avatar.run.person_tracking import person_number, print_first_look
+from instant_avatar.run.person_tracking import (
+    FitFunction,
+    fit_in_process,
+    person_number,
+    print_first_look,
+)
 from instant_avatar.run.run_folder import RunFolder
 from instant_avatar.run.run_tracking import import_tracked
 from preprocess.cameras.camera_file import write_cameras
@@ -46,16 +51,14 @@ def open_observations(
     console: Console,
     on_tracked: Callable[[Frame, PersonKeypoints | None], object] = lambda *_: None,
     *,
-    fit: Callable[[Capture], CaptureFit | None] = fit_capture,
-    prepare: Callable[[Capture], object] = lambda _: None,
+    fit: FitFunction = fit_in_process,
     background: Executor | None = None,
 ) -> tuple[ObservationSource, Capture]:
     """Open what a run learns from, whatever the input is.
 
     Args:
         on_tracked: Receives each frame of a stream that was searched, and the person in it.
-        fit: Fits a recording with poses that no run has fitted before.
-        prepare: Called with it just before that.
+        fit: Fits a recording with poses that no run has fitted before, or that were tracked.
         background: Where a first look at a recording with poses is taken, and printed; without it
             none is.
 
@@ -69,7 +72,7 @@ def open_observations(
         _describe(stream.capture, console)
         return stream, stream.capture
     if inputs.kind is InputKind.UNTRACKED:
-        imported = import_tracked(arguments, inputs, run, console)
+        imported = import_tracked(arguments, inputs, run, console, fit)
     else:
         imported = read_capture(inputs)
     earlier = None
@@ -85,16 +88,19 @@ def open_observations(
     _describe(capture, console)
     if is_new:
         preflight_check(capture, imported.inputs, console, force=arguments.force)
-        prepare(capture)
     if inputs.cameras == "solve":
         capture = _solve_cameras(arguments, capture, console)
     fitted = capture
     if arguments.refine_poses and not capture.motion.is_fitted:
         if earlier is None:
-            with console.status("fitting body and poses to the masks"):
-                earlier = fit_capture(capture, fit_body=False) if resumes else fit(capture)
+            earlier = _fit_poses(capture, console) if resumes else fit(capture, console)
         fitted = _apply_fit(capture, earlier, inputs, console)
     return RecordedObservations(fitted, realtime=inputs.realtime), capture
+
+
+def _fit_poses(capture: Capture, console: Console) -> CaptureFit | None:
+    with console.status("fitting poses"):
+        return fit_capture(capture, fit_body=False)
 
 
 def _take_first_look(source: FrameSource, inputs: CaptureInputs, console: Console) -> None:

@@ -12,7 +12,9 @@ from instant_avatar.cli.command_line import INTERRUPTED, CommandExit, stop_on_in
 from instant_avatar.cli.console import Console
 from instant_avatar.run.ingest_arguments import IngestArguments
 from instant_avatar.run.person_tracking import (
+    FitFunction,
     PersonTracking,
+    fit_in_process,
     print_doubts,
     track_person,
     tracked_inputs,
@@ -25,7 +27,11 @@ from preprocess.open_capture import ImportedCapture, read_capture
 
 
 def import_tracked(
-    arguments: IngestArguments, inputs: CaptureInputs, run: RunFolder, console: Console
+    arguments: IngestArguments,
+    inputs: CaptureInputs,
+    run: RunFolder,
+    console: Console,
+    fit: FitFunction = fit_in_process,
 ) -> ImportedCapture:
     """Track the person of a recording for a run; of a resumed run, read its own tracking.
 
@@ -45,7 +51,7 @@ def import_tracked(
     if beside is not None:
         console.warning(f"{beside} lies beside the video; to use it, pass --poses.")
     with stop_on_interrupt(console, "keeping the frames that were tracked") as stop:
-        tracking = _track(inputs, run, console, stop, resume=stored is not None)
+        tracking = _track(inputs, run, console, stop, fit, resume=stored is not None)
     imported, grade = tracking.imported, tracking.grade
     chosen = imported.inputs.frames
     stored = {
@@ -99,7 +105,13 @@ def _with_grade(imported: ImportedCapture, stored: dict[str, Any]) -> ImportedCa
 
 
 def _track(
-    inputs: CaptureInputs, run: RunFolder, console: Console, stop: threading.Event, *, resume: bool
+    inputs: CaptureInputs,
+    run: RunFolder,
+    console: Console,
+    stop: threading.Event,
+    fit: FitFunction,
+    *,
+    resume: bool,
 ) -> PersonTracking:
     """Track the person into the run's folder; leave no empty folder if that fails."""
     run.tracking.mkdir(parents=True, exist_ok=True)
@@ -107,7 +119,7 @@ def _track(
     OutputFileList(run.tracking).remove_temporaries()
     try:
         return track_person(
-            inputs, run.tracked_poses, console, stop=stop, resume=resume, for_learning=True
+            inputs, run.tracked_poses, console, stop=stop, resume=resume, for_learning=True, fit=fit
         )
     finally:
         OutputFileList(run.tracking).remove_if_empty()

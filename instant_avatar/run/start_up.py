@@ -2,13 +2,14 @@
 
 Python runs the code of one process on one core at a time. So torch is loaded on a thread, which
 waits while files are read; a first run's kernels are compiled in a process of their own; and body
-and poses are fitted to given masks in another one, which opens the same recording again, and sends
-back the fit, the person's rig, and what the masks' refinement has learnt from the frames.
+and poses are fitted in another one, which receives the capture, and sends back the fit, what the
+masks' refinement has learnt from the frames, and the person's rig.
 """
 
 import gc
 import os
 import pickle
+import signal
 import subprocess
 import sys
 import threading
@@ -19,9 +20,6 @@ from typing import TYPE_CHECKING, Any, final
 
 import avatar
 from capture.hardware import usable_cores
-from capture.source import FrameSource
-from preprocess.capture_inputs import CaptureInputs, InputKind, find_own_masks
-from preprocess.plugins import segmenter_name
 
 if TYPE_CHECKING:  # the process that fits needs no console, and scipy only once it has begun
     from avatar.rig import Rig
@@ -130,76 +128,75 @@ def warm_up(*, is_second: bool = False) -> None:
         proxy_surface.warm_up()
 
 
-def can_fit_beside(inputs: CaptureInputs, source: FrameSource) -> bool:
-    """Whether a recording can be fitted without this process: its poses and masks are given."""
-    if inputs.kind is not InputKind.POSED or inputs.cameras == "solve":
-        return False
-    if inputs.masks is not None:
-        return segmenter_name(inputs.masks) is None
-    return source.has_alpha or find_own_masks(inputs.video, inputs.poses) is not None
-
-
 @final
 class FitProcess:
-    """A process that fits a recording.
-
-    Attributes:
-        rig: The fitted person's, if the process has made it.
-    """
+    """A process that fits a recording."""
 
     def __init__(self, process: "subprocess.Popen[bytes]") -> None:
         """Wait for nothing yet."""
         self._process = process
-        self.rig: Rig | None = None
+
+    def send(self, capture: "Capture", height_m: float | None, *, with_rig: bool) -> None:
+        """Let the process fit a recording, and make the rig of its person, who is so tall.
+
+        What another process cannot open, such as masks by a plugin, is fitted by this one.
+        """
+        assert self._process.stdin is not None
+        with suppress(OSError, pickle.PicklingError, AttributeError, TypeError):  # or it has ended
+            self._process.stdin.write(pickle.dumps((capture, height_m, with_rig)))
+        with suppress(OSError):
+            self._process.stdin.close()
 
     def fit(self, capture: "Capture") -> "CaptureFit | None":
         """Wait for the fit, and let the masks know what those of the other process have learnt."""
         from preprocess.fitting.capture_fitting import fit_capture
         from preprocess.masks.mask_sources import GivenMasks
 
-        assert self._process.stdout is not None
-        sent = self._process.stdout.read()
-        if self._process.wait() or not isinstance(capture.masks, GivenMasks):
+        received = self._receive()
+        if received is None:
             return fit_capture(capture)  # which says what is wrong
-        try:
-            fit, capture.masks.refine, self.rig = pickle.loads(sent)
-        except (pickle.UnpicklingError, EOFError):  # it was cut off
-            return fit_capture(capture)
+        fit, refine = received
+        if isinstance(capture.masks, GivenMasks):
+            capture.masks.refine = refine
         return fit
+
+    def rig(self) -> "Rig | None":
+        """Wait for the rig of the fitted person, if the process was to make it."""
+        return self._receive()
+
+    def _receive(self) -> Any:
+        assert self._process.stdout is not None
+        try:
+            return pickle.load(self._process.stdout)
+        except (pickle.UnpicklingError, EOFError):  # it has ended
+            return None
 
 
 @contextmanager
-def fitting_beside(inputs: CaptureInputs, size_px: int) -> Iterator[FitProcess]:
-    """Fit a recording in another process, which ends with this block at the latest.
-
-    `size_px` is the longer side of the training images.
-    """
+def fitting_beside() -> Iterator[FitProcess]:
+    """Start another process to fit a recording, which ends with this block at the latest."""
     command, pipe = [sys.executable, "-c", FIT], subprocess.PIPE
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL) as process:
         try:
-            assert process.stdin is not None
-            with suppress(OSError), process.stdin as there:  # it may have ended
-                there.write(pickle.dumps((inputs, size_px)))
             yield FitProcess(process)
         finally:
             process.terminate()
 
 
 def fit_for_parent() -> None:
-    """Fit the recording that standard input describes; write fit and rig to standard output."""
+    """Fit the recording that standard input holds; write fit, then rig, to standard output."""
     gc.disable()  # the process is short
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other process decides what Ctrl-C ends
     answer = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for whatever libraries print
-    inputs, size_px = pickle.load(sys.stdin.buffer)
     from avatar.rig import Rig
     from preprocess.fitting.capture_fitting import apply_fit, fit_capture
-    from preprocess.masks.mask_sources import GivenMasks
-    from preprocess.open_capture import open_capture
 
-    capture = open_capture(inputs, size_px=size_px)
-    assert isinstance(capture.masks, GivenMasks)
+    capture, height_m, with_rig = pickle.load(sys.stdin.buffer)
     fit = fit_capture(capture)
-    fitted = capture if fit is None else apply_fit(capture, fit, height_m=inputs.height_m)
-    found = fit, capture.masks.refine, Rig.from_shaped_body(fitted.shaped)
     with answer:
-        answer.write(pickle.dumps(found))
+        pickle.dump((fit, getattr(capture.masks, "refine", None)), answer)
+        answer.flush()
+        if with_rig:
+            fitted = capture if fit is None else apply_fit(capture, fit, height_m=height_m)
+            pickle.dump(Rig.from_shaped_body(fitted.shaped), answer)

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 from capture.input_error import InputError
 from capture.source_opening import reopen
+from capture.work_ahead import read_ahead
 from preprocess.alignment.silhouette_objective import MaskSample, reduce_masks, sample_masks
 from preprocess.body.body_surface import SkinPoints
 from preprocess.capture_session import Capture
@@ -65,7 +66,8 @@ def _observe(capture: Capture, count: int, total: int) -> tuple[MaskSample, ...]
     start = chosen.start + stride // 2 // chosen.step * chosen.step
     stop = chosen.start + total * chosen.step if total < (source.frame_count or 1) else chosen.stop
     samples = []
-    for each in map(observe, reopen(source, slice(start, stop, stride)).frames()):
+    frames = reopen(source, slice(start, stop, stride)).frames()
+    for each in map(observe, read_ahead(frames)):
         if isinstance(each, Observation):
             index = each.frame.index
             longer, is_whole = max(each.frame.size_px), each.filmed_rgb is None

@@ -5,6 +5,7 @@ detected from a few samples. Files that hold no readable masks raise `InputError
 """
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -99,7 +100,7 @@ class Masks:
         self.count = count
         self.names = names
         self._read = read
-        self._doubts = invert is None
+        self._stated = invert
         rows = np.unique(np.linspace(0, count - 1, POLARITY_SAMPLES).round().astype(int))
         samples = _readable(read, [int(row) for row in rows])
         self._numbers = are_object_ids(samples)
@@ -108,6 +109,10 @@ class Masks:
         height, width = samples[0].shape
         self.size_px = (int(width), int(height))
         self.inverted = shows_background(samples, path) if invert is None else invert
+
+    def __reduce__(self) -> tuple[Callable[[Path], "Masks"], tuple[Path]]:
+        """Open the files again in another process."""
+        return partial(open_masks, invert=self._stated), (self.path,)
 
     def _binarize_ids(self, stored: Float32[np.ndarray, "_ _"]) -> Float32[np.ndarray, "_ _"]:
         """Alpha of a stored mask: any object, if the files hold object numbers."""
@@ -133,7 +138,7 @@ class Masks:
                 stored, size_px, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
             )
         alpha = np.float32(1.0) - stored if self.inverted else stored
-        if self._doubts and (_coverage(alpha) > MAX_PERSON_FRACTION).all():
+        if self._stated is None and (_coverage(alpha) > MAX_PERSON_FRACTION).all():
             raise InputError(
                 f"mask {row} in {self.path} covers most of the image and of its rim, unlike the "
                 "others; is it inverted?"

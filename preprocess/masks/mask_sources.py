@@ -1,7 +1,7 @@
 """Masks of a capture's frames: read from files or alpha channels, or estimated from the images."""
 
 from collections.abc import Callable, Iterator
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import final
 
@@ -148,7 +148,7 @@ class StoredMasks(GivenMasks):
         except InputError:
             if not same_aspect_ratio(self.files.size_px, self._source.size_px):
                 raise
-            masks.row_of = lambda index: index
+            masks.row_of = int
         return masks
 
 
@@ -218,23 +218,19 @@ def associate_masks(masks: Masks, source: FrameSource) -> Callable[[int], int]:
     if masks.names is not None and (unfinished or OutputFileList(masks.path).exists()):  # our own
         rows = {int(name): row for row, name in enumerate(masks.names) if name.isdecimal()}
         if len(rows) == masks.count and max(rows) < source.frames_in_file:
-            return _row_by_name(rows, masks)
+            return partial(_row_by_name, rows, masks.path)
     if masks.names is not None and masks.count not in (source.frames_in_file, source.frame_count):
         named = associate_by_name(masks.names, source)
         if named is not None:
-            return _row_by_name(named, masks)
+            return partial(_row_by_name, named, masks.path)
     return associate_by_order(masks.count, source, f"masks in {masks.path}")
 
 
-def _row_by_name(named: dict[int, int], masks: Masks) -> Callable[[int], int]:
-    """Rows of masks that belong to frames by their names, some of which have none."""
-
-    def row(index: int) -> int:
-        if index not in named:
-            raise InputError(f"{masks.path} holds none for frame {index}")
-        return named[index]
-
-    return row
+def _row_by_name(named: dict[int, int], path: Path, index: int) -> int:
+    """Row of a frame's mask by its name; some frames have none."""
+    if index not in named:
+        raise InputError(f"{path} holds none for frame {index}")
+    return named[index]
 
 
 def alpha_channel_mask(frame: Frame, size_px: tuple[int, int]) -> AlphaMask:

@@ -3,8 +3,6 @@
 import subprocess
 import sys
 import time
-from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,10 +11,9 @@ import pytest
 from avatar.kernels import numba_pose
 from avatar.rig import Rig
 from capture.hardware import usable_cores
-from capture.source_opening import open_source
 from instant_avatar.cli.console import Console
 from instant_avatar.run import start_up
-from instant_avatar.run.start_up import can_fit_beside, fitting_beside
+from instant_avatar.run.start_up import fitting_beside
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.fitting.capture_fitting import apply_fit, fit_capture
 from preprocess.open_capture import open_capture
@@ -111,11 +108,13 @@ def assert_same_fit(one, other):
 
 def test_another_process_fits_and_remembers_what_this_one_would(inputs):
     here, there = equal_captures(inputs)
-    with fitting_beside(inputs, SIZE_PX) as fitting:
+    with fitting_beside() as fitting:
+        fitting.send(there, None, with_rig=True)
         found = fitting.fit(there)
+        sent_rig = fitting.rig()
     assert_same_fit(found, fit_capture(here))
     rig = Rig.from_shaped_body(apply_fit(here, found).shaped)
-    for name, value in vars(fitting.rig).items():
+    for name, value in vars(sent_rig).items():
         np.testing.assert_array_equal(value, getattr(rig, name))
     assert not there.masks.needs_all_frames  # it has compared borders, as the other one
     assert there.masks.refine._ratios == here.masks.refine._ratios
@@ -124,25 +123,22 @@ def test_another_process_fits_and_remembers_what_this_one_would(inputs):
 def test_a_process_that_fails_is_done_without(inputs, monkeypatch):
     monkeypatch.setattr(start_up, "FIT", "raise SystemExit(1)")
     here, there = equal_captures(inputs)
-    with fitting_beside(inputs, SIZE_PX) as fitting:
+    with fitting_beside() as fitting:
+        fitting.send(there, None, with_rig=True)
         assert_same_fit(fitting.fit(there), fit_capture(here))
-    assert fitting.rig is None
+        assert fitting.rig() is None
 
 
-def test_the_process_ends_with_the_block(inputs, started, monkeypatch):
+def test_what_cannot_be_sent_is_fitted_by_this_process(inputs):
+    here, there = equal_captures(inputs)
+    there.masks.plugin = lambda: None  # not to be pickled
+    with fitting_beside() as fitting:
+        fitting.send(there, None, with_rig=False)
+        assert_same_fit(fitting.fit(there), fit_capture(here))
+
+
+def test_the_process_ends_with_the_block(started, monkeypatch):
     monkeypatch.setattr(start_up, "FIT", RUNS_LONG)
-    with fitting_beside(inputs, SIZE_PX):
+    with fitting_beside():
         assert started[0].poll() is None
     assert started[0].poll() is not None
-
-
-def test_only_given_poses_and_masks_are_fitted_elsewhere(film, inputs, tmp_path):
-    source = open_source(film)
-    assert can_fit_beside(inputs, source)
-    (tmp_path / "alone.mp4").write_bytes((film / "video.mp4").read_bytes())
-    alone = CaptureInputs(video=tmp_path / "alone.mp4")
-    assert not can_fit_beside(alone, source)
-    assert not can_fit_beside(replace(alone, poses=film / "truth" / "poses.npz"), source)
-    assert can_fit_beside(replace(alone, poses=film / "poses.npz"), source)  # masks lie there
-    assert not can_fit_beside(replace(inputs, masks=Path("segmenter:blazepose")), source)
-    assert not can_fit_beside(replace(inputs, cameras="solve"), source)
