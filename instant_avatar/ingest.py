@@ -5,8 +5,8 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, nullcontext
-from functools import partial
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, final
 
 from capture.hardware import usable_cores
 from instant_avatar.cli.command_line import (
@@ -21,6 +21,7 @@ from instant_avatar.cli.command_line import (
 from instant_avatar.cli.console import Console
 from instant_avatar.cli.shared_options import open_recording
 from instant_avatar.run.ingest_arguments import PROGRAM, VIEW_PORT, IngestArguments
+from instant_avatar.run.run_folder import RunFolder
 from instant_avatar.run.start_up import (
     FitProcess,
     fitting_beside,
@@ -67,36 +68,20 @@ def ingest(
     ):
         fitting = _fit_beside(arguments, inputs, cleanup)
         wait = cleanup.enter_context(preparing_to_train(console))
+        trainer_code = _TrainerCode(arguments, inputs, run, console, wait, fitting)
         with without_garbage_collection():
             from instant_avatar.run.run_capture import open_observations, write_solved_cameras
 
         command = arguments.as_json()
-        leaving = partial(exit_on_interrupt, console, PROGRAM, run.release)
-        threads = None
         if inputs.kind is InputKind.STREAMED:  # its frames come as soon as it is open
-            with leaving():
-                threads = _load_trainer_code(arguments, console, wait)
-
-        def fit_beside(capture: "Capture", console: Console) -> "CaptureFit | None":
-            nonlocal threads
-            assert fitting is not None
-            is_posed = inputs.kind is InputKind.POSED
-            fitting.send(capture, inputs.height_m, with_rig=is_posed)
-            with leaving() if is_posed else nullcontext():  # what was tracked is kept
-                threads = _load_trainer_code(arguments, console, wait)
-                _load_kernels(capture, console)
-            with console.status("fitting body and poses"):
-                return fitting.fit(capture)
-
+            trainer_code.load()
         observations, before_fit = open_observations(
             arguments, inputs, run, console,
             lambda frame, person: _show_tracked(frame, person, readers),
             background=cleanup.enter_context(ThreadPoolExecutor(1)),
-            **({} if fitting is None else {"fit": fit_beside}),
+            **({} if fitting is None else {"fit": trainer_code.load_and_fit}),
         )  # fmt: skip
-        if threads is None:
-            with leaving():
-                threads = _load_trainer_code(arguments, console, wait)
+        threads = trainer_code.load()
         from instant_avatar.report.report_writer import ReportWriter
         from instant_avatar.run.session_start import run_session
 
@@ -127,23 +112,52 @@ def _fit_beside(
     return cleanup.enter_context(fitting_beside())
 
 
-def _load_trainer_code(
-    arguments: IngestArguments, console: Console, wait: Callable[[], None]
-) -> int:
-    """Import torch, and set and return the number of threads; `wait` for the kernels first."""
-    wait()
-    with console.status("loading torch"), without_garbage_collection():
-        from instant_avatar.report import report_writer  # noqa: F401
-        from instant_avatar.run.session_start import set_threads
+@final
+@dataclass
+class _TrainerCode:
+    """Torch and the kernels, loaded once: beside the fit, where another process fits.
 
-        return set_threads(arguments.threads)
+    Attributes:
+        wait: Waits for the kernels of a first run.
+        threads: Number of numba's threads, once torch is loaded.
+    """
 
+    arguments: IngestArguments
+    inputs: CaptureInputs
+    run: RunFolder
+    console: Console
+    wait: Callable[[], None]
+    fitting: FitProcess | None
+    threads: int = 0
 
-def _load_kernels(capture: "Capture", console: Console) -> None:
-    """Load the kernels, or compile them, while another process fits the capture."""
-    from instant_avatar.run.session_start import warm_up_for
+    def load(self) -> int:
+        """Import torch, and set and return the number of threads."""
+        if not self.threads:
+            with exit_on_interrupt(self.console, PROGRAM, self.run.release):
+                self._import()
+        return self.threads
 
-    warm_up_for(capture, console)
+    def load_and_fit(self, capture: "Capture", console: Console) -> "CaptureFit | None":
+        """Load torch and the kernels while another process fits a capture."""
+        assert self.fitting is not None
+        is_posed = self.inputs.kind is InputKind.POSED
+        self.fitting.send(capture, self.inputs.height_m, with_rig=is_posed)
+        release = self.run.release
+        with exit_on_interrupt(console, PROGRAM, release) if is_posed else nullcontext():
+            self._import()  # after Ctrl-C, what was tracked is kept
+            from instant_avatar.run.session_start import warm_up_for
+
+            warm_up_for(capture, console)
+        with console.status("fitting body and poses"):
+            return self.fitting.fit(capture)
+
+    def _import(self) -> None:
+        self.wait()
+        with self.console.status("loading torch"), without_garbage_collection():
+            from instant_avatar.report import report_writer  # noqa: F401
+            from instant_avatar.run.session_start import set_threads
+
+            self.threads = set_threads(self.arguments.threads)
 
 
 def _show_tracked(

@@ -103,7 +103,7 @@ def test_without_time_poses_are_fitted_to_some_frames_that_are_spread_over_the_v
     frames = frames_of(score(steps=None, limit_s=0.0, fit_poses=True).fitted)
     assert len(frames) == FRAMES_PER_FIT
     assert frames == sorted(frames)
-    assert np.diff(frames).max() <= 10 * (COUNT // 4)
+    assert np.diff(frames).max() <= 10 * COUNT // 2
 
 
 def test_what_is_left_out_ends_at_once_and_keeps_what_was_scored(score):
