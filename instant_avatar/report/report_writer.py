@@ -19,6 +19,7 @@ from capture.atomic_files import atomic_file, write_text_atomically
 from capture.hardware import peak_memory_mb
 from capture.input_error import quote_command
 from capture.live_sources import camera_address
+from export.build import GOOD_PSNR
 from export.player import Player
 from instant_avatar.animation.driving_motion import FollowingCamera, ResampledMotion, demo_motion
 from instant_avatar.cli.command_line import DONE, INTERRUPTED, NO_AVATAR, CommandExit
@@ -101,7 +102,8 @@ ANIMATION_PX = 480
 ANIMATION_FPS = 16.0
 """Images per second of the animation on the page."""
 VISIBLE_GAIN_DB = 1.0
-"""Gain of the fine-tuned package on the one as baked for which the animation is drawn again, dB."""
+"""Gain of the fine-tuned package on the one as baked, up to `GOOD_PSNR`, for which the animation is
+drawn again, dB."""
 ANIMATION_FRAMES = 96
 """Largest number of images of an animation."""
 
@@ -147,7 +149,7 @@ class ReportWriter:
                     self._console.print_artifact("play it", self._play_command())
                 with self._console.status("drawing the report"):
                     assert result.exported is not None
-                    psnr = result.exported.psnr_to_renderer["hq"]
+                    psnr = min(result.exported.psnr_to_renderer["hq"], GOOD_PSNR)
                     if psnr - self._drawn_psnr > VISIBLE_GAIN_DB:
                         self._animation = demo_animation(Player.load(self._run.package))
                         self._drawn_psnr = psnr

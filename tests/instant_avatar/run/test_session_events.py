@@ -94,7 +94,7 @@ def test_package_and_page_are_there_before_scores_are_made(learn, tmp_path):
     assert avatar.report["held_out"]["psnr"] is not None
 
 
-def write_twice(avatar, path, *, progress, gain_db=0.0, **options):
+def write_twice(avatar, path, *, progress, psnr_db=(40.0, 40.0), **options):
     """Writes a package, and then one that is fine-tuned, as `export_avatar` does."""
     for number, psnr in enumerate((None, (1.0, 2.0))):
         if number:
@@ -105,7 +105,7 @@ def write_twice(avatar, path, *, progress, gain_db=0.0, **options):
         path.write_bytes(b"a" * (number + 1))
         yield ExportReport(
             path=path, bytes=number + 1, seconds=0.0,
-            psnr_to_renderer={"hq": 40.0 + number * gain_db},
+            psnr_to_renderer={"hq": psnr_db[number]},
             largest_difference=0.0, fine_tuning_psnr=psnr, warnings=(),
         )  # fmt: skip
 
@@ -123,13 +123,14 @@ def test_the_package_as_baked_stays_if_the_fine_tuned_one_is_refused(learn, monk
 
 
 @pytest.mark.parametrize(
-    ("gain_db", "drawings"), [(0.5, 1), pytest.param(3.0, 2, marks=pytest.mark.slow)]
+    ("psnr_db", "drawings"),
+    [((40.0, 45.0), 1), pytest.param((34.0, 37.0), 2, marks=pytest.mark.slow)],
 )
 def test_the_animation_is_drawn_again_only_where_fine_tuning_shows(
-    learn, monkeypatch, gain_db, drawings
+    learn, monkeypatch, psnr_db, drawings
 ):
     drawn = []
-    monkeypatch.setattr(snapshot_writer, "export_avatar", partial(write_twice, gain_db=gain_db))
+    monkeypatch.setattr(snapshot_writer, "export_avatar", partial(write_twice, psnr_db=psnr_db))
     monkeypatch.setattr(report_writer, "demo_animation", lambda player: drawn.append(0) or b"")
     learn()
     assert len(drawn) == drawings
