@@ -1,15 +1,17 @@
 """The coarse start of a capture's fit: distance, pelvis and an unknown focal length, by mask boxes.
 
 Poses may be for a body of another size, and a camera may be a guess. All poses then move together,
-so that the box around the posed body becomes the box of the mask in every frame: linear least
-squares over the boxes' sides. Rotations stay. What frames do not share is left to the fit of poses.
+so that the box around the posed body becomes the box of the mask in every frame.
+Rotations stay. What frames do not share is left to the fit of poses.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
+from scipy.optimize import least_squares
 
 from capture.camera import Camera
 from capture.source import AlphaMask
@@ -24,8 +26,6 @@ from preprocess.fitting.silhouettes import read_first_silhouettes
 
 START_FRAMES = 16
 """Frames whose boxes are compared."""
-ROUNDS = 4
-"""Times that the linear equations are solved, each time around the place found before."""
 SIGMA_SHIFT_M = 0.2
 """Prior standard deviation of the pelvis's shift, metres: from one side, a smaller distance and a
 shift towards the camera look alike."""
@@ -50,13 +50,13 @@ class _Start(NamedTuple):
 
     Attributes:
         magnification: Size of the masks' boxes relative to the posed body's.
-        shift_m: Shift of the pelvis in the root's axes.
+        shift_m: Shift of the pelvis in the root's axes; empty if only the focal length is changed.
         before, after: Mean IoU of body and masks.
     """
 
     geometry: CaptureGeometry
     magnification: float
-    shift_m: Float[np.ndarray, "3"]
+    shift_m: Float[np.ndarray, "axes"]
     before: float
     after: float
 
@@ -129,21 +129,37 @@ def start_focal_length(capture: Capture) -> Capture:
 def _find_start(
     capture: Capture, samples: tuple[MaskSample, ...], *, by_focal_length: bool
 ) -> _Start:
-    """Bring the boxes of body and masks together."""
-    objective = SilhouetteObjective(samples=samples, skin=SkinPoints.of(capture.shaped))
-    stated = geometry = capture.geometry()
-    magnification, shift = 1.0, np.zeros(3)
-    for _ in range(ROUNDS):
-        factor, shift = _compare_boxes(geometry, objective, shift, by_focal_length=by_focal_length)
-        magnification *= factor
+    """Bring the boxes of body and masks together by the robust least squares of their sides."""
+    shaped, stated = capture.shaped, capture.geometry()
+    objective = SilhouetteObjective(samples=samples, skin=SkinPoints.of(shaped))
+
+    def geometry_of(numbers: Float[np.ndarray, "numbers"]) -> CaptureGeometry:
+        magnification = float(np.exp(numbers[0]))
         if by_focal_length:
             intrinsics = stated.intrinsics.copy()
             intrinsics[:, [0, 1], [0, 1]] *= magnification
-            geometry = replace(stated, intrinsics=intrinsics)
-        else:
-            geometry = _place(stated, capture.shaped, magnification, shift)
+            return replace(stated, intrinsics=intrinsics)
+        return _place(stated, shaped, magnification, numbers[1:])
+
+    bodies = list(_bodies_before_camera(stated, objective))
+    prior = SIGMA_SIDE_PX * np.sqrt(max(4 * len(bodies), 1)) / SIGMA_SHIFT_M
+
+    def distances_px(numbers: Float[np.ndarray, "numbers"]) -> Float[np.ndarray, "rows"]:
+        """Of the sides of both boxes, and the shift's prior; none at the image's border."""
+        geometry, off = geometry_of(numbers), [prior * numbers[1:]]
+        moved = geometry.motion.root_translations - stated.motion.root_translations
+        for sample, row, points in bodies:
+            camera = geometry.camera_at(sample.camera_row, objective.size_px)
+            pixels = camera.project(points + moved[row])
+            sides = np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
+            off.append(np.nan_to_num(sides - _sides_of_mask(sample.alpha, camera)))
+        return np.concatenate(off)
+
+    start = np.zeros(1 if by_focal_length else 4)
+    found = least_squares(distances_px, start, loss="cauchy", f_scale=SIGMA_SIDE_PX).x
+    geometry = geometry_of(found)
     before, after = (mean_score(objective.frame_scores(each)) for each in (stated, geometry))
-    return _Start(geometry, magnification, shift, before, after)
+    return _Start(geometry, float(np.exp(found[0])), found[1:], before, after)
 
 
 def _place(
@@ -157,44 +173,17 @@ def _place(
     return replace(geometry, motion=replace(geometry.motion, root_translations=places))
 
 
-def _compare_boxes(
-    geometry: CaptureGeometry,
-    objective: SilhouetteObjective,
-    shift_m: Float[np.ndarray, "3"],
-    *,
-    by_focal_length: bool,
-) -> tuple[float, Float[np.ndarray, "3"]]:
-    """The factor by which bodies are too small in the images, and the pelvis's whole shift.
-
-    `shift_m` is the shift that the geometry has already.
-    """
-    # A side e of a body's box, seen from a camera with the pelvis at p and the center at c, moves
-    # by (k - 1) (e - p) as distances are divided by k, by (k - 1) (e - c) as the focal length is
-    # multiplied by it, and by f/z R_x s - (e - c)/z R_z s as the pelvis is shifted by R s.
-    rows, targets = [np.zeros((0, 4))], [np.zeros(0)]
+def _bodies_before_camera(
+    geometry: CaptureGeometry, objective: SilhouetteObjective
+) -> Iterator[tuple[MaskSample, int, Float32[np.ndarray, "points 3"]]]:
+    """Each mask whose frame has a pose before the camera, its row and the skin in the world."""
     for sample in objective.samples:
         row = geometry.row_for_frame(sample.index)
-        if row is None:
-            continue
-        camera = geometry.camera_at(sample.camera_row, objective.size_px)
-        points = objective.posed_points(geometry.motion, row).astype(np.float64)
-        view = camera.camera_from_world
-        pelvis = objective.skin.shaped.joints[0] + geometry.motion.root_translations[row]
-        depth = float(view[2, :3] @ pelvis + view[2, 3])
-        if (points @ view[2, :3] + view[2, 3]).min() < NEAR_PLANE_M:
-            continue
-        pixels, center = camera.project(points), np.tile(camera.center_px, 2)
-        sides = np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
-        fixed = center if by_focal_length else np.tile(camera.project(pelvis[None])[0], 2)
-        turn = view[:3, :3] @ rotation_matrices(geometry.motion.root_rotations[row])
-        across = np.tile(camera.focal_px, 2)[:, None] * np.tile(turn[:2], (2, 1))
-        shifted = (across - (sides - center)[:, None] * turn[2]) / depth
-        target = _sides_of_mask(sample.alpha, camera) - sides
-        seen = np.isfinite(target)
-        rows.append(np.column_stack([sides - fixed, shifted * (not by_focal_length)])[seen])
-        targets.append(target[seen])
-    found = _solve_robustly(np.concatenate(rows), np.concatenate(targets), shift_m)
-    return max(1.0 + float(found[0]), 0.2), shift_m + found[1:]
+        if row is not None:
+            points = objective.posed_points(geometry.motion, row)
+            view = geometry.camera_at(sample.camera_row, objective.size_px).camera_from_world[2]
+            if (points @ view[:3] + view[3]).min() > NEAR_PLANE_M:
+                yield sample, row, points
 
 
 def _sides_of_mask(alpha: AlphaMask, camera: Camera) -> Float[np.ndarray, "4"]:
@@ -208,21 +197,3 @@ def _sides_of_mask(alpha: AlphaMask, camera: Camera) -> Float[np.ndarray, "4"]:
     low[low < IMAGE_BORDER_PX] = np.nan
     high[high > size - IMAGE_BORDER_PX] = np.nan
     return np.concatenate([low, high])
-
-
-def _solve_robustly(
-    rows: Float[np.ndarray, "sides 4"],
-    targets: Float[np.ndarray, "sides"],
-    shift_m: Float[np.ndarray, "3"],
-) -> Float[np.ndarray, "4"]:
-    """The change of size and the further shift that the sides tell, with the shift's prior."""
-    prior = SIGMA_SIDE_PX * np.sqrt(max(len(rows), 1)) / SIGMA_SHIFT_M
-    held = prior * np.eye(4)[1:]
-    found, weights = np.zeros(4), np.ones(len(rows))
-    for _ in range(ROUNDS):
-        design = np.concatenate([weights[:, None] * rows, held])
-        target = np.concatenate([weights * targets, -prior * shift_m])
-        found = np.linalg.lstsq(design, target, rcond=None)[0]
-        off = (rows @ found - targets) / SIGMA_SIDE_PX
-        weights = 1.0 / np.sqrt(1.0 + off**2)
-    return found
