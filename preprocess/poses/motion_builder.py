@@ -54,8 +54,14 @@ def build_motion(
         ValueError: If the parts do not fit together.
     """
     is_assumed = isinstance(lens, RelativeFocalLength)
-    turned = stack_axis_angles(rotations)
-    placed = np.asarray(translations, dtype=np.float64).reshape(len(turned), 3)
+    counts = {len(part) for part in (*rotations, translations)}
+    placed = np.asarray(translations, dtype=np.float64)
+    if len(counts) > 1 or placed.size != 3 * len(placed):
+        raise ValueError(
+            f"rotations and translations of {sorted(counts)} rows, translations of the shape "
+            f"{placed.shape}; expected as many rows, and 3 metres in each translation"
+        )
+    turned, placed = stack_axis_angles(rotations), placed.reshape(-1, 3)
     order = np.arange(len(turned))
     if frames is not None:
         frames, order = np.unique(_numbers(frames, len(turned)), return_index=True)
@@ -89,9 +95,9 @@ def stack_rows(rows: list[Any]) -> Float[np.ndarray, "poses *rest"]:
 
 def _numbers(frames: Any, count: int) -> Int[np.ndarray, "poses"]:
     numbers = np.asarray(frames, dtype=np.float64).reshape(-1)
-    if len(numbers) != count or not np.isfinite(numbers).all():
-        raise ValueError(f"{len(numbers)} frame numbers for {count} poses")
-    return np.round(numbers).astype(np.int64)
+    if len(numbers) != count or not (numbers == np.round(numbers)).all():
+        raise ValueError(f"{len(numbers)} frame numbers, not all whole, for {count} poses")
+    return numbers.astype(np.int64)
 
 
 def _median_betas(betas: Any) -> Float[np.ndarray, "betas"]:
@@ -100,14 +106,16 @@ def _median_betas(betas: Any) -> Float[np.ndarray, "betas"]:
     rows = np.asarray(betas, dtype=np.float64)
     rows = rows.reshape(-1, rows.shape[-1]) if rows.ndim else rows.reshape(1, 1)
     rows = rows[np.isfinite(rows).all(axis=1)]
-    return np.median(rows, axis=0) if len(rows) else np.zeros(0)
+    if not len(rows):
+        raise ValueError("betas that are NaN; a shape of finite numbers was expected")
+    return np.median(rows, axis=0)
 
 
 def _median_intrinsic(intrinsic: Any) -> Float[np.ndarray, "3 3"] | None:
     if intrinsic is None:
         return None
     matrix = np.asarray(intrinsic, dtype=np.float64)
-    matrix = np.median(matrix.reshape(-1, 3, 3), axis=0)
+    matrix = np.nanmedian(matrix.reshape(-1, 3, 3), axis=0)
     if not np.isfinite(matrix).all() or matrix[0, 0] <= 0.0:
         raise ValueError("a K that is no camera matrix")
     return matrix

@@ -18,14 +18,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Float, Shaped
 
 from capture.input_error import InputError
 from preprocess.body.body_pose import DIAGONAL_FOCAL, Motion, PoseSpace
-from preprocess.body.kinematics import stack_axis_angles
 from preprocess.file_content import explain_damage
 from preprocess.frame_association import frame_numbers_from_names
-from preprocess.poses.motion_builder import MotionByPerson
+from preprocess.poses.motion_builder import MotionByPerson, build_motion
 from preprocess.tracking.keypoints import KEYPOINT_SHAPES, KeypointTrack
 
 POSE_KEY_LAYOUTS = (
@@ -96,32 +95,29 @@ def _motion(arrays: Arrays) -> Motion:
     if layout is None:
         expected = "; or ".join(" and ".join(keys) for keys in POSE_KEY_LAYOUTS)
         raise ValueError(f"it holds {', '.join(sorted(arrays)) or 'nothing'}; expected {expected}.")
-    rows = [_rows(arrays, key, arrays[layout[-1]]) for key in layout]
-    translations = rows.pop().reshape(len(rows[0]), -1)
-    count = len(translations)
-    try:
-        poses = stack_axis_angles(rows).reshape(count, 72)
-    except ValueError as cause:
-        raise ValueError(
-            f"{' + '.join(layout[:-1])} have {', '.join(str(r.shape) for r in rows)} numbers "
-            f"({cause}); expected axis-angles (N, 72), SMPL's root and 23 joints, or rotation "
-            "matrices."
-        ) from cause
-    if translations.shape != (count, 3):
-        raise ValueError(f"`{layout[-1]}` has {translations.shape}; expected (N, 3) metres.")
-    times = _per_row(arrays, "time", count)
-    return Motion(
-        root_rotations=poses[:, :3],
-        root_translations=translations,
-        joint_rotations=poses[:, 3:].reshape(count, 23, 3),
-        valid=_valid(arrays, np.column_stack([poses, translations]), times),
-        betas=_betas(arrays),
-        body_model=str(arrays["model"]) if "model" in arrays else "smpl",
-        frames=_frame_numbers(arrays, count),
-        times_s=times,
-        intrinsic=_intrinsic(arrays),
-        camera_from_world=_cameras(arrays, count),
-        space=_space(arrays),
+    *rotations, translations = (_rows(arrays, key) for key in layout)
+    count, frames, times_s = len(translations), None, _per_row(arrays, "time", len(translations))
+    order = np.arange(count)
+    if "frame" in arrays:
+        frames = _per_row(arrays, "frame", count)
+        order = np.argsort(frames, kind="stable")
+        if len(np.unique(frames)) < count:
+            raise ValueError("`frame` names a frame twice; expected one person's poses.")
+    marked = _per_row(arrays, "valid", count)
+    lost = np.zeros(count, dtype=bool) if marked is None else ~(marked > 0)
+    for part in (*rotations, translations, times_s):
+        if part is not None:
+            lost |= ~(np.abs(part.reshape(count, -1)) < MAX_MAGNITUDE).all(axis=1)
+    motion = build_motion(
+        rotations, translations, frames=frames, times_s=times_s, lost=lost,
+        betas=_read_numbers(arrays, "betas") if "betas" in arrays else None,
+        body_model=str(arrays.get("model", "smpl")), space=_space(arrays),
+        lens=_read_numbers(arrays, "K") if "K" in arrays else None,
+    )  # fmt: skip
+    cameras = _cameras(arrays, count)
+    return replace(
+        motion,
+        camera_from_world=None if cameras is None else cameras[order],
         proportions=_proportions(arrays),
         keypoints=KeypointTrack.from_arrays(arrays),
         program=str(arrays["program"]) if "program" in arrays else None,
@@ -165,18 +161,10 @@ def _read_numbers(arrays: Arrays, key: str) -> Float[np.ndarray, "..."]:
     return arrays[key].astype(np.float64)
 
 
-def _rows(
-    arrays: Arrays, key: str, translations: Shaped[np.ndarray, "..."]
-) -> Float[np.ndarray, "poses *numbers"]:
+def _rows(arrays: Arrays, key: str) -> Float[np.ndarray, "poses *numbers"]:
     rows = _read_numbers(arrays, key)
     if rows.ndim < 2 or not rows.size:
         raise ValueError(f"`{key}` has the shape {rows.shape}; expected one row a pose.")
-    count = len(np.atleast_1d(translations))
-    if len(rows) != count:
-        raise ValueError(
-            f"it holds {len(rows)} rows of `{key}` but {count} translations; expected one of each "
-            "per pose."
-        )
     return rows
 
 
@@ -190,31 +178,6 @@ def _per_row(arrays: Arrays, key: str, count: int) -> Float[np.ndarray, "poses"]
     return numbers
 
 
-def _valid(
-    arrays: Arrays, numbers: Float[np.ndarray, "poses 75"], times: Float[np.ndarray, "poses"] | None
-) -> Bool[np.ndarray, "poses"]:
-    """Rows that are finite, of a size that angles and places have, and not marked as lost."""
-    valid = np.asarray((np.abs(np.nan_to_num(numbers, nan=np.inf)) < MAX_MAGNITUDE).all(axis=1))
-    marked = _per_row(arrays, "valid", len(valid))
-    if marked is not None:
-        valid &= marked > 0
-    return valid if times is None else valid & np.isfinite(times)
-
-
-def _betas(arrays: Arrays) -> Float[np.ndarray, "betas"]:
-    """One shape for the whole motion: the mean, where each row has its own."""
-    if "betas" not in arrays:
-        return np.zeros(0)
-    betas = _read_numbers(arrays, "betas")
-    if betas.ndim > 2:
-        raise ValueError(f"`betas` have the shape {betas.shape}; expected (10,) or (1, 10).")
-    rows = np.atleast_2d(betas)
-    rows = rows[np.isfinite(rows).all(axis=1)]
-    if not len(rows):
-        raise ValueError("`betas` are NaN; a shape of finite numbers was expected.")
-    return rows.mean(axis=0)
-
-
 def _proportions(arrays: Arrays) -> Float[np.ndarray, "coefficients"] | None:
     if "proportions" not in arrays:
         return None
@@ -222,30 +185,6 @@ def _proportions(arrays: Arrays) -> Float[np.ndarray, "coefficients"] | None:
     if proportions.ndim != 1 or not (np.abs(proportions) < MAX_PROPORTION).all():
         raise ValueError("`proportions` are no coefficients; expected finite numbers.")
     return proportions
-
-
-def _frame_numbers(arrays: Arrays, count: int) -> Int[np.ndarray, "poses"] | None:
-    numbers = _per_row(arrays, "frame", count)
-    if numbers is None:
-        return None
-    if not np.isfinite(numbers).all() or (numbers != np.round(numbers)).any():
-        raise ValueError("`frame` holds numbers that are no frame numbers.")
-    frames = numbers.astype(np.int64)
-    if len(np.unique(frames)) < count:
-        raise ValueError("`frame` names a frame twice; expected one person's poses.")
-    return frames
-
-
-def _intrinsic(arrays: Arrays) -> Float[np.ndarray, "3 3"] | None:
-    """The tracker's K; the median, where each row has its own."""
-    if "K" not in arrays:
-        return None
-    intrinsic = _read_numbers(arrays, "K")
-    if intrinsic.ndim == 3:
-        intrinsic = np.nanmedian(intrinsic, axis=0)
-    if intrinsic.shape != (3, 3) or not np.isfinite(intrinsic).all() or intrinsic[0, 0] <= 0.0:
-        raise ValueError("`K` is no camera matrix; expected finite (3, 3) pixels.")
-    return intrinsic
 
 
 def _space(arrays: Arrays) -> PoseSpace:
