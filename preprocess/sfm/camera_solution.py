@@ -102,6 +102,14 @@ class QualityGate:
     passed: bool
     failure_reason: str
 
+    @classmethod
+    def at_least(cls, name: str, value: float, bound: float, failure_reason: str) -> "QualityGate":
+        """A figure that passes from its bound on."""
+        return cls(
+            name=name, value=value, bound=bound, passed=bool(value >= bound),
+            failure_reason=failure_reason,
+        )  # fmt: skip
+
     def describe_failure(self) -> str:
         """Say why it has not passed, and by which figure."""
         if not np.isfinite(self.value):
@@ -192,18 +200,22 @@ def evaluate_gates(model: SparseModel, keys: int) -> list[QualityGate]:
     residual = float(np.mean(model.reprojection_errors_px())) if len(model.pixels) else np.inf
     focal = model.focal_px / max(model.size_px)
     largest = MAX_TURNING_ERROR * max(model.size_px) if model.only_turns else MAX_REPROJECTION_PX
-    angle = model.turn_deg() if model.only_turns else _median_angle(model)
+    if model.only_turns:
+        turn = model.turn_deg()
+        reason = f"the camera turns by {turn:.1f}° only, which tells no focal length"
+        depth = QualityGate.at_least("turn_deg", turn, MIN_TURN_DEG, reason)
+    else:
+        angle = _median_angle(model)
+        reason = f"the camera hardly changes its place (points are seen under {angle:.1f}°)"
+        depth = QualityGate.at_least("angle_deg", angle, MIN_TRIANGULATION_ANGLE_DEG, reason)
     return [
-        QualityGate(
-            name="registered", value=registered, bound=MIN_REGISTERED_FRACTION,
-            passed=registered >= MIN_REGISTERED_FRACTION,
-            failure_reason=f"only {len(model.frames)} of {keys} key frames could be placed with "
-            "certainty",
+        QualityGate.at_least(
+            "registered", registered, MIN_REGISTERED_FRACTION,
+            f"only {len(model.frames)} of {keys} key frames could be placed with certainty",
         ),
-        QualityGate(
-            name="points", value=float(len(model.points)), bound=float(MIN_SPARSE_POINTS),
-            passed=len(model.points) >= MIN_SPARSE_POINTS,
-            failure_reason=f"only {len(model.points)} points of the surroundings were found",
+        QualityGate.at_least(
+            "points", float(len(model.points)), float(MIN_SPARSE_POINTS),
+            f"only {len(model.points)} points of the surroundings were found",
         ),
         QualityGate(
             name="reprojection_px", value=residual, bound=largest, passed=residual < largest,
@@ -214,17 +226,7 @@ def evaluate_gates(model: SparseModel, keys: int) -> list[QualityGate]:
             passed=FOCAL_RANGE[0] <= focal <= FOCAL_RANGE[1],
             failure_reason=f"the focal length came out as {focal:.2f} times the longer side",
         ),
-        QualityGate(
-            name="turn_deg", value=angle, bound=MIN_TURN_DEG, passed=angle >= MIN_TURN_DEG,
-            failure_reason=f"the camera turns by {angle:.1f}° only, which tells no focal length",
-        )
-        if model.only_turns
-        else QualityGate(
-            name="angle_deg", value=angle, bound=MIN_TRIANGULATION_ANGLE_DEG,
-            passed=angle >= MIN_TRIANGULATION_ANGLE_DEG,
-            failure_reason="the camera hardly changes its place (points are seen under "
-            f"{angle:.1f}°)",
-        ),
+        depth,
     ]  # fmt: skip
 
 

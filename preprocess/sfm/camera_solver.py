@@ -47,12 +47,14 @@ from preprocess.sfm.colmap_mapping import (
 )
 from preprocess.sfm.metric_world import MetricPlacement, place_in_metric_world, solution_report
 from preprocess.sfm.point_tracking import (
-    MAX_STATIC_MOTION,
     ResectionResult,
-    measure_background_motion,
     resect_intermediate_frames,
 )
-from preprocess.sfm.turning_camera import solve_turning_camera
+from preprocess.sfm.turning_camera import (
+    MAX_STATIC_MOTION,
+    measure_background_motion,
+    solve_turning_camera,
+)
 
 MIN_PARALLAX_FRACTION = 0.02
 """Fraction of matched image pairs that must show parallax, not one plane or a mere rotation."""
@@ -124,7 +126,7 @@ def _solve(
     chosen = select_keyframes(source, person_mask, part(0.0, 0.07), settings.max_keyframes)
     keys = write_keyframes(chosen, folder / "images", folder / "masks")
     background_motion = measure_background_motion(keys)
-    if background_motion <= MAX_STATIC_MOTION:
+    if background_motion <= MAX_STATIC_MOTION:  # not of a background that was lost
         return CameraSolution.static(source, background_motion, len(keys))
     ratio, longer_px = settings.focal_ratio, max(keys[0].gray.shape)
     workspace = ColmapWorkspace(
@@ -174,16 +176,14 @@ def _solve_path(
 def _parallax(workspace: ColmapWorkspace, keys: int) -> QualityGate:
     """The gate of image pairs that show depth."""
     pairs, share = colmap_mapping.parallax_fraction(workspace.database)
-    if pairs < MIN_REGISTERED_FRACTION * (keys - 1):
-        return QualityGate(
-            name="matched_pairs", value=float(pairs), bound=MIN_REGISTERED_FRACTION * (keys - 1),
-            passed=False, failure_reason="the pictures have hardly anything in common",
-        )  # fmt: skip
-    return QualityGate(
-        name="pairs_with_parallax", value=share, bound=MIN_PARALLAX_FRACTION,
-        passed=share >= MIN_PARALLAX_FRACTION,
-        failure_reason="nothing shows depth, as before one flat wall, and the camera does not just "
-        f"turn by {MIN_TURN_DEG:.0f}° or more",
+    least = MIN_REGISTERED_FRACTION * (keys - 1)
+    if pairs < least:
+        reason = "the pictures have hardly anything in common"
+        return QualityGate.at_least("matched_pairs", float(pairs), least, reason)
+    return QualityGate.at_least(
+        "pairs_with_parallax", share, MIN_PARALLAX_FRACTION,
+        "nothing shows depth, as before one flat wall, and the camera does not just turn by "
+        f"{MIN_TURN_DEG:.0f}° or more",
     )  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Points tracked from image to image: they tell a static camera, and place the frames in between.
+"""Points tracked from image to image: they place the frames between key frames.
 
 The tracker is that of Lucas & Kanade 1981, in pyramids (Bouguet 2000). Points that a key frame sees
 are followed into its neighbors, always from the key frame's own image, so that errors do not add
@@ -78,43 +78,6 @@ def _optical_flow(
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )  # fmt: skip
     return there[:, 0].astype(np.float64) + 0.5, status[:, 0] > 0
-
-
-MAX_CORNERS = 400
-"""Most points of the background that are tracked."""
-MIN_TRACKED_FRACTION = 0.3
-"""Fraction of the points that must be tracked for a static camera."""
-MAX_STATIC_MOTION = 0.005
-"""Largest shift of a static background; a fraction of the image's longer side (5 px of 960)."""
-MIN_TRACKED_POINTS = 12
-"""Fewest points that must be tracked for a static camera."""
-COMPARED_KEYFRAMES = 12
-"""Number of key frames that are compared with the first."""
-
-
-def measure_background_motion(keys: list[SfmKeyframe]) -> float:
-    """Largest shift of the background between the first key frame and some others.
-
-    The median over points of the first one's background, as a fraction of the image's longer side;
-    NaN if it was lost. The search ends where the camera cannot be static any more.
-    """
-    first, moved = keys[0], 0.0
-    pixels = detect_corners(first.gray, ~first.person_mask, MAX_CORNERS)
-    if len(pixels) < MIN_TRACKED_POINTS:
-        return float("nan")
-    rows = np.unique(np.linspace(1, len(keys) - 1, COMPARED_KEYFRAMES).round().astype(int))
-    for key in (keys[int(row)] for row in rows):
-        there, found = track_points(first.gray, key.gray, pixels)
-        x, y = np.clip(pixels.astype(int).T, 0, np.array(key.gray.shape[::-1])[:, None] - 1)
-        open_view = ~key.person_mask[y, x]
-        found &= open_view
-        if found.sum() < max(MIN_TRACKED_POINTS, MIN_TRACKED_FRACTION * open_view.sum()):
-            return float("nan")
-        shift = float(np.median(np.linalg.norm(there - pixels, axis=1)[found]))
-        moved = max(moved, shift / max(first.gray.shape))
-        if moved > MAX_STATIC_MOTION:
-            break
-    return moved
 
 
 MIN_PNP_POINTS = 20

@@ -28,6 +28,8 @@ MIN_CORNERS = 20
 """Fewest corners that must be followed from an anchor into another key frame."""
 MIN_PLANE_FRACTION = 0.6
 """Fraction of the corners that must move by one homography; parallax leaves fewer."""
+MAX_STATIC_MOTION = 0.005
+"""Largest shift of a static background; a fraction of the image's longer side (5 px of 960)."""
 FOCAL_RATIOS = np.geomspace(0.4, 2.5, 60)
 """Focal lengths that are tried first, as fractions of the image's longer side."""
 ITERATIONS = 10
@@ -65,7 +67,7 @@ def solve_turning_camera(
 
     The points of the model are directions. A stated focal length is used if it fits.
     """
-    tracks = _follow_corners(keys)
+    tracks = _follow_corners(keys, range(0, len(keys), -(-len(keys) // MAX_ANCHORS)))
     turns = _initial_turns(tracks, len(keys), max(keys[0].gray.shape))
     if turns is None:
         return None
@@ -77,10 +79,22 @@ def solve_turning_camera(
     return _to_model(turns, tracks, keys)
 
 
-def _follow_corners(keys: list[SfmKeyframe]) -> list[_Track]:
-    """Follow the background's corners of all anchors forwards and backwards until they are lost."""
+def measure_background_motion(keys: list[SfmKeyframe]) -> float:
+    """Largest shift of the background from the first key frame to another.
+
+    The median over its corners, as a fraction of the image's longer side; NaN if it was lost.
+    """
+    tracks = _follow_corners(keys, range(1))
+    if len(tracks) < len(keys) - 1:
+        return float("nan")
+    moved = (np.median(np.linalg.norm(each.end - each.start, axis=1)) for each in tracks)
+    return float(max(moved)) / max(keys[0].gray.shape)
+
+
+def _follow_corners(keys: list[SfmKeyframe], anchors: range) -> list[_Track]:
+    """Follow the background's corners of anchors forwards and backwards until they are lost."""
     tracks, middle = [], 0.5 * np.array(keys[0].gray.shape[::-1])
-    for anchor in range(0, len(keys), -(-len(keys) // MAX_ANCHORS)):
+    for anchor in anchors:
         start = keys[anchor]
         corners = detect_corners(start.gray, ~start.person_mask, MAX_CORNERS)
         for views in (range(anchor + 1, len(keys)), range(anchor - 1, -1, -1)):

@@ -10,13 +10,12 @@ from scipy.spatial.transform import Rotation
 from capture.source_opening import open_source
 from preprocess.sfm.colmap_mapping import SfmKeyframe
 from preprocess.sfm.point_tracking import (
-    MAX_STATIC_MOTION,
     detect_corners,
-    measure_background_motion,
     resect_camera,
     resect_intermediate_frames,
     track_points,
 )
+from preprocess.sfm.turning_camera import MAX_STATIC_MOTION, measure_background_motion
 
 
 def apart(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
