@@ -7,7 +7,6 @@ later pose is fitted to its key points and its mask together with those of the f
 once more when more frames have come after it.
 """
 
-import bisect
 import threading
 import time
 from collections import deque
@@ -23,6 +22,7 @@ from capture.camera import Camera
 from capture.inbox import Inbox
 from capture.input_error import InputError
 from capture.source import Frame, FrameSource, WrappedSource
+from preprocess.alignment.silhouette_objective import spaced_indices
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.cameras.camera_file import CameraTrack
@@ -64,48 +64,39 @@ FoundPerson = tuple[Frame, PersonKeypoints | None]
 
 @final
 class SkippedFrames:
-    """Frames that were not tracked in time; of too many those stay that fill the largest gaps."""
+    """Frames that were not tracked in time; where memory is used up, every second one is kept."""
 
     def __init__(self) -> None:
         """Keep nothing yet."""
-        self._kept: dict[float, Frame] = {}
-        self._times_s: list[float] = []  # of tracked frames and those that are kept, sorted
+        self._kept: list[Frame] = []
+        self._tracked_s: list[float] = []
+        self._count, self._stride = 0, 1
         self._lock = threading.Lock()
 
     def add(self, frame: Frame) -> None:
-        """Keep a frame, and let go of another one if memory is used up."""
-        self.mark(frame.time_s)
+        """Keep a frame, unless memory is used up and the one before it was kept."""
         with self._lock:
-            self._kept[frame.time_s] = frame
+            if self._count % self._stride == 0:
+                self._kept.append(frame)
+            self._count += 1
             if len(self._kept) * frame.rgb.nbytes > KEPT_BYTES:
-                self._take(min(self._kept, key=self._gap_s))
+                self._kept, self._stride = self._kept[::2], 2 * self._stride
 
     def mark(self, time_s: float) -> None:
         """Take note of a tracked frame's time."""
         with self._lock:
-            bisect.insort(self._times_s, time_s)
+            self._tracked_s.append(time_s)
 
     def take(self, count: int) -> list[Frame]:
-        """Take the frames that leave the smallest gaps, in order; none near a tracked one."""
+        """Take evenly spread frames, in order; none near a tracked one, or near each other."""
         with self._lock:
-            while self._kept:
-                densest = min(self._kept, key=self._gap_s)
-                if len(self._kept) <= count and self._gap_s(densest) >= 2.0 * MIN_INTERVAL_S:
-                    break
-                self._take(densest)
-            kept, self._kept = self._kept, {}
-        return [kept[time_s] for time_s in sorted(kept)]
-
-    def _gap_s(self, time_s: float) -> float:
-        """Time between the neighbors of a frame that is kept, seconds."""
-        place = bisect.bisect_left(self._times_s, time_s)
-        before = self._times_s[place - 1] if place else -np.inf
-        after = self._times_s[place + 1] if place + 1 < len(self._times_s) else np.inf
-        return after - before
-
-    def _take(self, time_s: float) -> None:
-        del self._kept[time_s]
-        self._times_s.remove(time_s)
+            kept, self._kept = self._kept, []
+        apart, times_s = list[Frame](), np.array([*self._tracked_s, -np.inf])
+        for frame in kept:
+            if np.abs(times_s - frame.time_s).min() >= MIN_INTERVAL_S:
+                apart.append(frame)
+                times_s[-1] = frame.time_s
+        return [apart[place] for place in spaced_indices(len(apart), count)]
 
 
 @final

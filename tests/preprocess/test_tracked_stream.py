@@ -221,7 +221,7 @@ def test_no_skipped_frame_is_kept_once_enough_are_tracked(standing, monkeypatch)
 
 @given(st.lists(st.booleans(), min_size=1, max_size=120), st.integers(1, 30))
 @settings(max_examples=30, deadline=None)
-def test_skipped_frames_are_taken_where_gaps_are_largest(tracked, count):
+def test_skipped_frames_that_are_taken_make_no_gap_larger(tracked, count):
     skipped = SkippedFrames()
     picture = np.zeros((1, 1, 3), np.uint8)
     for number, is_tracked in enumerate(tracked):
@@ -246,8 +246,8 @@ def test_skipped_frames_keep_to_their_memory(monkeypatch):
     for number in range(200):
         skipped.add(Frame(index=number, time_s=number / 5.0, rgb=picture))
     taken = [frame.index for frame in skipped.take(100)]
-    assert len(taken) == 10
-    assert np.diff(taken).max() < 80
+    assert 5 <= len(taken) <= 10
+    assert np.diff([*taken, 200]).max() <= 40
 
 
 def test_of_a_fast_camera_every_second_frame_is_taken(standing):
