@@ -47,50 +47,6 @@ def resolve_pose_path(path: Path) -> Path:
     return _first_existing([path], POSE_FILE_NAMES) or path
 
 
-def find_capture_paths(
-    video: Path,
-    poses: Path | None = None,
-    masks: Path | None = None,
-    cameras: Path | str | None = None,
-) -> CapturePaths:
-    """Find the parts that the user did not name.
-
-    For a folder, everything defaults to the files in it. For a file (and a folder that is named
-    `images`), masks and cameras are looked for beside it, then beside the poses.
-
-    Args:
-        video: Video file, folder of images, or native capture folder.
-        poses: Pose file; needed unless `video` is a folder that holds one of `POSE_FILE_NAMES`.
-        cameras: Camera file; "static" for a static camera without a description; "solve" for a
-            moving one, for which no file is looked for either.
-    """
-    if str(cameras) == "solve":  # nothing lies anywhere: until then each frame has its own camera
-        cameras = "static"
-    named = [Path(p) for p in (video, poses, masks) if p is not None]
-    if cameras is not None and str(cameras) != "static":
-        named.append(Path(cameras))
-    for path in named:
-        if not path.exists():
-            raise InputError(f"{path} does not exist; check the path.")
-    if poses is None:
-        poses = find_own_poses(video)
-    if poses is None:
-        other = _first_existing([video.parent], POSE_FILE_NAMES)
-        hint = "" if other is None else f" {other} lies beside it: is it meant?"
-        raise InputError(
-            f"No poses for {video}: give --poses FILE (an .npz in InstantAvatar's keys, or what a "
-            f"tracker wrote: docs/formats.md).{hint} ia-track finds poses in a video."
-        )
-    if cameras is None:
-        cameras = find_own_cameras(video, poses)
-    return CapturePaths(
-        video=video,
-        poses=poses,
-        masks=masks or find_own_masks(video, poses),
-        cameras=None if cameras is None or str(cameras) == "static" else Path(cameras),
-    )
-
-
 def find_own_poses(video: Path) -> Path | None:
     """The poses in a capture folder; None if there are none, or `video` is no folder."""
     return _first_existing([video], POSE_FILE_NAMES)
@@ -101,19 +57,15 @@ def find_own_masks(video: Path, poses: Path | None = None) -> Path | None:
     return _first_existing(_search_folders(video, poses), MASK_NAMES)
 
 
-def find_own_cameras(video: Path, poses: Path | None = None) -> Path | None:
-    """The cameras in a capture folder, beside a video, or beside its poses; None without any."""
-    return _first_existing(_search_folders(video, poses), CAMERA_NAMES)
-
-
-def find_stream_cameras(video: Path, named: str | None) -> Path | None:
-    """The cameras of a video or a live source without poses; None without any.
+def find_cameras(video: Path, named: str | None, poses: Path | None = None) -> Path | None:
+    """The cameras that are named, or those in a capture folder, beside a video or its poses.
 
     `named` is the value of --cameras: a file, "static" or "solve" (nothing is known yet), or None.
     """
     if named in ("static", "solve"):
         return None
-    return find_own_cameras(video) if named is None else Path(named)
+    folders = _search_folders(video, poses)
+    return _first_existing(folders, CAMERA_NAMES) if named is None else Path(named)
 
 
 def _search_folders(video: Path, poses: Path | None) -> list[Path]:
@@ -145,7 +97,7 @@ class InputKind(Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureInputs:
-    """The inputs that the user named; the rest is looked for (see `find_capture_paths`).
+    """The inputs that the user named; the rest is looked for (see `find_paths`).
 
     Attributes:
         video: Video file, folder of images, or capture folder.
@@ -202,9 +154,25 @@ class CaptureInputs:
         return InputKind.STREAMED if self.realtime else InputKind.UNTRACKED
 
     def find_paths(self) -> CapturePaths:
-        """The parts of a recording with poses; an InputError if one is missing."""
+        """The parts of a recording with poses; an InputError if one is missing.
+
+        For a folder, everything defaults to the files in it. For a file (and a folder that is named
+        `images`), masks and cameras are looked for beside it, then beside the poses.
+        """
+        self.check_named()
+        video, poses = self.video, self.poses or find_own_poses(self.video)
+        if poses is None:
+            other = find_own_poses(video.parent)
+            hint = "" if other is None else f" {other} lies beside it: is it meant?"
+            raise InputError(
+                f"No poses for {video}: give --poses FILE (an .npz in InstantAvatar's keys, or "
+                f"what a tracker wrote: docs/formats.md).{hint} ia-track finds poses in a video."
+            )
         named = self.masks if segmenter_name(self.masks) is None else None
-        return find_capture_paths(self.video, self.poses, named, self.cameras)
+        return CapturePaths(
+            video=video, poses=poses, masks=named or find_own_masks(video, poses),
+            cameras=find_cameras(video, self.cameras, poses),
+        )  # fmt: skip
 
     def input_paths(self) -> list[Path]:
         """Paths that no output may touch: those that were named, and those that may be found."""

@@ -25,9 +25,9 @@ from preprocess.cameras.camera_file import (
 from preprocess.capture_inputs import (
     CaptureInputs,
     CapturePaths,
+    find_cameras,
     find_own_masks,
     find_own_poses,
-    find_stream_cameras,
 )
 from preprocess.capture_session import Capture, Provenance
 from preprocess.fitting.coarse_start import start_distances, start_focal_length
@@ -330,7 +330,7 @@ def open_tracked_stream(
         shaped,
         assume_camera(inputs.video, inputs.cameras, tracking.stream),
         fixed_body=avatar_body is not None,
-        stated_focal=find_stream_cameras(inputs.video, inputs.cameras) is not None,
+        stated_focal=find_cameras(inputs.video, inputs.cameras) is not None,
     )
     masks: MaskSource = TrackedMasks(tracking, make_refinement(source.size_px))
     made = Provenance("masks", masks.origin, uncertainty=1.0)

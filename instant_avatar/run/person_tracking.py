@@ -23,8 +23,8 @@ from preprocess.cameras.camera_file import assume_camera
 from preprocess.capture_inputs import (
     CaptureInputs,
     CapturePaths,
+    find_cameras,
     find_own_masks,
-    find_stream_cameras,
 )
 from preprocess.capture_session import Capture
 from preprocess.fitting.capture_fit import CaptureFit
@@ -194,7 +194,7 @@ def _import_poses(
 ) -> ImportedCapture:
     """The recording with poses as a file would hold them."""
     assert inputs.poses is not None
-    cameras = find_stream_cameras(inputs.video, inputs.cameras)
+    cameras = find_cameras(inputs.video, inputs.cameras)
     paths = CapturePaths(
         video=inputs.video, poses=inputs.poses, masks=masks_beside, cameras=cameras
     )

@@ -17,7 +17,7 @@ from preprocess.cameras.camera_formats import (
     read_named_cameras,
 )
 from preprocess.cameras.named_camera import checked_camera, checked_rigid
-from preprocess.capture_inputs import find_stream_cameras
+from preprocess.capture_inputs import find_cameras
 from preprocess.file_content import explain_damage, read_npz
 from preprocess.frame_association import cameras_by_frame, interpolate_missing_cameras
 
@@ -211,9 +211,9 @@ def assume_camera(video: Path, named: str | None, source: FrameSource) -> Camera
     """A camera at the origin: the first one of a file, or a phone's where there is none.
 
     `named` is the value of --cameras; without it cameras are looked for beside the video (see
-    `find_stream_cameras`).
+    `find_cameras`).
     """
-    path = find_stream_cameras(video, named)
+    path = find_cameras(video, named)
     if path is None:
         phone = RelativeFocalLength(ratio=DEFAULT_FOCAL_RATIO).intrinsic_matrix(source.size_px)
         return Camera.from_intrinsic(phone, source.size_px)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from capture.input_error import InputError
-from preprocess.capture_inputs import find_capture_paths
+from preprocess.capture_inputs import CaptureInputs, CapturePaths
 
 
 @pytest.fixture
@@ -23,9 +23,18 @@ def make(tmp_path):
     return make
 
 
+def found_in(video: Path, *named: Path, cameras: str | None = None) -> CapturePaths:
+    """The parts of a capture whose poses, masks and cameras are named in this order."""
+    poses, masks, file = (*named, None, None, None)[:3]
+    inputs = CaptureInputs(
+        video=video, poses=poses, masks=masks, cameras=cameras or (file and str(file))
+    )
+    return inputs.find_paths()
+
+
 def test_a_folder_holds_everything(make):
     root = make("video.mp4", "poses.npz", "masks", "cameras.npz")
-    found = find_capture_paths(root)
+    found = found_in(root)
     assert found.video == root
     assert found.poses == root / "poses.npz"
     assert found.masks == root / "masks"
@@ -34,34 +43,34 @@ def test_a_folder_holds_everything(make):
 
 def test_beside_a_video_comes_before_beside_its_poses(make):
     root = make("a/v.mp4", "a/masks", "b/poses.npz", "b/masks", "b/cameras.npz")
-    found = find_capture_paths(root / "a/v.mp4", root / "b/poses.npz")
+    found = found_in(root / "a/v.mp4", root / "b/poses.npz")
     assert found.masks == root / "a/masks"
     assert found.cameras == root / "b/cameras.npz"
 
 
 def test_beside_a_folder_named_images_counts_too(make):
     root = make("images", "poses.npz", "masks.npz")
-    assert find_capture_paths(root / "images", root / "poses.npz").masks == root / "masks.npz"
+    assert found_in(root / "images", root / "poses.npz").masks == root / "masks.npz"
 
 
 def test_a_folder_does_not_take_its_neighbours_things(make):
     root = make("one/video.mp4", "one/poses.npz", "masks", "cameras.npz")
-    found = find_capture_paths(root / "one")
+    found = found_in(root / "one")
     assert found.masks is None
     assert found.cameras is None
 
 
 def test_what_is_named_wins(make):
     root = make("v.mp4", "p.npz", "masks", "other", "cameras.npz", "c.npz")
-    found = find_capture_paths(root / "v.mp4", root / "p.npz", root / "other", root / "c.npz")
+    found = found_in(root / "v.mp4", root / "p.npz", root / "other", root / "c.npz")
     assert (found.masks, found.cameras) == (root / "other", root / "c.npz")
-    assert find_capture_paths(root / "v.mp4", root / "p.npz", cameras="static").cameras is None
+    assert found_in(root / "v.mp4", root / "p.npz", cameras="static").cameras is None
 
 
 def test_a_video_without_poses_is_refused(make):
     root = make("video.mp4", "poses.npz")
     with pytest.raises(InputError, match="--poses"):
-        find_capture_paths(root / "video.mp4")
+        found_in(root / "video.mp4")
 
 
 @pytest.mark.parametrize("missing", ["video", "poses", "masks", "cameras"])
@@ -70,15 +79,15 @@ def test_what_is_named_must_be_there(make, missing):
     (root / f"{missing}.npz").unlink()
     named = [root / f"{name}.npz" for name in ("video", "poses", "masks", "cameras")]
     with pytest.raises(InputError, match=rf"{missing}\.npz does not exist"):
-        find_capture_paths(*named)
+        found_in(*named)
 
 
 def test_cameras_that_are_to_be_solved_are_looked_for_nowhere(make):
     root = make("video.mp4", "poses.npz", "cameras.npz")
-    assert find_capture_paths(root, cameras="solve").cameras is None
+    assert found_in(root, cameras="solve").cameras is None
 
 
 def test_poses_beside_a_video_are_not_taken_but_spoken_of(make):
     root = make("a/v.mp4", "a/poses.npz")
     with pytest.raises(InputError, match=r"give --poses FILE .*poses\.npz lies beside it"):
-        find_capture_paths(root / "a/v.mp4")
+        found_in(root / "a/v.mp4")
