@@ -106,7 +106,6 @@ def read_untrusted_file(path: Path) -> Any:
     """Return a file's content; for a folder a dictionary of its files in natural order, by name."""
     if path.is_dir():
         files = [file for file in path.iterdir() if file.suffix.lower() in POSE_FILE_SUFFIXES]
-        files.sort(key=natural_sort_key)
         if not files:
             raise InputError(
                 f"{path} is a folder without files ({', '.join(sorted(POSE_FILE_SUFFIXES))}); "

@@ -40,6 +40,7 @@ from preprocess.fitting.outlines import OUTLINE_PERSON_PX, OutlineDistances
 from preprocess.fitting.silhouettes import read_silhouettes
 from preprocess.observation import associate_cameras
 from preprocess.tracking.keypoints import MIN_PRESENCE, KeypointTrack, PersonKeypoints
+from preprocess.tracking.video_tracking import MIN_FRAMES
 
 KEY_FRAMES = 50
 """Frames, evenly spread, to whose masks given poses are fitted at first."""
@@ -70,8 +71,6 @@ MIN_ERROR_DECREASE = 0.01
 NOISE_DEG_PER_CM = 1.5
 """Rotation by which the fit changes exact poses, degrees for each cm by which outlines still differ
 after it (1.4, 1.4 and 1.55 on three exact captures; a tracker's, real and simulated: 5 to 8)."""
-MIN_FRAMES = 4
-"""Fewest frames with a usable mask, or with key points, to which a person is fitted."""
 EQUAL_TRACKED_FRAMES = 60
 """Frames in which key points are found if they are expected to count as much as the given poses,
 30 core-ms each. The number is this times the ratio of both's expected weights."""

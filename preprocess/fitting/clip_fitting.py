@@ -23,8 +23,6 @@ from preprocess.fitting.normal_equations import ChainEquations
 from preprocess.fitting.outlines import OutlineDistances, OutlineModel
 from preprocess.tracking.keypoints import KeypointTrack
 
-SIGMA_OUTLINE_PX = 1.0
-"""Standard deviation of an outline's distance, px of the reduced masks."""
 SIGMA_LOG_FOCAL = 0.3
 """Prior standard deviation of the logarithm of the focal length: what files state is often the
 tracker's own guess (with 0.08 a stated one stays 1.25 times too short that is 1.38 times so)."""
@@ -44,7 +42,8 @@ class EvidenceWeights(NamedTuple):
     """Weights of a clip's evidence against its priors.
 
     Attributes:
-        outline_rows: Independent distances along one outline; neighbors on it err alike.
+        outline_rows: Independent distances along one outline, each with a standard deviation of a
+            pixel of the reduced masks; neighbors on it err alike.
         keypoints: Factor of the key points' precision in the image, where an outline tells the
             pose, too.
     """
@@ -226,8 +225,7 @@ class ClipFitter:
             seen = self.model.compare(carried[index], mask, proportions=fitted.proportions)
             if seen is None:
                 continue
-            precision = self.weights.outline_rows / SIGMA_OUTLINE_PX**2
-            weight = seen.weights * (precision / len(seen.weights))
+            weight = seen.weights * (self.weights.outline_rows / len(seen.weights))
             squares += float(weight @ seen.residuals**2)
             total += float(weight.sum())
             zoomed = seen.focal_jacobian + depths[index] * seen.pose_jacobian[:, 74]

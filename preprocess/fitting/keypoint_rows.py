@@ -35,9 +35,8 @@ LEFT_OFFSETS_CM = {
 are mirrored. Measured on synthetic actors; a centimetre apart between them."""
 PIXEL_WEIGHTS = np.array([0.4] + [0.15] * 6 + [0.4] * 2 + [0.15] * 2 + [1.0] * 6 + [0.3] * 6
                          + [1.0] * 6 + [0.6] * 4)  # fmt: skip
-"""Weight of each key point in the image; those of the face and of a hand err alike."""
-SIGMA_KEYPOINT_PX = 1.0
-"""Standard deviation of a key point in the image, px of the reduced masks (1.4 cm)."""
+"""Precision of each key point in the image, 1 / px² of the reduced masks (of 1.4 cm); those of the
+face and of a hand err alike."""
 ROBUST_KEYPOINT_PX = 6.0
 """Distance at which a key point counts a quarter (Geman-McClure), px of the reduced masks."""
 DEPTH_PAIRS = (
@@ -264,7 +263,6 @@ class KeypointModel:
         view[..., 2] = -scale * plane
         robust = 1.0 / (1.0 + (off**2).sum(axis=-1) / ROBUST_KEYPOINT_PX**2) ** 2
         weights = factors[:, None] * PIXEL_WEIGHTS * found.confidence * robust
-        weights /= SIGMA_KEYPOINT_PX**2
         one, other = _PAIRS[:, 0], _PAIRS[:, 1]
         farther = (points[:, other, 2] - points[:, one, 2]) - (
             found.depths_m[:, other] - found.depths_m[:, one]

@@ -22,6 +22,7 @@ from jaxtyping import Float, Shaped
 
 from capture.input_error import InputError
 from preprocess.body.body_pose import DIAGONAL_FOCAL, Motion, PoseSpace
+from preprocess.cameras.named_camera import checked_rigid
 from preprocess.file_content import explain_damage
 from preprocess.frame_association import frame_numbers_from_names
 from preprocess.poses.motion_builder import MotionByPerson, build_motion
@@ -199,15 +200,9 @@ def _cameras(arrays: Arrays, count: int) -> Float[np.ndarray, "poses 4 4"] | Non
     key = next((key for key in CAMERA_KEYS if key in arrays), None)
     if key is None:
         return None
-    cameras = _read_numbers(arrays, key)
-    if cameras.shape not in ((4, 4), (count, 4, 4)) or not np.isfinite(cameras).all():
-        raise ValueError(
-            f"`{key}` has the shape {cameras.shape}; expected finite camera-from-world "
-            f"transforms (4, 4) or ({count}, 4, 4)."
-        )
-    rotations = cameras[..., :3, :3]
-    if np.abs(rotations @ np.swapaxes(rotations, -1, -2) - np.eye(3)).max() > 1e-3:
-        raise ValueError(f"`{key}` is not rigid; expected no scale, OpenCV's axes.")
+    cameras = checked_rigid(_read_numbers(arrays, key))
+    if cameras.shape not in ((4, 4), (count, 4, 4)):
+        raise ValueError(f"`{key}` has the shape {cameras.shape}; expected one, or one a pose.")
     return np.broadcast_to(cameras, (count, 4, 4)).copy()
 
 

@@ -280,13 +280,7 @@ class BlazePoseTracker:
         """The person to follow, of those in the first frame; none if it is not there yet."""
         if self._person is None:
             return sorted(self._detect.find_all(rgb), key=lambda each: -each.square.side)
-        persons: list[PersonDetection] = []
-        for each in self._detect.find_all(rgb, in_parts=True):
-            found = self._find_landmarks(rgb, each.square)
-            if found.keypoints.presence >= MIN_PRESENCE and not any(
-                distance_in_sides(other.square, found.square) < OVERLAPPING for other in persons
-            ):
-                persons.append(replace(each, square=found.square))
+        persons = find_persons(rgb, self._detect, self._find_landmarks)
         from_left = sorted(persons, key=lambda each: each.square.x)
         return from_left[self._person - 1 : self._person]
 
@@ -358,6 +352,20 @@ class BlazePoseTracker:
         if self._company.is_known:
             return distance < self._company.distance(colors)
         return distance < MAX_COLOR_DISTANCE
+
+
+def find_persons(
+    rgb: RgbImage, detect: BlazePoseDetector, find_landmarks: BlazePoseLandmarks
+) -> list[PersonDetection]:
+    """All persons in a frame, each once, in the squares that their key points give."""
+    persons: list[PersonDetection] = []
+    for each in detect.find_all(rgb, in_parts=True):
+        found = find_landmarks(rgb, each.square)
+        if found.keypoints.presence >= MIN_PRESENCE and not any(
+            distance_in_sides(other.square, found.square) < OVERLAPPING for other in persons
+        ):
+            persons.append(replace(each, square=found.square))
+    return persons
 
 
 def distance_in_sides(a: PersonSquare, b: PersonSquare) -> float:

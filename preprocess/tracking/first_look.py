@@ -17,7 +17,7 @@ from jaxtyping import Float, Float32, UInt8
 from capture.source import Frame, FrameSource, RgbImage
 from capture.source_opening import glance
 from preprocess.masks.color_models import DARK_LEVEL, DarkFilmBrightener
-from preprocess.tracking.blazepose import OVERLAPPING, distance_in_sides
+from preprocess.tracking.blazepose import distance_in_sides, find_persons
 from preprocess.tracking.blazepose_networks import (
     BlazePoseDetector,
     BlazePoseLandmarks,
@@ -236,13 +236,8 @@ class PersonFinder:
 
     def persons(self, rgb: RgbImage) -> list[FoundLandmarks]:
         """Find the largest person and others nearly as large, the largest first."""
-        persons: list[FoundLandmarks] = []
-        for detection in self._detect.find_all(rgb, in_parts=True):
-            rough = self._landmarks(rgb, detection.square)
-            if rough.keypoints.presence >= MIN_PRESENCE and not any(
-                distance_in_sides(other.square, rough.square) < OVERLAPPING for other in persons
-            ):
-                persons.append(self._landmarks(rgb, rough.square))
+        squares = [each.square for each in find_persons(rgb, self._detect, self._landmarks)]
+        persons = [self._landmarks(rgb, square) for square in squares]
         persons.sort(key=lambda each: -each.square.side)
         return [
             each

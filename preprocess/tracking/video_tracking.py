@@ -33,7 +33,7 @@ heights. Shoes and fingertips that touch a border are farther: they cut nothing 
 ELSEWHERE = 0.6
 """Distance from the last place, in sides of the square around the person, that is worth a word."""
 MIN_FRAMES = 4
-"""Fewest frames with the person of poses that are good enough for an avatar."""
+"""Fewest frames with the person, or with a usable mask, that an avatar is made of."""
 MIN_FOUND = 8
 """Fewest frames in which the person must be found; 4 of fewer than 16 frames."""
 FRAMES_REFINED_AGAIN = 60
