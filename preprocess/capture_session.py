@@ -11,7 +11,7 @@ from capture.input_error import InputError
 from capture.live_sources import camera_address
 from capture.source import Frame, FrameSource, PacingClock, RealtimePlayback
 from preprocess.alignment.capture_geometry import CaptureGeometry
-from preprocess.body.body_pose import BodyPose, Motion
+from preprocess.body.body_pose import Motion
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.capture_inputs import CapturePaths
@@ -167,10 +167,6 @@ class ObservationSource:
 
     def set_catch_up(self, catch_up: bool) -> None:
         """Deliver frames without delay while a resumed run reads back what it has seen."""
-
-    def take_revised_poses(self) -> dict[int, BodyPose]:
-        """Poses of earlier frames that later ones have improved since the last call."""
-        return {}
 
     def notes(self) -> Iterator[str]:
         """Messages for the user that need the frames to have come."""

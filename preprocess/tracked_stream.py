@@ -2,9 +2,9 @@
 
 Decoding, tracking and fitting run on threads of their own. The tracker takes the newest frame that
 has been decoded, whenever it is free: what it finds is about now, and the frames that came
-meanwhile are skipped. The first frames settle the person's proportions and the focal length. Each
-later pose is fitted to its key points and its mask together with those of the frames around it;
-once more when more frames have come after it.
+meanwhile are skipped. The first frames settle the person's proportions and the focal length. Later
+poses are fitted to key points and masks a few at a time, together with those of the frames around
+them, which therefore wait for a while.
 """
 
 import threading
@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import final
 
-import cv2
 import numpy as np
 from jaxtyping import Float32
 
@@ -29,10 +28,8 @@ from preprocess.cameras.camera_file import CameraTrack
 from preprocess.capture_session import Capture, ObservationSource
 from preprocess.fitting.clip_fitting import SIGMA_LOG_FOCAL, SIGMA_LOG_LIVE_FOCAL
 from preprocess.fitting.tracked_frames import (
-    LAG_FRAMES,
-    EarlierPoses,
-    FramePoseFitter,
     SeenPerson,
+    StreamPoseFitter,
     fit_first_frames,
     reduced_size_px,
 )
@@ -47,7 +44,7 @@ START_FRAMES = 8
 MIN_INTERVAL_S = 0.06
 """Time between two frames that are tracked: more of them teach no more, and their poses would
 jitter, for the frames around a frame would span too short a time."""
-QUEUED_FRAMES = 2
+QUEUED_FRAMES = 8
 """Most tracked frames that wait for the fit of their poses; what is tracked meanwhile is only
 looked at, so that advice goes on while a trainer is being prepared."""
 LOOK_INTERVAL_S = 0.3
@@ -103,9 +100,9 @@ class SkippedFrames:
 class TrackedStream(WrappedSource):
     """A source of frames of which the tracker takes the newest one whenever it is free.
 
-    Where frames are not `skippable`, they wait instead. Frames are handed over `LAG_FRAMES` after
-    they came, so that their poses are fitted together with those of later frames. If fewer than
-    `LEAST_FRAMES` were tracked, some that were skipped follow, from the first on again.
+    Where frames are not `skippable`, they wait instead. Frames are handed over once their poses are
+    fitted. If fewer than `LEAST_FRAMES` were tracked, some that were skipped follow, from the first
+    on again.
 
     Attributes:
         count: Number of frames that came.
@@ -113,8 +110,9 @@ class TrackedStream(WrappedSource):
         search: Finds the person in a frame, on a thread of its own; the second argument tells
             whether the frame has just come.
         on_frame: Called with each frame and what was found, in order.
-        on_end: Called when the last frame has been used, and before frames come from the first on
-            again.
+        on_end: Called after the last frame, and before frames come from the first on again; all
+            are ready then.
+        is_ready: Tells whether a frame may be handed over.
     """
 
     def __init__(self, source: FrameSource) -> None:
@@ -128,6 +126,7 @@ class TrackedStream(WrappedSource):
         self.search: Callable[[Frame, bool], PersonKeypoints | None] = lambda frame, is_new: None
         self.on_frame: Callable[[Frame, PersonKeypoints | None], None] = lambda frame, found: None
         self.on_end: Callable[[], None] = lambda: None
+        self.is_ready: Callable[[Frame], bool] = lambda frame: True
 
     @property
     def waited_s(self) -> float:
@@ -144,17 +143,19 @@ class TrackedStream(WrappedSource):
     def frames(self) -> Iterator[Frame]:
         """The frames that are tracked, once; those that `take_next` took already come first."""
         while True:
-            while len(self._waiting) > LAG_FRAMES:
-                yield self._waiting.popleft()
+            yield from self._take_ready()
             found = self._next_found()
             if found is None or found[0].time_s < self._last_s:
-                while self._waiting:
-                    yield self._waiting.popleft()
                 self.on_end()
+                yield from self._take_ready()
                 self._last_s = -np.inf
             if found is None:
                 return
             self._look(found)
+
+    def _take_ready(self) -> Iterator[Frame]:
+        while self._waiting and self.is_ready(self._waiting[0]):
+            yield self._waiting.popleft()
 
     def _next_found(self) -> FoundPerson | None:
         if self._tracked is None:
@@ -244,9 +245,10 @@ class LiveTracking:
         self.lost: list[int] = []
         self._seen: dict[int, SeenPerson] = {}
         self._mask_px: tuple[int, int] | None = None
-        self._fitter: FramePoseFitter | None = None
-        self._earlier: EarlierPoses | None = None
+        self._poses: dict[int, BodyPose] = {}
+        self._fitter: StreamPoseFitter | None = None
         stream.search, stream.on_frame = self._search, self._fit
+        stream.is_ready = lambda frame: frame.index in self._poses or frame.index not in self._seen
 
     def start(
         self,
@@ -276,10 +278,9 @@ class LiveTracking:
             seen, shaped, camera, fixed=fixed_body,
             sigma_log_focal=SIGMA_LOG_LIVE_FOCAL if stated_focal else SIGMA_LOG_FOCAL,
         )  # fmt: skip
-        self._fitter, self._earlier = FramePoseFitter(person, camera), EarlierPoses(person, camera)
-        self.stream.on_end = self._end_of_pass
+        self._fitter, self.stream.on_end = StreamPoseFitter(person, camera), self._end_of_pass
         for row, each in enumerate(seen):
-            self._fitter.add(each, motion[row])
+            self._poses |= self._fitter.add(each, motion[row])
         source = "focal length fitted to the first frames"
         return motion, person, CameraTrack(cameras=(camera,), source=source)
 
@@ -287,19 +288,8 @@ class LiveTracking:
         """The pose of a frame that was tracked when it was taken, or why it has none; once."""
         if frame.index not in self._seen:
             return NOT_FOUND
-        assert self._fitter is not None
         self.latest = self._seen.pop(frame.index)
-        return self._fitter.pose(frame.index)
-
-    def add_observation(self, observation: Observation) -> None:
-        """Take the latest frame's pose and mask as evidence for those of earlier frames."""
-        assert self._earlier is not None
-        mask = cv2.resize(observation.alpha, self._mask_px, interpolation=cv2.INTER_AREA)
-        self._earlier.add(replace(self.latest, mask=mask), observation.pose)
-
-    def take_revised_poses(self) -> dict[int, BodyPose]:
-        """Poses of earlier frames that were fitted again since the last call, by their numbers."""
-        return {} if self._earlier is None else self._earlier.take()
+        return self._poses.pop(frame.index)
 
     def notes(self) -> Iterator[str]:
         """Messages for the user that need the frames to have come."""
@@ -324,14 +314,12 @@ class LiveTracking:
         return found
 
     def _end_of_pass(self) -> None:
-        """Fit what is left together; the next frame is no neighbor of the last one."""
+        """Fit what is left; the next frame is no neighbor of the last one."""
         assert self._fitter is not None
-        assert self._earlier is not None
-        self._earlier.fit_rest()
-        self._fitter.forget()
+        self._poses |= self._fitter.finish()
 
     def _fit(self, frame: Frame, found: PersonKeypoints | None) -> None:
-        """Fit the pose in a frame once there is a person to fit."""
+        """Add the person in a frame, whose pose is fitted with those of later ones."""
         self.times_s[frame.index] = frame.time_s
         if found is None:
             self.lost.append(frame.index)
@@ -346,7 +334,7 @@ class LiveTracking:
         )
         self._seen[frame.index] = seen
         if self._fitter is not None:
-            self._fitter.add(seen)
+            self._poses |= self._fitter.add(seen)
 
 
 @final
@@ -379,16 +367,9 @@ class TrackedObservations(ObservationSource):
 
     def join(self, frame: Frame) -> Observation | DroppedFrame:
         """Join the next frame with its pose and mask."""
-        item = join_frame(
+        return join_frame(
             frame, self._tracking.pose_of, lambda index: self._camera, self.capture.masks
         )
-        if isinstance(item, Observation):
-            self._tracking.add_observation(item)
-        return item
-
-    def take_revised_poses(self) -> dict[int, BodyPose]:
-        """Poses that were fitted again since the last call."""
-        return self._tracking.take_revised_poses()
 
     def notes(self) -> Iterator[str]:
         """What tracking and masks have to say."""

@@ -180,20 +180,6 @@ class PoseOptimizer:
         self._update_bones(slot)
         self._joints_at_solve[slot] = self._joints.places[slot]
 
-    def replace_pose(self, slot: int, pose: BodyPose, *, frame: int, step: int) -> bool:
-        """Assigns a better pose of its tracker to a slot's frame, without a correction.
-
-        Returns True if that is too far from the one before for the roots to follow: the caller is
-        expected to solve the correspondences again then.
-        """
-        before = np.stack([self._joints.places[slot], self._joints_at_solve[slot]])
-        self.set_pose(slot, pose, frame=frame, step=step)
-        moved = np.linalg.norm(self._joints.places[slot] - before, axis=2).max(axis=1)
-        if (moved > (MAX_JOINT_STEP_M, RESOLVE_DISTANCE_M)).any():
-            return True
-        self._joints_at_solve[slot] = before[1]
-        return False
-
     def pose(self, slot: int) -> BodyPose:
         """The corrected pose."""
         given = self._tracker_poses[slot]

@@ -10,14 +10,13 @@ from typing import NamedTuple, final
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float32, UInt8
 from torch import Tensor
 
 from avatar.correspondence_grid import CORRESPONDENCE_CELL_M, CorrespondenceGrid
 from avatar.kernels.numba_drawing import SIGHT_SPACING_PX, draw_rays
 from avatar.kernels.operands import CorrespondenceTables, RayBatch
-from avatar.rig import Rig
-from avatar.training.frame_stream import TrainingFrame, camera_in_body, view_descriptor
+from avatar.training.frame_stream import TrainingFrame, view_descriptor
 from avatar.training.pose_optimizer import RootCorrection
 from avatar.training.training_pixels import RayView, TrainingPixels
 from capture.camera import Camera
@@ -111,7 +110,11 @@ class ReplayBuffer:
             self.frame_indices[slot] = frame.index
         head_view = frame.head and frame.head.view
         self._poses_and_views[slot] = frame.pose, frame.view, head_view
-        self._update_distances(slot, view_descriptor(frame.origin, frame.pose))
+        held, descriptor = len(self), view_descriptor(frame.origin, frame.pose)
+        self._descriptors[slot] = descriptor
+        gap = np.linalg.norm(self._descriptors[:held] - descriptor, axis=1)
+        gap[slot] = np.inf
+        self._descriptor_distances[slot, :held] = self._descriptor_distances[:held, slot] = gap
         self._store_frame(slot, frame)
         return slot
 
@@ -143,14 +146,6 @@ class ReplayBuffer:
         self._roots = self._store_rows(self._roots, slot, correspondences.roots)
         self._low[slot] = torch.from_numpy(correspondences.low)
         self._shape[slot] = torch.tensor(correspondences.packed_cells.shape, dtype=torch.int32)
-
-    def set_pose(self, slot: int, pose: BodyPose, rig: Rig) -> None:
-        """Gives a slot's frame another pose; `set_correspondences` and `correct_root` follow."""
-        _, view, head_view = self._poses_and_views[slot]
-        self._poses_and_views[slot] = pose, view, head_view
-        origin, self._body_from_camera[slot] = camera_in_body(view.camera, pose, rig)
-        self._given_origins[slot] = origin
-        self._update_distances(slot, view_descriptor(origin, pose))
 
     def correct_root(self, slot: int, correction: RootCorrection) -> None:
         """Lets a slot's rays follow its corrected root."""
@@ -212,13 +207,6 @@ class ReplayBuffer:
             store = wider
         store[row, :needed] = torch.from_numpy(values)
         return store
-
-    def _update_distances(self, slot: int, descriptor: Float[np.ndarray, " 72"]) -> None:
-        held = len(self)
-        self._descriptors[slot] = descriptor
-        gap = np.linalg.norm(self._descriptors[:held] - descriptor, axis=1)
-        gap[slot] = np.inf
-        self._descriptor_distances[slot, :held] = self._descriptor_distances[:held, slot] = gap
 
     def _most_redundant_slot(self) -> int:
         """The slot, of the two most similar frames', that is closer to a third."""

@@ -334,7 +334,7 @@ class _EvaluationSchedule:
         """The frame's sample, which later evaluations find again; bounded in number."""
         index = frame.observation.frame.index
         kept = self._samples.pop(index, None)
-        if kept is None or kept.frame is not frame:  # its pose was revised
+        if kept is None:
             while len(self._samples) >= 2 * FRAMES_PER_EVALUATION:
                 del self._samples[next(iter(self._samples))]
             kept = PixelSample.of(frame).with_correspondences(self._trainer.avatar.rig)

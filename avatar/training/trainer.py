@@ -36,7 +36,6 @@ from avatar.training.training_step import (
     compute_gradients,
 )
 from avatar.training.unseen_skin import UnseenSkin
-from preprocess.body.body_pose import BodyPose
 
 EMA_HORIZON_STEPS = 250
 """Steps that the mean averages over; a longer horizon shows new content later."""
@@ -188,16 +187,6 @@ class Trainer:
         if not is_restored:
             self._discard_old_corrections()
         return slot
-
-    def revise_pose(self, frame: int, pose: BodyPose) -> None:
-        """Gives a frame that replay holds a better pose of its tracker, without a correction."""
-        self.pose_corrections.pop(frame, None)
-        if frame not in self.replay.frame_indices:
-            return
-        slot, rig = self.replay.frame_indices.index(frame), self.avatar.rig
-        self.replay.set_pose(slot, pose, rig)
-        far = self.poses.replace_pose(slot, pose, frame=frame, step=self.steps)
-        move_correspondences(self.replay, self.poses, slot, far=far)
 
     @contextmanager
     def paused(self) -> Iterator[None]:

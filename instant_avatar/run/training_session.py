@@ -55,13 +55,9 @@ from instant_avatar.run.session_events import (
 )
 from instant_avatar.run.snapshot_writer import CheckpointWriter, validation_views, write_packages
 from instant_avatar.run.stream_meter import StreamMeter
-from preprocess.body.body_pose import BodyPose
 from preprocess.capture_session import ObservationSource
 from preprocess.licence_chain import licence_chain
 from preprocess.observation import Observation
-
-REVISED_PER_STEP = 2
-"""Frames whose poses are replaced between two steps; each solves its correspondences again."""
 
 
 @final
@@ -97,7 +93,6 @@ class TrainingSession:
         ]
         self.held_out: list[HeldOutFrame] = []
         self.newest_observation: Observation | None = None
-        self._revised_poses: dict[int, BodyPose] = {}
         self._checkpoints = CheckpointWriter(run, observations.capture)
         self.meter = StreamMeter(stop, observations.frames)
         self.coverage = Coverage(observations.capture.shaped)
@@ -106,7 +101,6 @@ class TrainingSession:
         self.is_interrupted = False
         self._result: TrainingResult | None = None
         self._ready_at: float | None = None
-        self._is_drafted = False
         self._report_progress: Callable[[str, float], object] = lambda *_: None
 
     def run(
@@ -164,7 +158,6 @@ class TrainingSession:
             self._checkpoints.restart_interval()
             for event in train(self.trainer, inbox, self.held_out):
                 yield from self._handle_event(event, inbox)
-                self._revise_poses()
                 if self.stop.is_set():
                     break
         finally:
@@ -299,22 +292,6 @@ class TrainingSession:
                     seen += 1
         return seen
 
-    def _revise_poses(self) -> None:
-        """Bring along the poses of earlier frames that a stream's later frames have improved."""
-        found = self._source.take_revised_poses()
-        for place, frame in enumerate(self.held_out):
-            pose = found.get(frame.observation.frame.index)
-            if pose is not None:
-                self.held_out[place] = replace(
-                    frame, observation=replace(frame.observation, pose=pose)
-                )
-        self._revised_poses |= found
-        if self._is_waited_for():  # after the draft
-            return
-        for _ in range(min(REVISED_PER_STEP, len(self._revised_poses))):
-            number = next(iter(self._revised_poses))
-            self.trainer.revise_pose(number, self._revised_poses.pop(number))
-
     def _handle_event(self, event: TrainEvent, inbox: Inbox[StreamItem]) -> Iterator[SessionEvent]:
         """Keep count of an event, and pass it on with what follows from it."""
         match event:
@@ -332,14 +309,8 @@ class TrainingSession:
                 yield from self._write_draft()
         yield event
 
-    def _is_waited_for(self) -> bool:
-        """Whether a user waits for the draft of a film whose last frame has come."""
-        source = self._frames
-        return self.meter.grows and source.paced and source.all_came and not self._is_drafted
-
     def _write_draft(self) -> Iterator[Playable]:
         """Write a package to be played until a checked one replaces it, unless it is empty."""
-        self._is_drafted = True
         view = validation_views(self.held_out, self._capture)[0]
         with self.trainer.paused(), suppress(ExportRefused):
             write_draft(self.trainer.avatar, self._run.package, view)

@@ -1,13 +1,10 @@
-"""Fits the poses of a stream's frames one by one, to the key points and the mask of each.
+"""Fits the poses of a stream's frames to the key points and the mask of each.
 
-The first frames settle proportions and focal length, which stay; each later pose is fitted together
-with those of the last few frames, so that it moves as people do. Earlier poses are fitted once more
-with the frames that came after them.
+The first frames settle proportions and focal length, which stay; later poses are fitted a few at a
+time, together with those of the frames before and after them, so that they move as people do.
 """
 
-from collections import deque
-from collections.abc import Collection, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import final
 
@@ -34,20 +31,13 @@ from preprocess.observation import shrink_to_longer_side
 from preprocess.tracking.keypoints import KeypointTrack, PersonKeypoints
 from preprocess.tracking.pose_lift import lift_keypoints
 
-WINDOW_FRAMES = 10
-"""Frames whose poses are fitted together while a stream runs."""
-LAG_FRAMES = 4
-"""Later frames that a frame's pose waits for: without any, poses jitter three times as much."""
+CHUNK_FRAMES = 8
+"""Frames whose poses are fitted at once, together with as many before and after them: without later
+ones, poses jitter three times as much."""
 FIRST_ITERATIONS = (5, 5)
 """Iterations over the first frames, with key points alone and then with outlines."""
-FRAME_ITERATIONS = (1, 1)
-"""Iterations for each later frame, with key points alone and then with outlines."""
-REVISED_FRAMES = 32
-"""New frames after which the poses of all of them are fitted again."""
-OVERLAP_FRAMES = 16
-"""Frames before those whose poses are fitted with them: a second time, with later neighbors."""
-REVISION_ITERATIONS = 2
-"""Iterations over these frames, with outlines; a third wins 0.5 mm."""
+CHUNK_ITERATIONS = (1, 3)
+"""The same over those of three chunks."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -86,7 +76,7 @@ def fit_first_frames(
     """
     model, lifted = OutlineModel(ProportionSpace.around(shaped)), _lift(seen, shaped, camera)
     fitter = _fitter(
-        seen, ClipPoses.of(lifted, range(len(seen))), model, camera, range(len(seen)),
+        seen, ClipPoses.of(lifted, range(len(seen))), model, camera,
         settled=False, sigma_log_focal=sigma_log_focal, weights=USUAL_WEIGHTS,
     )  # fmt: skip
     fitter.iterate_stages(FitParameters(proportions=not fixed), *FIRST_ITERATIONS)
@@ -95,102 +85,52 @@ def fit_first_frames(
 
 
 @final
-class FramePoseFitter:
-    """Fits the poses of a stream's last frames, for a known person and camera."""
+class StreamPoseFitter:
+    """Fits the poses of a stream's frames, a few at a time, for a known person and camera."""
 
     def __init__(self, shaped: ShapedBody, camera: Camera) -> None:
         """Start without frames."""
         self._model, self._camera = OutlineModel(ProportionSpace.around(shaped)), camera
-        self._seen: deque[SeenPerson] = deque(maxlen=WINDOW_FRAMES)
+        self._seen: list[SeenPerson] = []
         self._poses: list[BodyPose] = []
-        self._last: BodyPose | None = None
+        self._done = 0  # frames at the front whose poses were returned
 
-    def add(self, seen: SeenPerson, start: BodyPose | None = None) -> None:
-        """Fit the poses of the window that ends with the next frame.
+    def add(self, seen: SeenPerson, start: BodyPose | None = None) -> dict[int, BodyPose]:
+        """Add the next frame; return the poses that are fitted now, by the frames' numbers.
 
         `start` is its pose, if it is known nearly; None lifts it from the key points.
         """
-        self._seen.append(seen)
-        shaped = self._model.space.shaped
         if start is None:
+            shaped = self._model.space.shaped
             start = _lift([seen], shaped, self._camera)[0]
-            if self._last is not None:
-                start = _at_distance_of(start, self._last, shaped.joints[0])
-        count = len(self._seen)
-        poses = ClipPoses.stack([*self._poses, start][-count:])
-        outlined = {count - 1, count - 1 - LAG_FRAMES}
-        fitter = _fitter(self._seen, poses, self._model, self._camera, outlined)
-        fitter.iterate_stages(POSES_ALONE, *FRAME_ITERATIONS)
-        self._poses = [fitter.poses[place] for place in range(count)]
-        self._last = self._poses[-1]
+            if self._poses:
+                start = _at_distance_of(start, self._poses[-1], shaped.joints[0])
+        if not self._seen:
+            self._poses = []
+        self._seen.append(seen)
+        self._poses.append(start)
+        end = self._done + CHUNK_FRAMES
+        return self._fit(end) if len(self._seen) >= end + CHUNK_FRAMES else {}
 
-    def forget(self) -> None:
-        """Start again without frames, but at the last one's distance."""
-        self._seen.clear()
-        self._poses.clear()
-
-    def pose(self, number: int) -> BodyPose:
-        """Present pose of one of the last frames, by its number."""
-        numbers = [each.number for each in self._seen]
-        return self._poses[numbers.index(number)]
-
-
-@final
-class EarlierPoses:
-    """Fits the poses of a stream's earlier frames again, with their later neighbors.
-
-    Fits run on a thread of their own: no method waits for them. What comes while a fit is still
-    going on is left as it is, so that a slow machine does not fall behind.
-    """
-
-    def __init__(self, shaped: ShapedBody, camera: Camera) -> None:
-        """Start without frames."""
-        self._model, self._camera = OutlineModel(ProportionSpace.around(shaped)), camera
-        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="earlier poses")
-        self._fit: Future[None] | None = None
-        self._new: dict[SeenPerson, BodyPose] = {}
-        self._recent: dict[SeenPerson, BodyPose] = {}
-        self._revised: deque[dict[int, BodyPose]] = deque()
-
-    def add(self, seen: SeenPerson, pose: BodyPose) -> None:
-        """Add the next frame and its pose, and fit once there are enough of them."""
-        self._new[seen] = pose
-        if len(self._new) < REVISED_FRAMES:
-            return
-        if self._fit is None or self._fit.done():
-            self._fit_new()
-        else:
-            self._new = {}
-
-    def fit_rest(self) -> None:
-        """Fit the frames that were added since the last fit, which have no later neighbors."""
-        self._fit_new()
-        self._pool.submit(self._recent.clear)
-
-    def _fit_new(self) -> None:
-        if self._fit is not None and self._fit.done():
-            self._fit.result()  # raises what it raised
-        if self._new:
-            self._fit = self._pool.submit(self._fit_again, self._new)
-            self._new = {}
-
-    def take(self) -> dict[int, BodyPose]:
-        """Poses that were fitted since the last call, by the numbers of their frames."""
-        found: dict[int, BodyPose] = {}
-        while self._revised:
-            found |= self._revised.popleft()
+    def finish(self) -> dict[int, BodyPose]:
+        """Fit what is left; the next frame is no neighbor of the last one, but at its distance."""
+        found = self._fit(len(self._seen))
+        self._seen, self._poses, self._done = [], self._poses[-1:], 0
         return found
 
-    def _fit_again(self, new: dict[SeenPerson, BodyPose]) -> None:
-        frames = {**self._recent, **new}
-        seen, count = list(frames), len(frames)
-        start = ClipPoses.stack(list(frames.values()))
-        fitter = _fitter(seen, start, self._model, self._camera, range(count))
-        fitter.iterate_stages(POSES_ALONE, 0, REVISION_ITERATIONS)
-        poses = [fitter.poses[place] for place in range(count)]
-        self._recent.clear()
-        self._recent.update(zip(seen[-OVERLAP_FRAMES:], poses[-OVERLAP_FRAMES:], strict=True))
-        self._revised.append({each.number: p for each, p in zip(seen, poses, strict=True)})
+    def _fit(self, end: int) -> dict[int, BodyPose]:
+        """Fit all frames that are kept, and return the poses up to one of them."""
+        if self._done == end:
+            return {}
+        fitter = _fitter(self._seen, ClipPoses.stack(self._poses), self._model, self._camera)
+        fitter.iterate_stages(POSES_ALONE, *CHUNK_ITERATIONS)
+        self._poses = [fitter.poses[place] for place in range(len(self._seen))]
+        new = range(self._done, end)
+        found = {self._seen[place].number: self._poses[place] for place in new}
+        first = max(0, end - CHUNK_FRAMES)
+        self._seen, self._poses = self._seen[first:], self._poses[first:]
+        self._done = end - first
+        return found
 
 
 def _at_distance_of(pose: BodyPose, other: BodyPose, pelvis: Float[np.ndarray, "3"]) -> BodyPose:
@@ -222,21 +162,18 @@ def _fitter(
     poses: ClipPoses,
     model: OutlineModel,
     camera: Camera,
-    outlined: Collection[int],
     *,
     settled: bool = True,
     sigma_log_focal: float = SIGMA_LOG_FOCAL,
     weights: EvidenceWeights = TRACKED_WEIGHTS,
 ) -> ClipFitter:
-    """The fit of some frames, of which those at some places are compared with their masks."""
+    """The fit of some frames to their key points and masks."""
     small = camera.resize(seen[0].mask.shape[::-1])
     frames = [
         ClipFrame(
-            number=float(each.number),
-            camera=small,
-            mask=OutlineDistances.of(each.mask, small) if place in outlined else None,
+            number=float(each.number), camera=small, mask=OutlineDistances.of(each.mask, small)
         )
-        for place, each in enumerate(seen)
+        for each in seen
     ]
     return ClipFitter(
         poses, model.space, frames, model=model, track=_track(seen, camera),

@@ -18,8 +18,7 @@ from preprocess.body.parametric_body import load_body_model
 from preprocess.cameras.camera_file import CameraTrack, assume_camera, write_cameras
 from preprocess.capture_inputs import CaptureInputs, CapturePaths
 from preprocess.capture_session import Capture
-from preprocess.fitting.tracked_frames import LAG_FRAMES, EarlierPoses
-from preprocess.masks.mask_sources import EstimatedMasks
+from preprocess.fitting.tracked_frames import CHUNK_FRAMES
 from preprocess.observation import DroppedFrame, Observation
 from preprocess.open_capture import open_tracked_stream
 from preprocess.tracked_stream import (
@@ -138,23 +137,13 @@ def test_every_frame_has_a_pose_and_a_mask(standing):
     assert list(tracking.notes()) == []
 
 
-def test_earlier_poses_are_fitted_to_the_masks_that_are_learnt_from(standing, monkeypatch):
-    fitted = []
-    monkeypatch.setattr(EarlierPoses, "add", lambda earlier, seen, pose: fitted.append(seen))
-    stream, tracking, start = started(Tracker(standing))
-    masks = EstimatedMasks(lambda frame, pose, camera: np.full(SIZE[::-1], 0.9, dtype=np.float32))
-    seen = observe_all(stream, tracking, start, masks)
-    assert [each.number for each in fitted] == [item.frame.index for item in seen]
-    assert all(np.allclose(each.mask, 0.9) for each in fitted)
-
-
 def test_a_frame_waits_for_later_ones(standing):
     tracker = Tracker(standing)
     stream, _, _ = started(tracker)
     frames = stream.frames()
     for number in range(12):
         assert next(frames).index == number
-        assert tracker.calls >= number + 1 + LAG_FRAMES
+        assert tracker.calls >= number + 1 + CHUNK_FRAMES
 
 
 def test_frames_without_the_person_are_dropped_and_reported(standing):

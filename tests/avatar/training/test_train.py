@@ -425,29 +425,6 @@ def test_the_rate_falls_with_the_steps_that_are_left(rig, ready):
     assert rates[-1] < 0.1 * config.learning_rate
 
 
-def test_a_revised_pose_is_that_of_a_frame_that_came_with_it(rig, clip):
-    one, other = clip.observations[0], clip.observations[5]
-    wrong = dataclasses.replace(one, pose=other.pose)
-    trainers = Trainer(rig, QUICK), Trainer(rig, QUICK)
-    for trainer, seen in zip(trainers, (wrong, one), strict=True):
-        frame = prepare_frame(seen, rig)
-        trainer.add_frame(dataclasses.replace(frame, head=None))  # cut out where the pose was
-    trainers[0].pose_corrections[one.frame.index] = np.ones((25, 3))
-    trainers[0].poses.corrections[0] = 0.1
-    trainers[0].revise_pose(one.frame.index, one.pose)
-    trainers[0].revise_pose(999, one.pose)  # a frame that the replay buffer does not hold
-    rays = [
-        trainer.replay.sample_rays(64, torch.Generator().manual_seed(0)).rays
-        for trainer in trainers
-    ]
-    for mine, right in zip(*rays, strict=True):
-        torch.testing.assert_close(mine, right)
-    assert trainers[0].pose_corrections == {}
-    assert trainers[0].replay.replay_frames()[0].pose is one.pose
-    bones = [trainer.poses.bones[0] for trainer in trainers]
-    torch.testing.assert_close(*bones)
-
-
 def test_two_processes_that_compile_halves_compile_what_a_step_calls(rig, monkeypatch):
     monkeypatch.setattr(train_module, "WARM_THREADS", set())
     trainer = Trainer(rig, TrainConfig())

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from avatar.training import train
-from avatar.training.trainer import Trainer
 from capture.source_opening import open_source
 from capture.video_writer import H264, write_video
 from instant_avatar import ingest
@@ -169,16 +168,11 @@ def test_a_video_played_at_its_own_speed_is_tracked_meanwhile(ingest_video, monk
 
 
 @pytest.mark.usefixtures("without_baking", "fits_at_once")
-def test_a_stream_learns_from_given_masks_and_brings_poses_along(ingest_video, filmed, monkeypatch):
-    monkeypatch.setattr(tracked_frames, "REVISED_FRAMES", 4)
+def test_a_stream_learns_from_given_masks(ingest_video, filmed, monkeypatch):
     monkeypatch.setattr(MaskRefiner, "__call__", lambda *given: pytest.fail("a mask is refined"))
-    revised = []
-    monkeypatch.setattr(Trainer, "revise_pose", lambda trainer, frame, pose: revised.append(frame))
     done, out = ingest_video("--realtime", "--no-refine-masks", "--masks", filmed / "masks")
     assert done.code == 0, done.err
     assert json.loads((out / "report.json").read_text())["recipe"]["masks"] == "masks"
-    assert 0 in revised
-    assert len(set(revised)) >= 4  # which ones the tracker took depends on how fast it is
 
 
 def test_person_must_be_a_number(ingest_video):
