@@ -2,7 +2,6 @@
 
 import json
 import signal
-from concurrent.futures import Future
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from instant_avatar.evaluation.evaluation_frames import held_out_frames
 from instant_avatar.run import person_tracking, run_capture, run_tracking
 from instant_avatar.run.run_folder import RunFolder
 from preprocess.capture_inputs import CaptureInputs
-from preprocess.fitting import tracked_frames
 from preprocess.masks.mask_refinement import MaskRefiner
 from preprocess.poses.pose_format_registry import read_poses
 from preprocess.tracking.blazepose import BlazePoseTracker
@@ -36,24 +34,6 @@ def ingest_video(video, tmp_path, capsys, monkeypatch):
         return Outcome(code=code, out=captured.out, err=captured.err), out
 
     return call
-
-
-class AtOnce:
-    """An executor that runs what it is given before it returns."""
-
-    def __init__(self, **named) -> None:
-        pass
-
-    def submit(self, work, *arguments) -> Future:
-        done = Future()
-        done.set_result(work(*arguments))
-        return done
-
-
-@pytest.fixture
-def fits_at_once(monkeypatch):
-    """Earlier poses are fitted again on the thread that asks for it: no race with training."""
-    monkeypatch.setattr(tracked_frames, "ThreadPoolExecutor", AtOnce)
 
 
 @pytest.mark.usefixtures("without_baking")
@@ -167,7 +147,7 @@ def test_a_video_played_at_its_own_speed_is_tracked_meanwhile(ingest_video, monk
     assert frames["used"] + frames["held_out"] + frames["near_duplicates"] == 10  # every second
 
 
-@pytest.mark.usefixtures("without_baking", "fits_at_once")
+@pytest.mark.usefixtures("without_baking")
 def test_a_stream_learns_from_given_masks(ingest_video, filmed, monkeypatch):
     monkeypatch.setattr(MaskRefiner, "__call__", lambda *given: pytest.fail("a mask is refined"))
     done, out = ingest_video("--realtime", "--no-refine-masks", "--masks", filmed / "masks")
