@@ -13,7 +13,6 @@ import numpy as np
 from jaxtyping import Float, Float32
 from scipy.optimize import least_squares
 
-from capture.camera import Camera
 from capture.source import AlphaMask
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.silhouette_objective import MaskSample, SilhouetteObjective, mean_score
@@ -148,15 +147,16 @@ def _find_start(
         """Of the sides of both boxes, and the shift's prior; none at the image's border."""
         geometry, off = geometry_of(numbers), [prior * numbers[1:]]
         moved = geometry.motion.root_translations - stated.motion.root_translations
-        for sample, row, points in bodies:
+        for sample, row, points, sides in bodies:
             camera = geometry.camera_at(sample.camera_row, objective.size_px)
             pixels = camera.project(points + moved[row])
-            sides = np.concatenate([pixels.min(axis=0), pixels.max(axis=0)])
-            off.append(np.nan_to_num(sides - _sides_of_mask(sample.alpha, camera)))
-        return np.concatenate(off)
+            off.append(np.concatenate([pixels.min(axis=0), pixels.max(axis=0)]) - sides)
+        return np.nan_to_num(np.concatenate(off))
 
     start = np.zeros(1 if by_focal_length else 4)
-    found = least_squares(distances_px, start, loss="cauchy", f_scale=SIGMA_SIDE_PX).x
+    found = start
+    if bodies:
+        found = least_squares(distances_px, start, loss="cauchy", f_scale=SIGMA_SIDE_PX).x
     geometry = geometry_of(found)
     before, after = (mean_score(objective.frame_scores(each)) for each in (stated, geometry))
     return _Start(geometry, float(np.exp(found[0])), found[1:], before, after)
@@ -175,20 +175,20 @@ def _place(
 
 def _bodies_before_camera(
     geometry: CaptureGeometry, objective: SilhouetteObjective
-) -> Iterator[tuple[MaskSample, int, Float32[np.ndarray, "points 3"]]]:
-    """Each mask whose frame has a pose before the camera, its row and the skin in the world."""
+) -> Iterator[tuple[MaskSample, int, Float32[np.ndarray, "points 3"], Float[np.ndarray, "4"]]]:
+    """Masks whose frames have a pose before the camera, with its row, the skin and their sides."""
     for sample in objective.samples:
         row = geometry.row_for_frame(sample.index)
         if row is not None:
             points = objective.posed_points(geometry.motion, row)
             view = geometry.camera_at(sample.camera_row, objective.size_px).camera_from_world[2]
             if (points @ view[:3] + view[3]).min() > NEAR_PLANE_M:
-                yield sample, row, points
+                yield sample, row, points, _sides_of_mask(sample.alpha)
 
 
-def _sides_of_mask(alpha: AlphaMask, camera: Camera) -> Float[np.ndarray, "4"]:
+def _sides_of_mask(alpha: AlphaMask) -> Float[np.ndarray, "4"]:
     """Left, top, right and bottom of a mask, px; NaN at the image's border or in an empty mask."""
-    size = np.array(camera.size_px, dtype=np.float64)
+    size = np.array(alpha.shape[::-1], dtype=np.float64)
     columns, lines = (np.flatnonzero((alpha > 0.5).any(axis=axis)) for axis in (0, 1))
     if not len(columns):
         return np.full(4, np.nan)

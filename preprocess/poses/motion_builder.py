@@ -24,6 +24,8 @@ from preprocess.cameras.named_camera import invert_rigid
 
 MotionByPerson = dict[str, Motion]
 """By the name that the file gives each, in the file's order."""
+MAX_MAGNITUDE = 1e9
+"""Largest magnitude of an angle or a translation; numbers beyond it mean a damaged file."""
 
 
 def build_motion(
@@ -69,7 +71,7 @@ def build_motion(
         raise ValueError("no poses")
     turned, placed = turned[order], placed[order]
     numbers = np.column_stack([turned.reshape(len(turned), -1), placed])
-    valid = np.asarray(np.isfinite(numbers).all(axis=1))
+    valid = np.asarray((np.abs(numbers) < MAX_MAGNITUDE).all(axis=1))  # none of NaN
     if lost is not None:
         valid &= ~np.asarray(lost, dtype=bool)[order]
     return Motion(

@@ -36,8 +36,6 @@ POSE_KEY_LAYOUTS = (
 """The keys that may hold the poses, first match wins; one array of 72 starts with the root."""
 CAMERA_KEYS = ("camera_from_world", "w2c", "camera")
 """Keys of camera-from-world, best first."""
-MAX_MAGNITUDE = 1e9
-"""Largest magnitude of an angle or a translation; numbers beyond it mean a damaged file."""
 MAX_PROPORTION = 100.0
 """Largest magnitude of a coefficient of proportions, in prior standard deviations."""
 Arrays = dict[str, Shaped[np.ndarray, "..."]]
@@ -97,18 +95,13 @@ def _motion(arrays: Arrays) -> Motion:
         expected = "; or ".join(" and ".join(keys) for keys in POSE_KEY_LAYOUTS)
         raise ValueError(f"it holds {', '.join(sorted(arrays)) or 'nothing'}; expected {expected}.")
     *rotations, translations = (_rows(arrays, key) for key in layout)
-    count, frames, times_s = len(translations), None, _per_row(arrays, "time", len(translations))
-    order = np.arange(count)
-    if "frame" in arrays:
-        frames = _per_row(arrays, "frame", count)
-        order = np.argsort(frames, kind="stable")
-        if len(np.unique(frames)) < count:
-            raise ValueError("`frame` names a frame twice; expected one person's poses.")
-    marked = _per_row(arrays, "valid", count)
+    count = len(translations)
+    frames, times_s, marked = (_per_row(arrays, key, count) for key in ("frame", "time", "valid"))
+    if frames is not None and len(np.unique(frames)) < count:
+        raise ValueError("`frame` names a frame twice; expected one person's poses.")
     lost = np.zeros(count, dtype=bool) if marked is None else ~(marked > 0)
-    for part in (*rotations, translations, times_s):
-        if part is not None:
-            lost |= ~(np.abs(part.reshape(count, -1)) < MAX_MAGNITUDE).all(axis=1)
+    if times_s is not None:
+        lost |= ~np.isfinite(times_s)
     motion = build_motion(
         rotations, translations, frames=frames, times_s=times_s, lost=lost,
         betas=_read_numbers(arrays, "betas") if "betas" in arrays else None,
@@ -118,7 +111,9 @@ def _motion(arrays: Arrays) -> Motion:
     cameras = _cameras(arrays, count)
     return replace(
         motion,
-        camera_from_world=None if cameras is None else cameras[order],
+        camera_from_world=cameras
+        if cameras is None or frames is None
+        else cameras[frames.argsort()],
         proportions=_proportions(arrays),
         keypoints=KeypointTrack.from_arrays(arrays),
         program=str(arrays["program"]) if "program" in arrays else None,
