@@ -144,8 +144,7 @@ class FitProcess:
         assert self._process.stdin is not None
         with suppress(OSError, pickle.PicklingError, AttributeError, TypeError):  # or it has ended
             self._process.stdin.write(pickle.dumps((capture, height_m, with_rig)))
-        with suppress(OSError):
-            self._process.stdin.close()
+            self._process.stdin.flush()
 
     def fit(self, capture: "Capture") -> "CaptureFit | None":
         """Wait for the fit, and let the masks know what those of the other process have learnt."""
@@ -165,7 +164,10 @@ class FitProcess:
         return self._receive()
 
     def _receive(self) -> Any:
+        assert self._process.stdin is not None
         assert self._process.stdout is not None
+        with suppress(OSError):
+            self._process.stdin.close()  # without a capture the process ends
         try:
             return pickle.load(self._process.stdout)
         except (pickle.UnpicklingError, EOFError):  # it has ended

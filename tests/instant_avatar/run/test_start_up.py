@@ -137,6 +137,12 @@ def test_what_cannot_be_sent_is_fitted_by_this_process(inputs):
         assert_same_fit(fitting.fit(there), fit_capture(here))
 
 
+def test_a_process_without_a_capture_ends_before_training(started):
+    with fitting_beside() as fitting:
+        assert fitting.rig() is None
+        assert started[0].wait(timeout=60.0) != 0
+
+
 def test_the_process_ends_with_the_block(started, monkeypatch):
     monkeypatch.setattr(start_up, "FIT", RUNS_LONG)
     with fitting_beside():
