@@ -35,7 +35,6 @@ UNCLEAR_WORDS = re.compile(
 QUOTED = ("CHANGELOG.md", "dev/lab-log.md", "dev/log/", "tests/test_house.py")
 """Files and folders that may hold them: history, and this list."""
 TORCH_FREE = ("capture", "preprocess", "export.player")
-PLAYER_FREE = ("torch", "cv2", "scipy", "numba", "onnx", "trimesh", "pycolmap")
 
 
 @functools.cache
@@ -63,12 +62,6 @@ def imported(tree):
             yield "." * node.level + (node.module or "")
 
 
-def wrong_arrows(stage, tree):
-    """Imports of a later stage, and relative ones."""
-    later = STAGES[STAGES.index(stage) + 1 :]
-    return [name for name in imported(tree) if name.startswith(".") or name.split(".")[0] in later]
-
-
 def loads(names, forbidden):
     """What of the forbidden has been loaded in a fresh interpreter that imports the names."""
     code = (
@@ -82,30 +75,6 @@ def loads(names, forbidden):
 
 
 # --- imports ----------------------------------------------------------------------------------
-
-
-def test_imports_point_back_along_the_data_flow():
-    wrong = {
-        str(path): arrows
-        for path, tree in sources()
-        if (arrows := wrong_arrows(path.parts[0], tree))
-    }
-    assert not wrong, f"imports of a later stage, or relative ones: {wrong}"
-
-
-@pytest.mark.parametrize(
-    ("stage", "line", "is_wrong"),
-    [
-        ("capture", "import avatar.rig", True),
-        ("preprocess", "def f():\n from export.player import Player", True),
-        ("avatar", "from . import rig", True),
-        ("export", "from avatar import rig", False),
-        ("instant_avatar", "import capture, preprocess, avatar, export", False),
-        ("avatar", "import avatar.rig, exporters", False),
-    ],
-)
-def test_the_check_of_imports_can_fail(stage, line, is_wrong):
-    assert bool(wrong_arrows(stage, ast.parse(line))) == is_wrong
 
 
 def circle(trees):
@@ -149,10 +118,6 @@ def test_the_check_of_circles_can_fail():
 def test_what_stands_before_or_after_training_loads_without_torch(package):
     names = modules(package) if package in STAGES else [package]
     assert loads(names, ("torch",)) == []
-
-
-def test_the_player_loads_with_numpy_and_onnxruntime_alone():
-    assert loads(["export.player"], PLAYER_FREE) == []
 
 
 @pytest.mark.slow
