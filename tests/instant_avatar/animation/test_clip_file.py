@@ -15,7 +15,6 @@ from capture.input_error import InputError
 from export.player import Player
 from instant_avatar.animation.clip_file import (
     background_compositor,
-    check_clip_path,
     clip_format,
     write_clip,
 )
@@ -202,16 +201,6 @@ def test_a_png_is_one_picture_exactly(tmp_path):
             np.testing.assert_array_equal(np.asarray(image), expected)
 
 
-def test_nothing_but_frames_is_replaced(tmp_path):
-    out = tmp_path / "frames"
-    written(out, disc(1), blend=None)
-    check_clip_path(out, [], overwrite=False)
-    (out / "0001.png").write_bytes(b"mine")
-    for overwrite in (False, True):
-        with pytest.raises(InputError, match=r"holds 0001\.png"):
-            check_clip_path(out, [], overwrite=overwrite)
-
-
 SIZE = 96
 
 
@@ -265,22 +254,6 @@ def test_one_pose_is_one_picture(call_play, package, player, novel, tmp_path):
     camera = FollowingCamera.of(player, held, (80, 60), view).camera_for(motion[5])
     with Image.open(out) as picture:
         np.testing.assert_array_equal(np.asarray(picture), player.render(motion[5], camera))
-
-
-def test_without_a_name_a_still_lies_beside_the_package(call_play, package, novel):
-    outcome = call_play(package, "--poses", novel, "--still", 3, "--size", SIZE)
-    assert outcome.out.strip() == str(package.parent / "poses-3.png")
-    (package.parent / "poses-3.png").unlink()
-
-
-@pytest.mark.slow
-def test_without_poses_it_moves_all_the_same(call_play, package):
-    outcome = call_play(package, "--size", 32, "--tier", "lite")
-    assert outcome.code == 0
-    assert outcome.out.strip() == str(package.parent / "avatar.mp4")
-    assert "90 frames" in outcome.err
-    assert "at 30 fps" in outcome.err
-    (package.parent / "avatar.mp4").unlink()
 
 
 @pytest.mark.parametrize(

@@ -3,8 +3,6 @@
 import json
 import os
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 
 import cv2
@@ -67,13 +65,19 @@ def test_frames_replace_frames_but_nothing_else(call_play, package, novel, tmp_p
     assert [file.name for file in tmp_path.iterdir()] == ["frames"]
 
 
-def test_a_clip_without_a_name_lies_beside_the_package(call_play, package, novel):
-    outcome = call_play(package, "--poses", novel, "--size", SIZE)
-    assert outcome.code == 0
-    expected = package.parent / "poses.mp4"
-    assert outcome.out.strip() == str(expected)
-    assert len(frames_of(expected)) == 12
-    expected.unlink()
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        (["--poses", "{novel}"], "poses.mp4"),
+        (["--poses", "{novel}", "--still", "3"], "poses-3.png"),
+        pytest.param([], "avatar.mp4", marks=pytest.mark.slow),
+    ],
+)
+def test_what_gets_no_name_lies_beside_the_package(call_play, package, novel, words, name):
+    given = [word.format(novel=novel) for word in words]
+    outcome = call_play(package, *given, "--size", 32, "--tier", "lite")
+    assert outcome.out.strip() == str(package.parent / name)
+    (package.parent / name).unlink()
 
 
 def test_the_film_s_camera_shows_what_the_film_shows(call_play, package, film, tmp_path):
@@ -262,22 +266,6 @@ def test_a_full_disk_leaves_nothing(call_play, package, novel, tmp_path, monkeyp
     assert outcome.code == 3
     assert "the disk is full" in outcome.complaint("ia-play")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_playing_needs_no_torch(package, novel, tmp_path):
-    code = (
-        "import sys\n"
-        "from instant_avatar import play\n"
-        "assert play.main(sys.argv[1:]) == 0\n"
-        "assert play.main([sys.argv[1], '--verify']) == 0\n"
-        "sys.exit('torch' in sys.modules)"
-    )
-    arguments = [str(package), "--poses", str(novel), "--size", "64"]
-    done = subprocess.run(
-        [sys.executable, "-c", code, *arguments, "--out", str(tmp_path / "clip.gif")],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
 
 
 def reference_model() -> onnx.ModelProto:

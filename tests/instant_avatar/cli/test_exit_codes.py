@@ -12,13 +12,10 @@ from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
 import pytest
 from rich.console import Console as RichConsole
 
-from capture.image_folder import read_image
 from capture.input_error import InputError
-from instant_avatar.animation.clip_file import background_compositor
 from instant_avatar.cli import command_line
 from instant_avatar.cli.command_line import CommandExit, run_command, stop_on_interrupt
 from instant_avatar.cli.console import MAX_PRINTED_WARNINGS, Console
@@ -175,21 +172,6 @@ def test_a_note_asks_for_nothing_and_is_no_warning():
         console.note("the masks were refined")
     assert printed.getvalue() == "the masks were refined\n"
     assert (console.notes, console.warnings) == (["the masks were refined"], [])
-
-
-def test_colors_and_images_serve_as_backgrounds(tmp_path, rng):
-    rgba = rng.integers(0, 256, (6, 8, 4), dtype=np.uint8)
-    rgba[0, :, 3], rgba[1, :, 3] = 0, 255
-    on_blue = background_compositor("rgb(10, 20, 250)")(rgba)
-    assert (on_blue[0] == [10, 20, 250]).all()
-    np.testing.assert_array_equal(on_blue[1], rgba[1, :, :3])
-    from PIL import Image
-
-    path = tmp_path / "wall.png"
-    Image.fromarray(rng.integers(0, 256, (6, 20, 3), dtype=np.uint8)).save(path)
-    on_wall = background_compositor(str(path))(rgba)
-    np.testing.assert_array_equal(on_wall[0], read_image(path)[0][0, 6:14])
-    np.testing.assert_array_equal(on_wall[1], rgba[1, :, :3])
 
 
 ROOT = Path(__file__).parents[3]
