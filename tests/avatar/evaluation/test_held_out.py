@@ -186,11 +186,3 @@ def test_held_out_frames_that_come_later_from_before_are_put_between_the_others(
         frame = replace(held.observation.frame, index=index)
         add_held_out(kept, HeldOutFrame(observation=replace(held.observation, frame=frame)))
     assert [each.observation.frame.index for each in kept] == [10, 40, 65, 90, 100, 120, 140]
-
-
-@pytest.mark.slow
-def test_a_warp_that_is_solved_when_it_is_needed_gives_the_same_score(rig, held, learnt):
-    lazy = HeldOutFrame(observation=held.observation)
-    assert score_frame(learnt.trainer.avatar, lazy) == score_frame(
-        learnt.trainer.avatar, lazy.with_correspondences(rig)
-    )

@@ -81,31 +81,6 @@ def test_compiled_table_gradient_agrees_with_autograd(levels, generator, count):
     torch.testing.assert_close(ours, theirs, atol=1e-4, rtol=1e-4)
 
 
-def test_the_encodings_gradient_passes_gradcheck_in_double(levels, generator):
-    points = points_in(levels, 5, generator).double()
-    table = torch.randn(
-        levels.entries, FEATURES_PER_LEVEL, generator=generator, dtype=torch.float64
-    )
-    entries = torch.unique(torch.randint(levels.entries, (50,), generator=generator))
-    part = table[entries].clone().requires_grad_()
-
-    def encode_with(values):
-        return torch_reference.encode(points, table.index_put((entries,), values), levels)
-
-    assert torch.autograd.gradcheck(encode_with, (part,))
-
-
-def test_the_encodings_gradient_for_the_points_passes_gradcheck_in_double(levels, generator):
-    """Inside, and outside the box, where the border's cells extrapolate."""
-    points = points_in(levels, 6, generator, beyond=0.1).double().requires_grad_()
-    table = torch.randn(
-        levels.entries, FEATURES_PER_LEVEL, generator=generator, dtype=torch.float64
-    )
-    assert torch.autograd.gradcheck(
-        lambda places: torch_reference.encode(places, table, levels), (points,), eps=1e-7
-    )
-
-
 def test_a_uniform_fog_absorbs_as_beer_and_lambert_say():
     raw = torch.tensor([[50.0, -50.0, 0.0, math.log(3.0)]]).repeat(40, 1)
     rendered = operations.composite(raw, packed([40]), 0.01)
@@ -210,16 +185,6 @@ def test_the_density_of_a_saturated_sample_has_no_gradient(generator):
     raw, *rest = loss_case(generator)
     raw[3, 3] = MAX_LOG_DENSITY + 1.0
     assert composite_loss(raw, *rest)[2][3, 3] == 0.0
-
-
-def test_the_meaning_of_the_loss_passes_gradcheck_in_double(generator):
-    raw, samples, step_m, target, *weights = loss_case(generator)
-
-    def mean_loss(raw):
-        rendered = torch_reference.composite(raw, samples.offsets, samples.counts, step_m)
-        return torch_reference.loss_per_ray(rendered, target.double(), *weights).mean()
-
-    assert torch.autograd.gradcheck(mean_loss, (raw.double().requires_grad_(),))
 
 
 @pytest.fixture(scope="module")

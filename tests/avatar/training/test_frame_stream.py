@@ -4,7 +4,6 @@ from avatar.evaluation.held_out import HeldOutFrame
 from avatar.training.frame_stream import (
     TrainingFrame,
     prepare_items,
-    prepare_stream,
     separate_held_out,
 )
 
@@ -16,16 +15,6 @@ def indices_of(items, kind):
         for item in items
         if isinstance(item, kind)
     ]
-
-
-def test_both_stages_together_are_the_prepared_stream(rig, clip):
-    observations = clip.observations[:8]
-    split = separate_held_out(observations, stride=3, total=None)
-    by_stages = list(prepare_items(split, rig))
-    at_once = list(prepare_stream(observations, rig, stride=3, total=None))
-    for kind in (HeldOutFrame, TrainingFrame):
-        assert indices_of(by_stages, kind) == indices_of(at_once, kind)
-    assert indices_of(by_stages, HeldOutFrame) == [2, 5]
 
 
 def test_an_item_that_is_dropped_in_between_moves_no_held_out_frame(rig, clip):
