@@ -65,10 +65,6 @@ def test_no_inverse_is_taken_of_the_skin_beyond_its_stored_cells(skin, per_step)
     assert trusted(np.argwhere(some & ~whole)) == 0.0
 
 
-def test_all_weights_sum_to_one(skin):
-    np.testing.assert_allclose(subdivided_skinning_nodes(skin).weights.sum(axis=0), 1.0, atol=1e-5)
-
-
 def test_stored_normals_point_outward_and_are_nearly_unit(tables):
     normals = tables.surfels.normals
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=0.06)

@@ -10,12 +10,6 @@ from scipy import ndimage
 
 from avatar.evaluation.image_metrics import psnr
 from baselines.reference_player import PlayerInputs, draw_reference, trace_picture
-from baselines.reference_skinning import (
-    PosedNodes,
-    invert_matrices,
-    skin_tetrahedral,
-    skin_trilinear,
-)
 from capture.camera import Camera
 from capture.input_error import InputError
 from export.bake import compositor
@@ -24,8 +18,7 @@ from export.bake.traced_rays import RaySegments, RayTracer
 from export.graph.player_graph import build_graph
 from export.package.package_file import COARSE_GRAPH, read_package
 from export.package.player_tables import QUALITY_TIERS, RenderSettings
-from export.player import PictureDifference, Player, compare_golden_frames, premultiply
-from export.player_inputs import subdivided_skinning_nodes
+from export.player import PictureDifference, Player, premultiply
 from export.skinned_mesh import LevelSet, extract_mesh, skinning_weights
 from export.warm_up_package import write_warm_up_package
 from preprocess.body.body_pose import BodyPose
@@ -243,14 +236,7 @@ def test_an_avatar_out_of_sight_leaves_the_picture_empty(player, bent, camera):
     assert not player.render(aside, camera(50, 40)).any()
 
 
-def test_a_close_up_has_no_holes(player, stand_in, camera):
-    view = camera(160, 160, distance_m=0.75)
-    alpha = player.render(stand_in.canonical, view)[..., 3]
-    chest = alpha[:90, 70:90]
-    assert chest.min() > 245
-
-
-@pytest.mark.parametrize("zoom", [3.0, 10.0, 24.0])
+@pytest.mark.parametrize("zoom", [1.0, 3.0, 10.0, 24.0])
 def test_close_ups_have_no_gaps_between_surfels(player, stand_in, camera, zoom):
     view = camera(160, 160, distance_m=0.75)
     (fx, fy), (x, y) = view.focal_px, view.center_px
@@ -259,7 +245,7 @@ def test_close_ups_have_no_gaps_between_surfels(player, stand_in, camera, zoom):
     )
     alpha = player.render(stand_in.canonical, close)[..., 3]
     assert alpha[30:60, 65:95].min() > 245
-    assert (alpha > 245).mean() > 0.9
+    assert zoom == 1.0 or (alpha > 245).mean() > 0.9
 
 
 def test_more_samples_converge(player, bent, camera):
@@ -294,16 +280,13 @@ def test_numbers_that_are_none_are_refused_before_they_are_drawn(
         player.render(bent, replace(camera(9, 9), **change), size=size)
 
 
-def test_a_pose_without_numbers_is_refused(player, bent, camera):
-    lost = replace(bent, joint_rotations=np.full((23, 3), np.nan))
-    with pytest.raises(InputError, match="joint_rotations holds NaN"):
-        player.render(lost, camera(9, 9))
-
-
-def test_a_pose_in_degrees_is_refused(player, bent, camera):
-    degrees = replace(bent, joint_rotations=np.rad2deg(bent.joint_rotations))
-    with pytest.raises(InputError, match=r"numpy\.deg2rad"):
-        player.render(degrees, camera(9, 9))
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [(np.rad2deg, r"numpy\.deg2rad"), (lambda turned: np.nan * turned, "holds NaN")],
+)
+def test_a_pose_in_degrees_or_without_numbers_is_refused(player, bent, camera, spoil, said):
+    with pytest.raises(InputError, match=said):
+        player.render(replace(bent, joint_rotations=spoil(bent.joint_rotations)), camera(9, 9))
 
 
 def test_an_onnxruntime_that_is_too_old_is_named(exported, monkeypatch):
@@ -345,32 +328,6 @@ def test_tetrahedra_reproduce_linear_colors_and_constant_density(tables):
     assert np.ptp(alpha) < 1e-3 * alpha.max()
 
 
-def test_skin_in_tetrahedra_gives_its_nodes_and_linear_maps_back(tables):
-    nodes = subdivided_skinning_nodes(tables.skinning)
-    matrix = np.array([[0.9, 0.2, 0.1], [-0.3, 1.1, 0.0], [0.2, 0.1, 0.8]], dtype=np.float32)
-    posed = PosedNodes(nodes, nodes.positions @ matrix.T)
-    points = tables.surfels.positions
-    for carry in (skin_tetrahedral, skin_trilinear):
-        moved, derivative = carry(posed, points)
-        np.testing.assert_allclose(moved, points @ matrix.T, atol=1e-5)
-        np.testing.assert_allclose(derivative, np.broadcast_to(matrix, derivative.shape), atol=1e-4)
-
-
-def test_matrices_are_inverted_unless_they_are_flat(rng):
-    matrices = rng.normal(size=(50, 3, 3)).astype(np.float32)
-    matrices[0] = 0.0
-    inverse, volume = invert_matrices(matrices)
-    np.testing.assert_allclose(volume, np.linalg.det(matrices.astype(float)), atol=1e-6)
-    np.testing.assert_allclose(inverse[1:] @ matrices[1:], np.eye(3)[None].repeat(49, 0), atol=1e-3)
-    np.testing.assert_array_equal(inverse[0], np.eye(3))
-
-
-def test_golden_frames_are_drawn_again_without_a_difference(exported):
-    differences = compare_golden_frames(read_package(exported.path))
-    assert len(differences) == 2
-    assert all(difference.matches for difference in differences)
-
-
 def test_the_player_needs_numpy_and_onnxruntime_alone(exported):
     code = f"""
 import sys
@@ -382,7 +339,7 @@ player = Player.load({str(exported.path)!r})
 camera = Camera(focal_px=(60.0, 60.0), center_px=(20.0, 25.0), size_px=(40, 50),
                 camera_from_world=np.diag([1.0, -1.0, -1.0, 1.0]))
 assert player.render(BodyPose.rest(), camera).shape == (50, 40, 4)
-heavy = {{"torch", "cv2", "scipy", "numba", "onnx", "PIL"}} & set(sys.modules)
+heavy = {{"torch", "cv2", "scipy", "numba", "onnx", "PIL", "trimesh"}} & set(sys.modules)
 sys.exit(f"the player pulls in {{heavy}}" if heavy else 0)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

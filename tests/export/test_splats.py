@@ -263,11 +263,6 @@ def test_a_plane_between_nodes_is_found_where_it_is():
     assert (normals[:, 0] > 0.0).all()  # towards the negative
 
 
-def test_a_surface_with_a_hole_is_not_closed():
-    _, faces = extract_isosurface(grid(sphere)[0])
-    assert not is_closed(faces[1:])
-
-
 def test_noise_gives_a_closed_surface_too():
     values = np.random.default_rng(3).standard_normal((14, 15, 16)).astype(np.float32)
     inside = np.full((16, 17, 18), -1.0, dtype=np.float32)
