@@ -52,9 +52,7 @@ REST_DELAY_S = 0.4
 PANEL_INTERVAL_S = 0.5
 """Interval of updates of the panel, seconds."""
 PANEL_PX = 340
-"""Width of the panel beside the avatar; on a phone it is a sheet below it."""
-SHEET_SHARE = 0.4
-"""Share of a phone's height that the sheet covers."""
+"""Width of the panel beside the avatar."""
 FRAME_HEIGHT_PX = 300
 """Height of the newest frame in the panel."""
 BACKGROUND_RGB = (251, 250, 247)
@@ -111,19 +109,10 @@ class BrowserCamera:
     moved_at: float
 
     def to_camera(self, height_px: int) -> Camera:
-        """Convert to a camera with this image height, which leaves a phone's sheet free."""
-        free = 1.0 - SHEET_SHARE if self.aspect < 0.8 else 1.0
-        width_px = max(1, round(height_px * self.aspect))
-        focal = free * 0.5 * height_px / np.tan(0.5 * self.fov)
-        camera_from_world = np.eye(4)
-        camera_from_world[:3, :3] = self.world_from_camera.T
-        camera_from_world[:3, 3] = -self.world_from_camera.T @ self.position
-        return Camera(
-            focal_px=(float(focal), float(focal)),
-            center_px=(width_px / 2.0, free * height_px / 2.0),
-            size_px=(width_px, height_px),
-            camera_from_world=camera_from_world,
-        )
+        """Convert to a camera with this image height."""
+        size_px = max(1, round(height_px * self.aspect)), height_px
+        focal_px = 0.5 * height_px / float(np.tan(0.5 * self.fov))
+        return Camera.at(self.position, self.world_from_camera.T, focal_px, size_px)
 
 
 @final

@@ -30,7 +30,6 @@ from instant_avatar.run.live_viewer import (
     DANCE,
     NEWEST,
     PANEL_PX,
-    SHEET_SHARE,
     BrowserCamera,
     PreviewPoses,
     render_preview,
@@ -52,10 +51,10 @@ with_viser = pytest.mark.skipif(
 )
 
 
-def scene(browser: Browser, *, beside_px: int = PANEL_PX) -> tuple[np.ndarray, np.ndarray]:
+def scene(browser: Browser) -> tuple[np.ndarray, np.ndarray]:
     """The picture left of the panel, below the browser's own notes, and where it is no paper."""
     picture = browser.picture()
-    picture = picture[:, : picture.shape[1] - beside_px].astype(int)
+    picture = picture[:, : picture.shape[1] - PANEL_PX].astype(int)
     picture[:160, :320] = PAPER  # Chromium shows its notice about a missing GPU here
     return picture, np.abs(picture - PAPER).max(axis=2) > 24
 
@@ -97,7 +96,6 @@ def test_a_user_watches_pauses_saves_and_starts_the_dance(film, tmp_path):
         with Browser(tmp_path / "browser") as browser:
             browser.go(address.group(0))
             look_and_pause(browser, film)
-            look_on_a_phone(browser)
             save(browser, out, process)
             browser.click("Resume")
             stay_and_dance(browser, log)
@@ -131,14 +129,6 @@ def look_and_pause(browser: Browser, film: Path) -> None:
     # not just a shape: it is dressed as the actor is
     assert np.abs(picture[drawn].mean(axis=0) - actors_color(film)).max() < 40.0
     assert "seen" in browser.text()
-
-
-def look_on_a_phone(browser: Browser) -> None:
-    """The panel is a sheet at the bottom there, and the whole person stands above it."""
-    browser.emulate(scheme="light", size=(360, 640))
-    above = int(640 * (1.0 - SHEET_SHARE))
-    until(lambda: shows_a_person(scene(browser, beside_px=0)[1][160:above]), 60.0)
-    browser.emulate(scheme="light", size=(1200, 800))
 
 
 def save(browser: Browser, out: Path, process: subprocess.Popen) -> None:
@@ -293,13 +283,6 @@ def test_the_first_look_sees_the_newest_frame_as_its_camera_did(recording, obser
     seen_there = (world - world[0]) @ rotation.T
     seen_here = page @ look().to_camera(100).camera_from_world[:3, :3].T
     assert seen_here == pytest.approx(seen_there, abs=1e-6)
-
-
-def test_on_a_phone_the_person_stands_above_the_sheet():
-    camera = look(aspect=360 / 640).to_camera(640)
-    person = np.array([[0.0, half, 0.0] for half in (-1.0, 1.0)])
-    assert np.ptp(camera.project(person)[:, 1]) > 0.4 * 640
-    assert camera.project(person)[:, 1].max() < (1.0 - SHEET_SHARE) * 640
 
 
 def test_the_dance_goes_on_and_begins_again(recording):
