@@ -1,11 +1,8 @@
 """Film the actor before a backdrop or in a room, and write a capture folder, exact or a phone's."""
 
-from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from os import cpu_count
 from pathlib import Path
 from typing import final
 
@@ -14,11 +11,13 @@ from jaxtyping import Float, UInt8
 
 from capture.atomic_files import atomic_folder, check_replaceable_folder
 from capture.camera import Camera
+from capture.hardware import usable_cores
 from capture.image_folder import write_png
 from capture.input_error import InputError
 from capture.source import AlphaMask, FrameSelection, RgbImage
 from capture.video import VideoFile
 from capture.video_writer import FFV1, H264, open_video_writer, write_video
+from capture.work_ahead import map_ahead
 from instant_avatar.studio import painted_surfaces, staging
 from instant_avatar.studio.actor import Actor
 from instant_avatar.studio.furnished_room import FurnishedRoom
@@ -53,19 +52,7 @@ ShootProgress = Callable[[int, int], None]
 
 def draw_ahead(render: Callable[[int], RenderedFrame], count: int) -> Iterator[RenderedFrame]:
     """The pictures 0 … count - 1 in order, as `render` draws them."""
-    workers = max(1, min(4, cpu_count() or 1))
-    with ThreadPoolExecutor(workers) as pool:
-        ahead = deque()
-        try:
-            for row in range(count):
-                ahead.append(pool.submit(render, row))
-                if len(ahead) > workers:
-                    yield ahead.popleft().result()
-            while ahead:
-                yield ahead.popleft().result()
-        finally:
-            for waiting in ahead:
-                waiting.cancel()
+    return map_ahead(render, range(count), workers=min(4, usable_cores()))
 
 
 def _to_uint8(alpha: AlphaMask) -> UInt8[np.ndarray, "height width"]:
