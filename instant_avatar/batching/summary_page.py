@@ -3,19 +3,15 @@
 import math
 from collections import Counter
 from collections.abc import Mapping
-from pathlib import Path
 from statistics import median
 from urllib.parse import quote
-
-from jinja2 import Environment, FileSystemLoader
 
 from instant_avatar.batching.batch_folder import folder_of
 from instant_avatar.batching.ingest_attempt import ANIMATION_NAME, LOG_NAME, AttemptRecord
 from instant_avatar.cli.console import format_duration
+from instant_avatar.report.page_rendering import render_template
 from instant_avatar.report.report_schema import format_psnr
 
-TEMPLATE_FOLDERS = (Path(__file__).parent, Path(__file__).parents[1] / "report")
-"""Folders of the page's template, and of the style of all pages."""
 STATUSES = ("failed", "refused", "waiting", "done")
 """States of a capture, the worst first."""
 Results = Mapping[str, AttemptRecord | None]
@@ -46,13 +42,17 @@ def headline(results: Results) -> str:
 
 def summary_page(results: Results, title: str) -> str:
     """Return the page; its pictures lie beside it, in the folders of the captures."""
-    environment = Environment(loader=FileSystemLoader(TEMPLATE_FOLDERS), autoescape=True)
     cards = [
         (name, _status(record), quote(folder_of(name, _status(record))), describe_result(record))
         for name, record in sorted(results.items(), key=_badness)
     ]
-    return environment.get_template("summary.html").render(
-        title=title, headline=headline(results), cards=cards, animation=ANIMATION_NAME, log=LOG_NAME
+    return render_template(
+        "summary.html",
+        title=title,
+        headline=headline(results),
+        cards=cards,
+        animation=ANIMATION_NAME,
+        log=LOG_NAME,
     )
 
 
