@@ -40,16 +40,8 @@ def main(package: Path, picture: Path) -> None:
     )
 
     # A camera 4 m before the pelvis. OpenCV axes: x right, y down, z forward.
-    size, distance = 540, 4.0
-    camera_from_world = np.diag([1.0, -1.0, -1.0, 1.0])
-    camera_from_world[:3, 3] = [0.0, 0.0, distance]
-    camera_from_world[:3, 3] -= camera_from_world[:3, :3] @ player.manifest.rest_joints[0]
-    camera = Camera(
-        focal_px=(1.6 * size, 1.6 * size),
-        center_px=(size / 2, size / 2),
-        size_px=(size, size),
-        camera_from_world=camera_from_world,
-    )
+    eye, axes = player.manifest.rest_joints[0] + [0.0, 0.0, 4.0], np.diag([1.0, -1.0, -1.0])
+    camera = Camera.at(eye, axes, focal_px=1.6 * 540, size_px=(540, 540))
 
     rgba = player.render(pose, camera)  # straight alpha
     Image.fromarray(rgba).save(picture)

@@ -25,16 +25,8 @@ def camera_at(angle: float, looked_at: np.ndarray) -> Camera:
     """A camera that stands so far round the person and looks at a point (OpenCV axes)."""
     forward = -np.array([np.sin(angle), 0.0, np.cos(angle)])
     down = np.array([0.0, -1.0, 0.0])
-    camera_from_world = np.eye(4)
-    camera_from_world[:3, :3] = np.stack([np.cross(down, forward), down, forward])
-    camera_from_world[:3, 3] = -camera_from_world[:3, :3] @ looked_at
-    camera_from_world[2, 3] += DISTANCE_M
-    return Camera(
-        focal_px=(2.0 * SIZE, 2.0 * SIZE),
-        center_px=(SIZE / 2, SIZE / 2),
-        size_px=(SIZE, SIZE),
-        camera_from_world=camera_from_world,
-    )
+    axes = np.stack([np.cross(down, forward), down, forward])
+    return Camera.at(looked_at - DISTANCE_M * forward, axes, 2.0 * SIZE, (SIZE, SIZE))
 
 
 def main(package: Path, moving: Path) -> None:

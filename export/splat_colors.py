@@ -50,18 +50,9 @@ def cameras_around(
         turn = 2.0 * np.pi * number / views
         tilt = ELEVATION_RAD if number % 2 else -ELEVATION_RAD
         # the first camera, before the body, looks along -z with y down
-        axes = Rotation.from_euler("YX", [np.pi + turn, tilt]).as_matrix().T
-        camera_from_world = np.eye(4)
-        camera_from_world[:3, :3] = np.diag([-1.0, -1.0, 1.0]) @ axes
-        camera_from_world[:3, 3] = [0.0, 0.0, distance_m] - camera_from_world[:3, :3] @ middle
-        found.append(
-            Camera(
-                focal_px=(focal, focal),
-                center_px=(0.5 * side, 0.5 * side),
-                size_px=(side, side),
-                camera_from_world=camera_from_world,
-            )
-        )
+        right_up = Rotation.from_euler("YX", [np.pi + turn, tilt]).as_matrix().T
+        axes = np.diag([-1.0, -1.0, 1.0]) @ right_up
+        found.append(Camera.at(middle - distance_m * axes[2], axes, focal, (side, side)))
     return found
 
 

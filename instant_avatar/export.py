@@ -274,16 +274,8 @@ def synthetic_views(rig: "Rig") -> list[tuple[BodyPose, Camera]]:
     distance = DISTANCE_HEIGHTS * (high[1] - low[1])
     # person_px / focal = height / distance, of which the height cancels
     focal = PERSON_HEIGHT_SHARE * VIEW_PX * DISTANCE_HEIGHTS
-    axes = np.diag([1.0, -1.0, -1.0])
-    camera_from_world = np.eye(4)
-    camera_from_world[:3, :3] = axes
-    camera_from_world[:3, 3] = [0.0, 0.0, distance] - axes @ (0.5 * (low + high))
-    camera = Camera(
-        focal_px=(focal, focal),
-        center_px=(VIEW_PX / 2, VIEW_PX / 2),
-        size_px=(VIEW_PX, VIEW_PX),
-        camera_from_world=camera_from_world,
-    )
+    eye, axes = 0.5 * (low + high) + [0.0, 0.0, distance], np.diag([1.0, -1.0, -1.0])
+    camera = Camera.at(eye, axes, focal, (VIEW_PX, VIEW_PX))
     return [(motion[row], camera) for row in range(CHECK_VIEWS)]
 
 

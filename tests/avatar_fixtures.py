@@ -99,13 +99,8 @@ def observed(shaped) -> Callable[..., Observation]:
     """
 
     def observe(*, turned=0.0, lowered=0.8, alpha=None, up_m=0.0, distance_m=4.0) -> Observation:
-        camera_from_world = np.diag([1.0, -1.0, -1.0, 1.0])
         eye = shaped.joints[0] + [0.0, up_m, distance_m]
-        camera_from_world[:3, 3] = -camera_from_world[:3, :3] @ eye
-        camera = Camera(
-            focal_px=(350.0, 350.0), center_px=(100.0, 100.0), size_px=(200, 200),
-            camera_from_world=camera_from_world,
-        )  # fmt: skip
+        camera = Camera.at(eye, np.diag([1.0, -1.0, -1.0]), 350.0, (200, 200))
         pose = BodyPose(
             root_rotation=np.array([0.0, turned, 0.0]),
             root_translation=np.zeros(3),

@@ -67,17 +67,9 @@ def _camera_around(
     """A level camera that looks at a point from an angle about the vertical, 0: from the front."""
     forward = -np.array([np.sin(angle), 0.0, np.cos(angle)])
     down = np.array([0.0, -1.0, 0.0])
-    camera_from_world = np.eye(4)
-    camera_from_world[:3, :3] = np.stack([np.cross(down, forward), down, forward])
-    camera_from_world[:3, 3] = -camera_from_world[:3, :3] @ (target - distance_m * forward)
-    width, height = VIEW_PX
-    focal_px = PERSON_SHARE * height * distance_m / height_m
-    return Camera(
-        focal_px=(focal_px, focal_px),
-        center_px=(width / 2, height / 2),
-        size_px=VIEW_PX,
-        camera_from_world=camera_from_world,
-    )
+    axes = np.stack([np.cross(down, forward), down, forward])
+    focal_px = PERSON_SHARE * VIEW_PX[1] * distance_m / height_m
+    return Camera.at(target - distance_m * forward, axes, focal_px, VIEW_PX)
 
 
 def render_unfilmed_views(

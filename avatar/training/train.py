@@ -414,14 +414,8 @@ def _small_trainer(trainer: Trainer) -> Trainer:
 
 
 def _front_camera(rig: Rig) -> Camera:
-    camera_from_world = np.diag([1.0, -1.0, -1.0, 1.0])
-    camera_from_world[:3, 3] = -camera_from_world[:3, :3] @ (rig.rest_joints[0] + [0.0, 0.0, 3.0])
-    return Camera(
-        focal_px=(WARMUP_IMAGE_PX * 1.5, WARMUP_IMAGE_PX * 1.5),
-        center_px=(WARMUP_IMAGE_PX / 2, WARMUP_IMAGE_PX / 2),
-        size_px=(WARMUP_IMAGE_PX, WARMUP_IMAGE_PX),
-        camera_from_world=camera_from_world,
-    )
+    eye, axes = rig.rest_joints[0] + [0.0, 0.0, 3.0], np.diag([1.0, -1.0, -1.0])
+    return Camera.at(eye, axes, 1.5 * WARMUP_IMAGE_PX, (WARMUP_IMAGE_PX, WARMUP_IMAGE_PX))
 
 
 def _dummy_frame(rig: Rig, camera: Camera) -> TrainingFrame:

@@ -10,6 +10,7 @@ from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.coverage import coverage_advice
 from avatar.events import FrameArrived, Stepped, WaitingForFrame
 from avatar.rig import canonical_rotations
+from capture.camera import Camera
 from instant_avatar.phone.film_queue import Film
 from instant_avatar.report.page_rendering import webp_data_uri
 from instant_avatar.report.report_page import CoverageMap
@@ -17,7 +18,6 @@ from instant_avatar.run.live_viewer import (
     CENTER_ABOVE_PELVIS_M,
     INITIAL_DISTANCE_M,
     INITIAL_FOV_RAD,
-    BrowserCamera,
     render_preview,
 )
 from instant_avatar.run.session_events import (
@@ -148,9 +148,7 @@ class FilmFeedback:
         axes = np.array([[cosine, 0.0, -sine], [0.0, -1.0, 0.0], [-sine, 0.0, -cosine]])
         position = np.array([sine, 0.0, cosine]) * INITIAL_DISTANCE_M
         position[1] = CENTER_ABOVE_PELVIS_M
-        camera = BrowserCamera(
-            world_from_camera=axes.T, position=position, fov=INITIAL_FOV_RAD, aspect=0.8,
-            moved_at=0.0,
-        ).to_camera(PREVIEW_PX)  # fmt: skip
+        focal_px = 0.5 * PREVIEW_PX / float(np.tan(0.5 * INITIAL_FOV_RAD))
+        camera = Camera.at(position, axes, focal_px, (round(0.8 * PREVIEW_PX), PREVIEW_PX))
         pose, grid = self._grid
         return webp_data_uri(render_preview(avatar, pose, camera, cells=grid))

@@ -1,7 +1,7 @@
 """A person whose field is a formula: capsules about the bones, striped, soft at the rim."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -30,12 +30,7 @@ class StandIn:
 
     @property
     def canonical(self) -> BodyPose:
-        zero = np.zeros(3)
-        return BodyPose(
-            root_rotation=zero,
-            root_translation=zero,
-            joint_rotations=self.rig.canonical_rotations,
-        )
+        return replace(BodyPose.rest(), joint_rotations=self.rig.canonical_rotations)
 
     def volume_render(self, pose: BodyPose, camera: Camera) -> np.ndarray:
         """The exact picture: every sample is carried into canonical space by itself."""
@@ -143,15 +138,8 @@ def bent(stand_in: StandIn) -> BodyPose:
 
 def camera_of(width: int, height: int, *, distance_m: float = 3.0) -> Camera:
     """Looks at the pelvis from the front."""
-    camera_from_world = np.diag([1.0, -1.0, -1.0, 1.0])
-    camera_from_world[:3, 3] = [0, -0.25, distance_m]
-    focal = 1.4 * height
-    return Camera(
-        focal_px=(focal, focal),
-        center_px=(width / 2, height / 2),
-        size_px=(width, height),
-        camera_from_world=camera_from_world,
-    )
+    eye, axes = np.array([0.0, -0.25, distance_m]), np.diag([1.0, -1.0, -1.0])
+    return Camera.at(eye, axes, 1.4 * height, (width, height))
 
 
 @pytest.fixture(scope="session")
