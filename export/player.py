@@ -5,7 +5,7 @@ rgba = player.render(pose, camera)          # uint8, straight alpha
 """
 
 from collections.abc import Generator, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import final
 
@@ -169,14 +169,8 @@ class Player:
 
     def render_canonical(self, camera: Camera) -> UInt8[np.ndarray, "height width 4"]:
         """Draw the avatar in its canonical pose, where it was learnt; straight alpha."""
-        return self.render(
-            BodyPose(
-                root_rotation=np.zeros(3),
-                root_translation=np.zeros(3),
-                joint_rotations=self.manifest.canonical_rotations,
-            ),
-            camera,
-        )
+        learnt = self.manifest.canonical_rotations
+        return self.render(replace(BodyPose.rest(), joint_rotations=learnt), camera)
 
     def render(
         self,

@@ -5,6 +5,7 @@ elsewhere, in other poses, fog shows as pixels that are neither opaque nor empty
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -54,9 +55,7 @@ def unfilmed_views(rig: Rig) -> Iterator[tuple[BodyPose, Camera]]:
         joints = np.zeros((23, 3))
         for joint, rotation in rotations.items():
             joints[joint] = rotation
-        pose = BodyPose(
-            root_rotation=np.zeros(3), root_translation=np.zeros(3), joint_rotations=joints
-        )
+        pose = replace(BodyPose.rest(), joint_rotations=joints)
         for side in range(SIDES):
             yield pose, _camera_around(target, 2.0 * np.pi * side / SIDES, distance_m, height_m)
 

@@ -17,7 +17,6 @@ from preprocess.body.kinematics import (
     JOINT_NAMES,
     body_from_rest,
     rotation_matrices,
-    slerp,
     world_from_body,
 )
 from preprocess.poses.motion_builder import anchor_at_pelvis
@@ -127,19 +126,12 @@ class ResampledMotion:
         return len(self.positions)
 
     def pose(self, frame: int) -> BodyPose:
-        """Return the pose of a frame: slerp of rotations, linear root translation."""
+        """Return the pose of a frame."""
         before, share = self._split_position(frame)
         first = self.motion[int(self.valid_rows[before])]
         if share < 1e-6:
             return first
-        last = self.motion[int(self.valid_rows[before + 1])]
-        turned = slerp(_rotations(first), _rotations(last), np.array([share]))[0]
-        way = last.root_translation - first.root_translation
-        return BodyPose(
-            root_rotation=turned[0],
-            root_translation=first.root_translation + share * way,
-            joint_rotations=turned[1:],
-        )
+        return first.towards(self.motion[int(self.valid_rows[before + 1])], share)
 
     def nearest_row(self, frame: int) -> int:
         """Return the row of the motion nearest to a frame."""
@@ -150,10 +142,6 @@ class ResampledMotion:
         place = min(float(self.positions[frame]), len(self.valid_rows) - 1.0)
         before = int(place + 1e-6)
         return before, max(0.0, place - before)
-
-
-def _rotations(pose: BodyPose) -> Float[np.ndarray, "24 3"]:
-    return np.concatenate([pose.root_rotation[None], pose.joint_rotations])
 
 
 PERSON_HEIGHT_SHARE = 0.8

@@ -19,7 +19,6 @@ from instant_avatar.studio.lighting import LAMP_RGB, RenderedFrame, composite_ov
 from instant_avatar.studio.outfit import SHIRT, TROUSERS, PerVertex, Vertices
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.body_surface import vertex_normals
-from preprocess.body.kinematics import slerp
 
 WAVES = 4
 SHIRT_M, TROUSERS_M = 0.010, 0.006
@@ -180,12 +179,4 @@ def expose(
 def _pose_between(motion: Motion, at: float) -> BodyPose:
     """The pose at a moment between two rows."""
     row = min(int(at), max(len(motion) - 2, 0))
-    share = at - row
-    first, second = motion[row], motion[min(row + 1, len(motion) - 1)]
-    turned = slerp(
-        np.concatenate([first.root_rotation[None], first.joint_rotations]),
-        np.concatenate([second.root_rotation[None], second.joint_rotations]),
-        np.array([share]),
-    )[0]
-    place = (1.0 - share) * first.root_translation + share * second.root_translation
-    return BodyPose(root_rotation=turned[0], root_translation=place, joint_rotations=turned[1:])
+    return motion[row].towards(motion[min(row + 1, len(motion) - 1)], at - row)

@@ -6,6 +6,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from preprocess.body.kinematics import slerp
 from preprocess.tracking.keypoints import KeypointTrack
 
 
@@ -34,6 +35,16 @@ class BodyPose:
             root_translation=np.zeros(3),
             joint_rotations=np.zeros((23, 3)),
         )
+
+    def towards(self, other: "BodyPose", share: float) -> "BodyPose":
+        """The pose at a share of the way to another: joints turn evenly, the root goes straight."""
+        before, after = (
+            np.concatenate([pose.root_rotation[None], pose.joint_rotations])
+            for pose in (self, other)
+        )
+        turned = slerp(before, after, share)
+        place = (1.0 - share) * self.root_translation + share * other.root_translation
+        return BodyPose(root_rotation=turned[0], root_translation=place, joint_rotations=turned[1:])
 
 
 RootAnchor = Literal["pelvis", "origin", "hips"]

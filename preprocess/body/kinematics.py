@@ -178,10 +178,10 @@ def _as_axis_angles(part: Float[np.ndarray, "..."]) -> Float[np.ndarray, "poses 
 def slerp(
     before: Float[np.ndarray, "joints 3"],
     after: Float[np.ndarray, "joints 3"],
-    fractions: Float[np.ndarray, "rows"],
-) -> Float[np.ndarray, "rows joints 3"]:
-    """Rotations on the shortest way from one to the other (slerp; Shoemake 1985)."""
+    share: float,
+) -> Float[np.ndarray, "joints 3"]:
+    """Rotations at a share of the shortest way from one to the other (slerp; Shoemake 1985)."""
     start = rotation_matrices(before)
     way = axis_angles_from_matrices(np.swapaxes(start, -1, -2) @ rotation_matrices(after))
-    turned = start @ rotation_matrices(fractions[:, None, None] * way)  # R_a exp(t log(R_aᵀ R_b))
+    turned = start @ rotation_matrices(share * way)  # R_a exp(t log(R_aᵀ R_b))
     return axis_angles_from_matrices(turned)

@@ -1,5 +1,7 @@
 """The rig: weights, joints, box and volumes against the body they come from."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import binary_fill_holes
@@ -23,18 +25,12 @@ from preprocess.body.kinematics import PARENTS
 def pose(request) -> BodyPose:
     """Any pose, however unnatural, with the root at rest."""
     rotations = np.random.default_rng(request.param).normal(size=(23, 3)) * 0.3 * request.param
-    return BodyPose(
-        root_rotation=np.zeros(3), root_translation=np.zeros(3), joint_rotations=rotations
-    )
+    return replace(BodyPose.rest(), joint_rotations=rotations)
 
 
 @pytest.fixture(scope="module")
 def canonical(shaped) -> BodyPose:
-    return BodyPose(
-        root_rotation=np.zeros(3),
-        root_translation=np.zeros(3),
-        joint_rotations=canonical_rotations(),
-    )
+    return replace(BodyPose.rest(), joint_rotations=canonical_rotations())
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,6 @@ from scipy import ndimage
 
 from avatar.evaluation.image_metrics import psnr
 from baselines.reference_player import PlayerInputs, draw_reference, trace_picture
-from capture.camera import Camera
 from capture.input_error import InputError
 from export.bake import compositor
 from export.bake.compositor import VoxelCodes, composite_segments
@@ -370,18 +369,13 @@ def test_onnxruntime_keeps_no_record_of_who_plays_what(module, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_package_of_two_points_runs_every_graph_and_is_small(tmp_path):
+def test_a_package_of_two_points_runs_every_graph_and_is_small(camera, tmp_path):
     path = tmp_path / "avatar.iavatar"
     write_warm_up_package(path)
     assert path.stat().st_size < 200_000
     assert set(read_package(path, tier=None).graphs) == {*QUALITY_TIERS, COARSE_GRAPH}
-    camera = Camera(
-        focal_px=(64.0, 64.0), center_px=(32.0, 32.0), size_px=(64, 64),
-        camera_from_world=np.array(
-            [[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 3], [0, 0, 0, 1]], float
-        ),
-    )  # fmt: skip
+    view = camera(64, 64)
     for tier in QUALITY_TIERS:
-        drawn = Player.load(path, tier=tier).render(BodyPose.rest(), camera)
+        drawn = Player.load(path, tier=tier).render(BodyPose.rest(), view)
         assert drawn.shape == (64, 64, 4)
         assert not drawn[..., 3].any()  # its brick is empty

@@ -80,10 +80,7 @@ def test_frames_are_prepared_in_order_and_those_left_out_pass_through(rig, clip)
 
 
 def observed(rgb, alpha) -> Observation:
-    size = alpha.shape[::-1]
-    camera = Camera(
-        focal_px=(9.0, 9.0), center_px=(1.0, 1.0), size_px=size, camera_from_world=np.eye(4)
-    )
+    camera = Camera.at(np.zeros(3), np.eye(3), 9.0, alpha.shape[::-1])
     frame = Frame(index=0, time_s=0.0, rgb=rgb)
     return Observation(frame=frame, alpha=alpha, pose=BodyPose.rest(), camera=camera)
 

@@ -29,10 +29,8 @@ def turned(observation, index, *, angle=0.0, bend=0.0, time_s=None):
     """The same picture in a pose whose root has turned and whose elbow has bent so far."""
     joints = np.zeros((23, 3))
     joints[17, 1] = bend
-    pose = BodyPose(
-        root_rotation=np.array([0.0, angle, 0.0]),
-        root_translation=observation.pose.root_translation,
-        joint_rotations=joints,
+    pose = dataclasses.replace(
+        observation.pose, root_rotation=np.array([0.0, angle, 0.0]), joint_rotations=joints
     )
     frame = dataclasses.replace(
         observation.frame, index=index, time_s=index / 100.0 if time_s is None else time_s

@@ -49,9 +49,7 @@ def posed(frame, index, *, knee):
     """The frame under another index, with a knee bent by `knee` radians."""
     rotations = np.zeros((23, 3))
     rotations[3, 0] = knee
-    pose = BodyPose(
-        root_rotation=np.zeros(3), root_translation=np.zeros(3), joint_rotations=rotations
-    )
+    pose = dataclasses.replace(BodyPose.rest(), joint_rotations=rotations)
     return dataclasses.replace(frame, index=index, pose=pose)
 
 

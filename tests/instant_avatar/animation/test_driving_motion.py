@@ -1,5 +1,7 @@
 """Driving motions, and the camera that follows them from a viewpoint."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -97,11 +99,8 @@ def bent_arm():
     """The T-pose with the left forearm forward."""
     joints = np.zeros((23, 3))
     joints[17, 1] = -np.pi / 2.0
-    return BodyPose(
-        root_rotation=np.zeros(3),
-        root_translation=np.array([1.0, 2.0, 3.0]),
-        joint_rotations=joints,
-    )
+    place = np.array([1.0, 2.0, 3.0])
+    return replace(BodyPose.rest(), root_translation=place, joint_rotations=joints)
 
 
 @pytest.mark.parametrize("size", [(160, 90), (90, 160), (120, 120)])

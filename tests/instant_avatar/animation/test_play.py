@@ -17,7 +17,7 @@ from capture.atomic_files import LIST_NAME as LIST
 from export import player_page
 from export.package.package_file import read_package, write_package
 from export.player import Player
-from instant_avatar.animation.driving_motion import FollowingCamera, demo_motion
+from instant_avatar.animation.driving_motion import FollowingCamera, canonical_pose_of, demo_motion
 from instant_avatar.animation.player_checks import REFERENCE_GRAPH
 from instant_avatar.animation.sample_motions import sample_motions
 from preprocess.body.body_pose import BodyPose
@@ -92,13 +92,8 @@ def test_the_film_s_camera_shows_what_the_film_shows(call_play, package, film, t
 
 def test_the_standing_person_takes_four_fifths_of_the_picture(package):
     player = Player.load(package)
-    motion = demo_motion(2)
-    standing = BodyPose(
-        root_rotation=np.zeros(3),
-        root_translation=np.zeros(3),
-        joint_rotations=player.manifest.canonical_rotations,
-    )
-    camera = FollowingCamera.of(player, motion, 256).camera_for(standing)
+    standing = canonical_pose_of(player)
+    camera = FollowingCamera.of(player, demo_motion(2), 256).camera_for(standing)
     rows = np.flatnonzero((player.render(standing, camera)[..., 3] > 127).any(axis=1))
     assert (rows[-1] + 1 - rows[0]) / 256 == pytest.approx(0.8, abs=0.03)
     assert (rows[-1] + 1 + rows[0]) / 2 == pytest.approx(128, abs=4)

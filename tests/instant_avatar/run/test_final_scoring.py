@@ -27,12 +27,7 @@ COUNT = 20
 
 @pytest.fixture
 def held_out() -> list[HeldOutFrame]:
-    camera = Camera(
-        focal_px=(20.0, 20.0), center_px=(8.0, 12.0), size_px=(16, 24), camera_from_world=np.eye(4)
-    )
-    pose = BodyPose(
-        root_rotation=np.zeros(3), root_translation=np.zeros(3), joint_rotations=np.zeros((23, 3))
-    )
+    camera, pose = Camera.at(np.zeros(3), np.eye(3), 20.0, (16, 24)), BodyPose.rest()
     alpha = np.zeros((24, 16), dtype=np.float32)
     alpha[4:20, 4:12] = 1.0
     return [

@@ -181,12 +181,7 @@ SIZE = 40
 
 @pytest.fixture
 def camera():
-    return Camera(
-        focal_px=(50.0, 50.0),
-        center_px=(SIZE / 2, SIZE / 2),
-        size_px=(SIZE, SIZE),
-        camera_from_world=np.eye(4),
-    )
+    return Camera.at(np.zeros(3), np.eye(3), 50.0, (SIZE, SIZE))
 
 
 def rectangle(left, right, top, bottom, depth):
