@@ -69,7 +69,11 @@ def _connect(ray: Any, address: str) -> None:
     on_sigterm = signal.getsignal(signal.SIGTERM)
     try:
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **own)
-    except (ConnectionError, ValueError, RuntimeError) as error:
+    except Exception as error:  # a start that takes too long has no class of its own
+        if address == RAY_LOCAL:
+            raise InputError(
+                f"Ray did not start on this machine ({error}). Is it busy? Run the command again."
+            ) from error
         raise InputError(
             f"--ray {address}: there is no cluster to connect to ({error}). Start one: ray start "
             "--head; or omit --ray to use this machine alone."

@@ -67,6 +67,8 @@ def describe_verdict(report: Report, refusal: str | None, *, is_final: bool) -> 
     """Return the verdict on an avatar as a sentence, and what would make it better."""
     if (failure := refusal or diagnose_failure(report)) is not None:
         return failure
+    if report.verdict is None and report.held_out.psnr is not None:
+        return "The avatar is there. It was not judged from all sides."
     if report.verdict is None:
         scored = [point for point in report.curve if point.psnr is not None]
         estimate = f", at about {format_psnr(scored[-1].psnr, None, digits=0)}" if scored else ""

@@ -338,7 +338,9 @@ def _announce_duration(arguments: IngestArguments, trainer: Trainer, console: Co
             f"no image has come for {arguments.idle_seconds:g} s, or Ctrl-C."
         )
         return
-    seconds = max(0.0, config.seconds - trainer.wall_seconds)
+    seconds = config.seconds - trainer.wall_seconds
+    if (config.steps - trainer.steps if config.steps else seconds) <= 0:
+        return  # a run that is resumed without a larger budget, as a warning says
     duration = f"{seconds:.0f} s" if seconds >= 10.0 else f"{seconds:.1g} s"
     if config.steps:
         duration = f"{config.steps - trainer.steps} steps"

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -76,6 +77,16 @@ def test_without_ray_it_says_what_to_install(monkeypatch, capsys):
     monkeypatch.setattr(command_line, "find_spec", lambda module: None if module == "ray" else True)
     assert batch.main(["films", "--out", "o"]) == 2
     assert "[learn,cluster]" in capsys.readouterr().err
+
+
+def test_where_ray_does_not_start_one_line_says_so(tmp_path, copies, monkeypatch, capsys):
+    def init(**_):
+        raise Exception("The current node timed out during startup.")
+
+    copies(tmp_path / "films", ["a"])
+    monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(init=init, __spec__=True))
+    assert batch.main([str(tmp_path / "films"), "--out", str(tmp_path / "out")]) == 2
+    assert "Ray did not start on this machine (The current" in capsys.readouterr().err
 
 
 def test_a_broken_capture_costs_a_line_and_what_ended_is_not_learnt_again(

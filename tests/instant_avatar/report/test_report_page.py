@@ -250,6 +250,12 @@ def test_an_avatar_of_one_side_is_not_called_sharp():
     assert diagnose_failure(kept) is None
 
 
+def test_scores_that_ended_before_the_verdict_are_not_called_missing():
+    held_out = HeldOutStats.of(scores((29.75, 25.0)), (64, 48))
+    verdict = describe_verdict(report(held_out=held_out), None, is_final=True)
+    assert verdict == "The avatar is there. It was not judged from all sides."
+
+
 SOLVED = {
     "verdict": "solved", "focal_px": 434.2, "scale": {"cues": ["ground"]},
     "frames": {"key": 60, "placed": 28, "interpolated": 2, "missing": 0},

@@ -48,6 +48,7 @@ def test_another_video_is_added_and_both_are_learnt_from(
     assert sum(number < 0 for number in numbers) == sum(number >= 0 for number in numbers) == 9
     again = call_ingest(other, "--out", out, "--resume", "--frames", "12:24", GIVEN)
     assert again.code == 0
+    assert "Training for" not in again.err  # the budget is used
     assert json.loads((out / "report.json").read_text())["earlier_videos"] == extended
 
 

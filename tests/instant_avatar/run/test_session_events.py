@@ -4,8 +4,11 @@ import json
 import signal
 import threading
 from collections import Counter
+from contextlib import ExitStack
 from dataclasses import asdict, replace
 from functools import partial
+from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -21,6 +24,7 @@ from instant_avatar import train
 from instant_avatar.cli.console import Console
 from instant_avatar.report import report_writer
 from instant_avatar.run import snapshot_writer
+from instant_avatar.run.console_reader import ConsoleReader
 from instant_avatar.run.run_folder import RunFolder
 from instant_avatar.run.session_events import PackageWritten, Scored, SessionEvent
 from instant_avatar.run.session_start import _announce_coverage
@@ -271,3 +275,15 @@ def test_poses_without_a_frame_do_not_count(folder):
     strays = replace(capture.geometry(), row_frames=numbers)
     object.__setattr__(capture, "geometry", lambda: strays)
     assert len(announced(capture)) == 1
+
+
+@pytest.mark.parametrize(("steps", "shown"), [(60, "step 60 of 60, 7 s"), (96, "step 96, 7 s")])
+def test_steps_beyond_the_wish_are_not_counted_against_it(steps, shown):
+    """A stream makes a least number of them, and each frame takes one."""
+    session = Mock(spec=TrainingSession, curve=[])
+    budget = SimpleNamespace(seconds=3.0, steps=60)
+    session.trainer = Mock(steps=steps, config=budget, wall_seconds=7.0, frames_seen=9)
+    session.coverage, session.meter = Mock(seen_share=0.5), Mock(is_paced=False)
+    with ExitStack() as cleanup:
+        text = ConsoleReader(session, Console(), cleanup)._training_text()
+    assert text.startswith(f"{shown} · ")
