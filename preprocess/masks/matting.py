@@ -1,11 +1,14 @@
 """Alpha matting of a mask's border before a known background, and the guided filter.
 
 A border pixel shows I = a F + (1 - a) B (Chuang et al. 2001, a Bayesian approach to digital
-matting). `refine_border` knows the background: the border may be displaced from the mask's, each
-displacement gives a pixel its a, and is weighted by the prior of the mask's error and by the
-likelihood of the color. The result is the mean over all displacements. `guided_coefficients` are
-those of the guided filter with a color guide (He et al. 2013, Guided image filtering).
+matting). `refine_border` knows the background: the border may be displaced from the mask's, and
+sharp or soft. Each displacement and width gives a pixel its a, and is weighted by the prior of the
+mask's error, by how often borders are so wide in the frame, and by the likelihood of the color. The
+result is the mean over all of them. `guided_coefficients` are those of the guided filter with a
+color guide (He et al. 2013, Guided image filtering).
 """
+
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -16,16 +19,24 @@ from preprocess.masks.color_models import (
     Channels,
     FullImage,
     FullPlane,
+    Pixels,
     Plane,
     PlateColors,
 )
 
+BORDER_WIDTHS_PX = np.array([1.0, 2.0, 4.0], np.float32)
+"""Widths over which alpha falls from 1 to 0: borders are soft where a picture was enlarged, is out
+of focus or moves. How often each occurs is estimated in each frame."""
 BORDER_SIGMA_PX = 0.35
-"""Standard deviation of a mask's border error, px."""
+"""Standard deviation of the error of a mask's sharp border, px; it grows with the root of the
+border's width."""
 BORDER_SHIFTS_PX = np.linspace(-1.6, 1.6, 9, dtype=np.float32)
-"""Displacements of the border that are averaged, px."""
-BORDER_BAND_PX = 2.2
+"""Displacements of a sharp border that are averaged, px; they grow alike."""
+BORDER_BAND_PX = 3.6
 """Largest distance from the mask's border of a pixel that is refined, px."""
+SHARE_STRIDE, SHARE_ITERATIONS, MIN_SHARE = 4, 8, 0.05
+"""Pixels of which one tells how often each width occurs, iterations of that estimate, and the
+share below which a width is left out."""
 COLOR_AXES = np.array(
     [[0.45, 0.35, -0.118], [0.88, -0.293, -0.232], [0.171, -0.057, 0.35]], np.float32
 )
@@ -93,7 +104,7 @@ def refine_border(
     background: tuple[Float32[np.ndarray, "height width 3"], Plane],
     foreground: tuple[Float32[np.ndarray, "height width 3"], Plane],
 ) -> Plane:
-    """Move a mask's border to where the colors change from person to background.
+    """Move a mask's border to where the colors change from person to background, as softly.
 
     Args:
         rgb: The image, in levels of any type.
@@ -103,34 +114,94 @@ def refine_border(
     outside = border_distance_px(alpha)
     spread = background[1] + foreground[1]
     at = (np.abs(outside) < BORDER_BAND_PX) & np.isfinite(spread)
-    away = outside[at]
-    tried = np.clip(0.5 - (away[:, None] + BORDER_SHIFTS_PX), 0.0, 1.0).astype(np.float32)
-    off = (rgb[at].astype(np.float32) - background[0][at]) @ COLOR_AXES
-    apart = (foreground[0][at] - background[0][at]) @ COLOR_AXES
-    # |I - (a F + (1 - a) B)|² = |off - a apart|², for each displacement's a
-    squared = (off**2).sum(axis=1)[:, None] - 2.0 * tried * (off * apart).sum(axis=1)[:, None]
-    squared += tried**2 * (apart**2).sum(axis=1)[:, None]
-    noise = (background[1][at] ** 2)[:, None] * (1.0 - tried) ** 2 + 1.0
-    likely = LIKELIHOOD_FLOOR + (1.0 - OUTLIER_PROBABILITY) * _color_likelihood(
-        squared, noise, tried, foreground[1][at][:, None]
-    )
-    likely += OUTLIER_PROBABILITY * _color_likelihood(
-        squared, noise, tried, np.float32(OUTLIER_SPREAD)
-    )
-    weight = np.float32(LIKELIHOOD_EXPONENT) * np.log(likely)
-    weight -= np.float32(0.5) * (BORDER_SHIFTS_PX / np.float32(BORDER_SIGMA_PX)) ** 2
-    np.exp(weight, out=weight)
     found = alpha.copy()
-    found[at] = (weight * tried).sum(axis=1) / weight.sum(axis=1)
+    if not at.any():
+        return found
+    pixels = _BorderPixels(
+        away=outside[at],
+        off=(rgb[at].astype(np.float32) - background[0][at]) @ COLOR_AXES,
+        apart=(foreground[0][at] - background[0][at]) @ COLOR_AXES,
+        noise=background[1][at] ** 2,
+        spread=foreground[1][at],
+    )
+    shares = _width_shares(pixels)
+    likely = shares > MIN_SHARE
+    tried, weight = _weigh_borders(pixels, BORDER_WIDTHS_PX[likely])
+    weight *= shares[likely, None]
+    found[at] = (weight * tried).sum(axis=(1, 2)) / weight.sum(axis=(1, 2))
     return found
 
 
+class _BorderPixels(NamedTuple):
+    """Pixels near a mask's border.
+
+    Attributes:
+        away: Distance from the border, positive outside, px.
+        off, apart: The pixel's color and the person's, from the background's, by `COLOR_AXES`.
+        noise, spread: Variance of the background's color, standard deviation of the person's.
+    """
+
+    away: Pixels
+    off: Float32[np.ndarray, "pixels 3"]
+    apart: Float32[np.ndarray, "pixels 3"]
+    noise: Pixels
+    spread: Pixels
+
+    def every(self, stride: int) -> "_BorderPixels":
+        """One of `stride` pixels."""
+        return _BorderPixels(*(each[::stride] for each in self))
+
+
+def _weigh_borders(
+    pixels: _BorderPixels, widths_px: Float32[np.ndarray, "widths"]
+) -> tuple[
+    Float32[np.ndarray, "pixels widths shifts"], Float32[np.ndarray, "pixels widths shifts"]
+]:
+    """Alpha of each pixel for each width and displacement of the border, and its weight."""
+    wide = widths_px[:, None]
+    across = pixels.away[:, None, None] / wide + BORDER_SHIFTS_PX / np.sqrt(wide)
+    tried = np.clip(np.float32(0.5) - across, np.float32(0.0), np.float32(1.0))
+    off, apart, noise, spread = (each[:, None, None] for each in pixels[1:])
+    # |I - (a F + (1 - a) B)|² = |off - a apart|², for each displacement's a
+    squared = (off**2).sum(axis=-1) - np.float32(2.0) * tried * (off * apart).sum(axis=-1)
+    squared += tried**2 * (apart**2).sum(axis=-1)
+    noisy = noise * (np.float32(1.0) - tried) ** 2 + np.float32(1.0)
+    likely = LIKELIHOOD_FLOOR + (1.0 - OUTLIER_PROBABILITY) * _color_likelihood(
+        squared, noisy, tried, spread
+    )
+    likely += OUTLIER_PROBABILITY * _color_likelihood(
+        squared, noisy, tried, np.float32(OUTLIER_SPREAD)
+    )
+    weight = np.float32(LIKELIHOOD_EXPONENT) * np.log(likely)
+    weight -= np.float32(0.5) * (BORDER_SHIFTS_PX / np.float32(BORDER_SIGMA_PX)) ** 2
+    return tried, np.exp(weight, out=weight)
+
+
+def _width_shares(pixels: _BorderPixels) -> Float32[np.ndarray, "widths"]:
+    """How often each width occurs, by the likelihoods of all pixels (expectation maximization).
+
+    Borders are sharp as far as colors inside them are not the person's expected ones: half of an
+    expected color would be a soft border everywhere.
+    """
+    inside = pixels.away < 1.0 - BORDER_BAND_PX
+    off = np.linalg.norm(pixels.off[inside] - pixels.apart[inside], axis=1)
+    expected = np.float32((off < 2.0 * pixels.spread[inside]).sum() / max(inside.sum(), 1))
+    likelihoods = _weigh_borders(pixels.every(SHARE_STRIDE), BORDER_WIDTHS_PX)[1].sum(axis=2)
+    shares = BORDER_WIDTHS_PX**-2 / (BORDER_WIDTHS_PX**-2).sum()  # mostly sharp, if all are alike
+    for _ in range(SHARE_ITERATIONS):
+        belongs = likelihoods * shares
+        shares = (belongs / belongs.sum(axis=1, keepdims=True)).mean(axis=0)
+    shares *= expected
+    shares[0] += np.float32(1.0) - expected
+    return shares
+
+
 def _color_likelihood(
-    squared: Float32[np.ndarray, "pixels tried"],
-    noise: Float32[np.ndarray, "pixels tried"],
-    alpha: Float32[np.ndarray, "pixels tried"],
+    squared: Float32[np.ndarray, "*tried"],
+    noise: Float32[np.ndarray, "*tried"],
+    alpha: Float32[np.ndarray, "*tried"],
     spread: Float32[np.ndarray, "..."] | np.float32,
-) -> Float32[np.ndarray, "pixels tried"]:
+) -> Float32[np.ndarray, "*tried"]:
     """Density of a color at a squared distance from the mixture, up to a factor."""
     variance = noise + (alpha * spread) ** 2
     ratio = np.float32(16.0) / variance

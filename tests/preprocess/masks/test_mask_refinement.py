@@ -274,6 +274,13 @@ def test_a_border_half_a_pixel_off_comes_back(rng):
         np.testing.assert_array_equal(found[far], given[far])
 
 
+def test_a_soft_border_stays_soft():
+    """Of an enlarged or moving picture: what lies beside a sharp mask is a mixture, too."""
+    true, given = cv2.GaussianBlur(disc(20.2), (0, 0), 1.5), disc(20.7)
+    found = refine_border(pictured(true, WALL), given, constant(WALL, 5.0), constant(SUIT, 8.0))
+    assert np.abs(found - true).sum() < 0.33 * np.abs(given - true).sum()
+
+
 def test_nothing_changes_where_either_color_is_unknown():
     picture, given = pictured(disc(20.2), WALL), disc(19.7)
     known, unknown = constant(WALL, 5.0), constant(SUIT, np.inf)
