@@ -68,7 +68,8 @@ def test_an_added_video_keeps_the_avatars_body_and_says_how_its_own_differs(
     changed(other / "poses.npz", betas=betas)
     outcome = call_ingest(other, "--out", out, "--resume", *FEW)
     assert outcome.code == 0
-    assert f"state a body of {100 * stated.height_m:.0f} cm" in " ".join(outcome.err.split())
+    said = " ".join(outcome.err.split())
+    assert f"body of these poses is {100 * stated.height_m:.0f} cm tall" in said
     kept = read_shaped_body(out / "checkpoint" / "person.npz", body)
     np.testing.assert_array_equal(kept.vertices, person.vertices)
     trainer, _ = checkpoint.load(out / "checkpoint")
