@@ -47,8 +47,8 @@ def encode_webp(
     first, *others = [Image.fromarray(picture) for picture in pictures]
     frame_ms, buffer = max(1, round(1000.0 / fps)), io.BytesIO()
     moving = {"save_all": True, "append_images": others, "duration": frame_ms, "loop": 0}
-    in_order = {"kmin": len(others), "kmax": len(others) + 1}  # no key frames are tried
-    options = {"method": 1, **moving, **in_order} if others else {"method": 3}
+    one_key_frame = {"kmin": len(others), "kmax": len(others) + 1}  # the first
+    options = {"method": 1, **moving, **one_key_frame} if others else {"method": 3}
     first.save(buffer, format="WEBP", quality=82, **options)
     return buffer.getvalue()
 

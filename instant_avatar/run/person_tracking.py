@@ -53,7 +53,7 @@ LEARNT_FPS = 14.0
 FEW_FRAMES = 120
 """Number of a film's frames below which none is left out, and that are left at least."""
 FitFunction = Callable[[Capture, Console], CaptureFit | None]
-"""Fits body and poses of a capture, and shows that it does."""
+"""Fits body and poses of a capture, and shows the stage on the console."""
 SAME_PERSON = 0.15
 """Mean distance of one person's key points, found twice in a frame, in the person's size."""
 

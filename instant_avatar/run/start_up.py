@@ -137,9 +137,10 @@ class FitProcess:
         self._process = process
 
     def send(self, capture: "Capture", height_m: float | None, *, with_rig: bool) -> None:
-        """Let the process fit a recording, and make the rig of its person, who is so tall.
+        """Let the process fit a recording, and make the rig of its person `with_rig`.
 
-        What another process cannot open, such as masks by a plugin, is fitted by this one.
+        `height_m` is the person's height, if the user has stated it. What another process cannot
+        open, such as masks by a plugin, is fitted by this one.
         """
         assert self._process.stdin is not None
         with suppress(OSError, pickle.PicklingError, AttributeError, TypeError):  # or it has ended
