@@ -160,19 +160,24 @@ def score_finally(
     fit_poses: bool,
     report_progress: Callable[[str, float], object] = lambda *_: None,
     is_left_out: Callable[[], bool] = lambda: False,
+    clock: Callable[[], float] = time.perf_counter,
 ) -> FinalScores:
     """Score the held-out frames in about `SCORING_LIMIT_S`; with `fit_poses` in fitted poses, too.
 
     After a given number of steps all are scored, whatever the time: the results of such a run do
     not depend on the machine. `report_progress` receives the stage and its share that is done; once
-    `is_left_out` is true, what was scored until then is returned.
+    `is_left_out` is true, what was scored until then is returned. `clock` gives the seconds by
+    which the limit is kept.
     """
     if not held_out:
         return FinalScores()
     limit_s = math.inf if trainer.config.steps else SCORING_LIMIT_S
-    began, scored, fitted = time.perf_counter(), list[_ScoredFrame](), list[HeldOutScore]()
-    whole_until = began + WHOLE_IMAGES_SHARE * limit_s
-    with closing(_score_in_given_poses(trainer.avatar, held_out, whole_until)) as given:
+    began, scored, fitted = clock(), list[_ScoredFrame](), list[HeldOutScore]()
+
+    def is_late(share: float) -> bool:
+        return clock() - began > share * limit_s
+
+    with closing(_score_in_given_poses(trainer.avatar, held_out, is_late)) as given:
         while not is_left_out() and (one := next(given, None)) is not None:
             scored.append(one)
             report_progress(f"scoring {len(held_out)} held-out frames", len(scored) / len(held_out))
@@ -184,7 +189,7 @@ def score_finally(
     if fit_poses and not is_left_out():
         with suppress(KeyboardInterrupt):
             for score in _score_in_fitted_poses(
-                trainer, scored, began + limit_s, report_progress, is_left_out
+                trainer, scored, is_late, report_progress, is_left_out
             ):
                 fitted.append(score)
     order = np.argsort([one.given.frame for one in scored])
@@ -199,14 +204,14 @@ def score_finally(
 
 
 def _score_in_given_poses(
-    avatar: Avatar, held_out: list[HeldOutFrame], whole_until: float
+    avatar: Avatar, held_out: list[HeldOutFrame], is_late: Callable[[float], bool]
 ) -> Generator[_ScoredFrame, None, None]:
     """Score frames in an order of which every prefix is spread over the video."""
 
     def score(numbered: tuple[int, HeldOutFrame]) -> _ScoredFrame:
         numba.set_num_threads(1)  # of this frame; others are scored beside it
         count, frame = numbered
-        late = count >= MIN_WHOLE_IMAGES and time.perf_counter() > whole_until
+        late = count >= MIN_WHOLE_IMAGES and is_late(WHOLE_IMAGES_SHARE)
         if late or count >= MAX_WHOLE_IMAGES:
             sampled = PixelSample.of(frame).score(avatar)
             return _ScoredFrame(frame, score_fine_sample(avatar, frame), sampled, None)
@@ -225,7 +230,7 @@ def _score_in_given_poses(
 def _score_in_fitted_poses(
     trainer: Trainer,
     scored: list[_ScoredFrame],
-    until: float,
+    is_late: Callable[[float], bool],
     report_progress: Callable[[str, float], object],
     is_left_out: Callable[[], bool],
 ) -> Iterator[HeldOutScore]:
@@ -241,7 +246,7 @@ def _score_in_fitted_poses(
 
     def fit(first: int) -> list[HeldOutScore]:
         numba.set_num_threads(1)  # of these frames; others are fitted beside them
-        if is_left_out() or (first and time.perf_counter() > until):
+        if is_left_out() or (first and is_late(1.0)):
             return []
         some, scores = scored[first : first + FRAMES_PER_FIT], list[HeldOutScore]()
         fitted = fit_test_poses(trainer, [one.frame for one in some], progress=check)

@@ -4,9 +4,12 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, replace
 from typing import Any, final
+
+from numba import get_num_threads, set_num_threads
 
 from avatar.evaluation.coverage import Coverage, coverage_advice
 from avatar.evaluation.held_out import PIXELS_PER_FRAME, HeldOutFrame, add_held_out
@@ -37,6 +40,7 @@ from instant_avatar.cli.command_line import BAD_INPUT, INTERRUPTED, CommandExit
 from instant_avatar.report.report_schema import CurvePoint, finite_mean, format_percent
 from instant_avatar.run.final_scoring import (
     EarlierVideos,
+    FinalScores,
     TrainingResult,
     earlier_video_names,
     score_finally,
@@ -58,6 +62,9 @@ from instant_avatar.run.stream_meter import StreamMeter
 from preprocess.capture_session import ObservationSource
 from preprocess.licence_chain import licence_chain
 from preprocess.observation import Observation
+
+FINE_TUNING_CLOCK_RATE = 0.5
+"""Rate of the clock by which scores are limited while the package is fine-tuned beside them."""
 
 
 @final
@@ -102,6 +109,8 @@ class TrainingSession:
         self._result: TrainingResult | None = None
         self._ready_at: float | None = None
         self._report_progress: Callable[[str, float], object] = lambda *_: None
+        self._scores: Future[FinalScores] | None = None
+        self._tuned_at: float | None = None
 
     def run(
         self, report_progress: Callable[[Progressed], object] = lambda _: None
@@ -123,9 +132,10 @@ class TrainingSession:
         yield from self._train()
         self._check_trained()
         self.trainer.replay.clear_correspondences()  # nothing is learnt from here on
-        yield from self._write_packages()
-        EarlierVideos(self._run, self._notes).save_frames(self.trainer)
-        yield from self._score()
+        with ThreadPoolExecutor(1) as beside:
+            yield from self._write_packages(beside)
+            EarlierVideos(self._run, self._notes).save_frames(self.trainer)
+            yield from self._score(beside)
         yield Ended(result=self.result)
 
     def save_package(self) -> ExportReport:
@@ -184,8 +194,11 @@ class TrainingSession:
             licence=licence_chain(self._notes.get("made_with", ())),
         )
 
-    def _write_packages(self) -> Iterator[SessionEvent]:
-        """Write the package as baked, then the fine-tuned one, and checkpoints beside the first."""
+    def _write_packages(self, beside: Executor) -> Iterator[SessionEvent]:
+        """Write the package as baked, then the fine-tuned one, and checkpoints beside the first.
+
+        Held-out frames are scored beside the fine-tuning.
+        """
 
         def check_stop(share: float) -> None:
             if self._is_left_out():
@@ -207,6 +220,9 @@ class TrainingSession:
                 ready_at = self.result.ready_at or time.perf_counter()
                 self._result = replace(self.result, exported=exported, ready_at=ready_at)
                 yield PackageWritten(path=self._run.package, result=self.result, is_final=is_final)
+                self._scores = self._scores or beside.submit(
+                    self._compute_scores, get_num_threads()
+                )
         except ExportRefused as error:  # of the fine-tuned one: that as baked stays
             if self.result.exported is None:
                 self._result = replace(self.result, refusal=str(error))
@@ -218,13 +234,35 @@ class TrainingSession:
         for message in self.result.exported.warnings if self.result.exported else ():
             yield Warned(message=message)
 
-    def _score(self) -> Iterator[SessionEvent]:
+    def _begin_scoring(self, beside: Executor) -> "Future[FinalScores]":
+        if self._scores is None:
+            self._scores = beside.submit(self._compute_scores, get_num_threads())
+        return self._scores
+
+    def _compute_scores(self, threads: int) -> FinalScores:
         """Score held-out frames, in the given poses and in poses fitted to them."""
-        scores = score_finally(
+        set_num_threads(threads)  # each thread has a number of its own
+        began = time.perf_counter()
+
+        def report_progress(stage: str, share: float) -> None:
+            if self._tuned_at is not None:
+                self._report_progress(stage, share)
+
+        def read_clock() -> float:
+            now = time.perf_counter()
+            tuned_at = max(began, self._tuned_at or now)
+            return now - tuned_at + FINE_TUNING_CLOCK_RATE * (tuned_at - began)
+
+        return score_finally(
             self.trainer, self.held_out,
             fit_poses=self.trainer.config.refine_poses and not self.is_interrupted,
-            report_progress=self._report_progress, is_left_out=self._is_left_out,
+            report_progress=report_progress, is_left_out=self._is_left_out, clock=read_clock,
         )  # fmt: skip
+
+    def _score(self, beside: Executor) -> Iterator[SessionEvent]:
+        """Wait for the scores of held-out frames, and add them to curve, package and result."""
+        self._tuned_at = time.perf_counter()
+        scores = self._begin_scoring(beside).result()
         last = self.curve[-1].wall_seconds if self.curve else -1.0
         if scores.sampled and self.trainer.wall_seconds > last:
             wall_s, cpu_s = self.trainer.wall_seconds, self.trainer.cpu_seconds

