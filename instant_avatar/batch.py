@@ -6,11 +6,17 @@ from contextlib import closing
 from pathlib import Path
 
 from instant_avatar.batching.batch_arguments import BatchArguments
-from instant_avatar.batching.batch_folder import RESULTS_NAME, BatchFolder
+from instant_avatar.batching.batch_folder import (
+    RESULTS_NAME,
+    BatchFolder,
+    Results,
+    describe_result,
+    headline,
+    summary_page,
+)
 from instant_avatar.batching.capture_discovery import find_captures, parse_options, split_paths
-from instant_avatar.batching.ray_tasks import run_attempts
+from instant_avatar.batching.ingest_attempt import run_attempts
 from instant_avatar.batching.remote_files import RemoteFileError
-from instant_avatar.batching.summary_page import Results, describe_result, headline, summary_page
 from instant_avatar.cli.command_line import (
     DONE,
     NO_AVATAR,

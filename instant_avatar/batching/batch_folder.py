@@ -1,12 +1,19 @@
-"""The output folder of a batch, local or behind a URL: avatars, and the results of all captures."""
+"""The output folder of a batch, local or behind a URL: avatars, and the results of all captures.
+
+Its summary.html is a contact sheet, the worst first.
+"""
 
 import json
+import math
 import time
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import fields, replace
 from pathlib import Path
+from statistics import median
 from typing import final
+from urllib.parse import quote
 
 from capture.atomic_files import (
     OutputFileList,
@@ -16,7 +23,13 @@ from capture.atomic_files import (
 )
 from capture.input_error import InputError
 from instant_avatar.batching.capture_discovery import BatchCapture
-from instant_avatar.batching.ingest_attempt import PACKAGE_NAME, Attempt, AttemptRecord
+from instant_avatar.batching.ingest_attempt import (
+    ANIMATION_NAME,
+    LOG_NAME,
+    PACKAGE_NAME,
+    Attempt,
+    AttemptRecord,
+)
 from instant_avatar.batching.remote_files import (
     RemoteFileError,
     is_url,
@@ -24,7 +37,9 @@ from instant_avatar.batching.remote_files import (
     open_remote,
     read_text,
 )
-from instant_avatar.cli.console import Console
+from instant_avatar.cli.console import Console, format_duration
+from instant_avatar.report.page_rendering import render_template
+from instant_avatar.report.report_schema import format_psnr
 from instant_avatar.run.run_folder import claim_folder
 
 RESULTS_NAME = "results.jsonl"
@@ -33,6 +48,10 @@ FAILED_NAME = "_failed"
 """Folder with the logs of captures without an avatar."""
 SAVE_INTERVAL_S = 30.0
 """Interval at which the results are sent to a URL, where nothing can be appended, seconds."""
+STATUSES = ("failed", "refused", "waiting", "done")
+"""States of a capture, the worst first."""
+Results = Mapping[str, AttemptRecord | None]
+"""The result of each capture by its name; None for one that waits."""
 
 
 def folder_of(name: str, status: str) -> str:
@@ -167,3 +186,52 @@ def _read_records(text: str) -> Iterator[AttemptRecord]:
         with suppress(ValueError, TypeError, AttributeError):
             content = json.loads(line)
             yield AttemptRecord(**{key: content[key] for key in known & content.keys()})
+
+
+def describe_result(record: AttemptRecord | None) -> str:
+    """Return quality and duration of an avatar, or why there is none."""
+    if record is None:
+        return "not learnt yet"
+    if record.status != "done":
+        return f"{record.status}: {record.cause}"
+    score = format_psnr(record.figures.get("psnr"), record.figures.get("verdict"))
+    return f"{score}, {format_duration(record.wall_s)}"
+
+
+def headline(results: Results) -> str:
+    """Return counts, median quality and median time in a sentence."""
+    counts = Counter(map(_status, results.values()))
+    text = ", ".join(f"{counts[s]} {s}" for s in reversed(STATUSES) if counts[s])
+    done = [record for record in results.values() if record is not None and record.status == "done"]
+    scores = [psnr for record in done if (psnr := record.figures.get("psnr")) is not None]
+    if scores:
+        wall_s = median(record.wall_s for record in done)
+        text += f". Median {format_psnr(median(scores), None)}, {format_duration(wall_s)}"
+    return f"{text}."
+
+
+def summary_page(results: Results, title: str) -> str:
+    """Return the page; its pictures lie beside it, in the folders of the captures."""
+    cards = [
+        (name, _status(record), quote(folder_of(name, _status(record))), describe_result(record))
+        for name, record in sorted(results.items(), key=_badness)
+    ]
+    return render_template(
+        "summary.html",
+        title=title,
+        headline=headline(results),
+        cards=cards,
+        animation=ANIMATION_NAME,
+        log=LOG_NAME,
+    )
+
+
+def _status(record: AttemptRecord | None) -> str:
+    return "waiting" if record is None else record.status
+
+
+def _badness(item: tuple[str, AttemptRecord | None]) -> tuple[int, float, str]:
+    """Return a key by which the worst come first: no avatar, then the lowest PSNR."""
+    name, record = item
+    psnr = None if record is None else record.figures.get("psnr")
+    return STATUSES.index(_status(record)), -math.inf if psnr is None else psnr, name

@@ -11,11 +11,10 @@ import pytest
 from capture.input_error import InputError
 from instant_avatar import ingest
 from instant_avatar.batching.batch_arguments import BatchArguments
-from instant_avatar.batching.batch_folder import BatchFolder
+from instant_avatar.batching.batch_folder import BatchFolder, summary_page
 from instant_avatar.batching.capture_discovery import find_captures
 from instant_avatar.batching.ingest_attempt import AttemptFailure, learn_capture
 from instant_avatar.batching.remote_files import fetch_files, list_files, open_remote, read_text
-from instant_avatar.batching.summary_page import summary_page
 from instant_avatar.cli.command_line import CommandExit
 from instant_avatar.cli.console import Console
 
