@@ -32,8 +32,7 @@ from preprocess.capture_inputs import CaptureInputs, InputKind
 if TYPE_CHECKING:  # it imports torch
     from capture.source import Frame
     from instant_avatar.run.session_events import EventReader
-    from preprocess.capture_session import Capture
-    from preprocess.fitting.capture_fit import CaptureFit
+    from preprocess.capture_session import Capture, CaptureFit
     from preprocess.tracking.keypoints import PersonKeypoints
 
 

@@ -18,7 +18,7 @@ from capture.image_folder import list_images
 from capture.input_error import InputError
 from capture.source import FrameSource
 from preprocess.body.kinematics import rigid_transform
-from preprocess.cameras.named_camera import NamedCamera
+from preprocess.cameras.camera_formats import NamedCamera
 
 
 def associate_by_order(rows: int, source: FrameSource, things: str) -> Callable[[int], int]:

@@ -27,8 +27,7 @@ from capture.image_folder import list_images, write_png
 from capture.input_error import InputError
 from instant_avatar.cli.console import Console
 from preprocess.cameras.camera_file import CameraTrack, write_cameras
-from preprocess.cameras.camera_formats import find_colmap_model, read_colmap_model
-from preprocess.cameras.named_camera import NamedCamera
+from preprocess.cameras.camera_formats import NamedCamera, find_colmap_model, read_colmap_model
 from preprocess.file_content import read_npz
 from preprocess.masks.mask_files import Masks, open_masks
 

@@ -26,8 +26,7 @@ from preprocess.capture_inputs import (
     find_cameras,
     find_own_masks,
 )
-from preprocess.capture_session import Capture
-from preprocess.fitting.capture_fit import CaptureFit
+from preprocess.capture_session import Capture, CaptureFit
 from preprocess.fitting.capture_fitting import fit_capture, fitted_motion
 from preprocess.masks.mask_files import open_masks
 from preprocess.masks.mask_refinement import MaskRefiner

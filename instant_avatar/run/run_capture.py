@@ -24,11 +24,12 @@ from preprocess.cameras.camera_file import write_cameras
 from preprocess.capture_inputs import CaptureInputs, InputKind
 from preprocess.capture_session import (
     Capture,
+    CaptureFit,
     ObservationSource,
     RecordedObservations,
+    load_capture_fit,
     video_identity,
 )
-from preprocess.fitting.capture_fit import CaptureFit, load_capture_fit
 from preprocess.fitting.capture_fitting import apply_fit, fit_capture
 from preprocess.masks.mask_refinement import MaskRefiner
 from preprocess.open_capture import (

@@ -24,8 +24,7 @@ from capture.hardware import usable_cores
 if TYPE_CHECKING:  # the process that fits needs no console, and scipy only once it has begun
     from avatar.rig import Rig
     from instant_avatar.cli.console import Console
-    from preprocess.capture_session import Capture
-    from preprocess.fitting.capture_fit import CaptureFit
+    from preprocess.capture_session import Capture, CaptureFit
 
 COMPILE = (
     "import gc; gc.disable(); from instant_avatar.run.start_up import warm_up; "

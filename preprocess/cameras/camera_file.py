@@ -12,11 +12,12 @@ from capture.input_error import InputError
 from capture.source import FrameSource
 from preprocess.body.body_pose import Motion, RelativeFocalLength
 from preprocess.cameras.camera_formats import (
+    checked_camera,
+    checked_rigid,
     find_multi_view_cameras,
     read_multi_view_camera,
     read_named_cameras,
 )
-from preprocess.cameras.named_camera import checked_camera, checked_rigid
 from preprocess.capture_inputs import find_cameras
 from preprocess.file_content import explain_damage, read_npz
 from preprocess.frame_association import cameras_by_frame, interpolate_missing_cameras

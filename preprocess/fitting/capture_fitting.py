@@ -24,8 +24,7 @@ from preprocess.alignment.capture_geometry import CaptureGeometry, rescale_motio
 from preprocess.alignment.silhouette_objective import spaced_indices
 from preprocess.body.body_pose import Motion
 from preprocess.body.proportion_space import SIGMA_BETA, ProportionSpace
-from preprocess.capture_session import Capture, Provenance
-from preprocess.fitting.capture_fit import CaptureFit
+from preprocess.capture_session import Capture, CaptureFit, Provenance
 from preprocess.fitting.clip_fitting import (
     POSES_ALONE,
     TRACKED_WEIGHTS,

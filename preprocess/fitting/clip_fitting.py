@@ -4,7 +4,7 @@ A tracker's poses are off by several degrees and centimetres, slowly varying and
 its body has other proportions than the person, and the focal length is a guess. All of it is fitted
 at once by Gauss-Newton: residuals are distances between outlines (`preprocess.fitting.outlines`),
 priors hold what outlines leave undetermined, and corrections of neighboring frames are alike.
-What a fit changes of a capture is a `CaptureFit` (`preprocess.fitting.capture_fit`).
+What a fit changes of a capture is a `CaptureFit` (`preprocess.capture_session`).
 """
 
 from collections.abc import Sequence

@@ -20,7 +20,7 @@ from preprocess.body.kinematics import (
 )
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.cameras.camera_file import CameraTrack, tracker_intrinsic_matrix
-from preprocess.cameras.named_camera import invert_rigid
+from preprocess.cameras.camera_formats import invert_rigid
 
 MotionByPerson = dict[str, Motion]
 """By the name that the file gives each, in the file's order."""

@@ -22,7 +22,7 @@ from jaxtyping import Float, Shaped
 
 from capture.input_error import InputError
 from preprocess.body.body_pose import DIAGONAL_FOCAL, Motion, PoseSpace
-from preprocess.cameras.named_camera import checked_rigid
+from preprocess.cameras.camera_formats import checked_rigid
 from preprocess.file_content import explain_damage
 from preprocess.frame_association import frame_numbers_from_names
 from preprocess.poses.motion_builder import MotionByPerson, build_motion

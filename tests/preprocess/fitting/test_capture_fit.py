@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from preprocess.fitting.capture_fit import CaptureFit, load_capture_fit
+from preprocess.capture_session import CaptureFit, load_capture_fit
 
 
 @pytest.fixture

@@ -11,8 +11,8 @@ from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.capture_inputs import CaptureInputs
+from preprocess.capture_session import CaptureFit
 from preprocess.fitting import capture_fitting
-from preprocess.fitting.capture_fit import CaptureFit
 from preprocess.fitting.capture_fitting import (
     HEAD_JOINTS,
     NOISE_DEG_PER_CM,
