@@ -14,9 +14,9 @@ from avatar.evaluation.image_metrics import (
     psnr_of_errors,
 )
 from avatar.render import render
-from avatar.training.head_picture import head_box
 from avatar.training.held_out_pose_fitting import fit_test_poses
 from avatar.training.trainer import Trainer
+from avatar.training.training_pixels import head_box
 
 BORDER_SHARE = 1 / 12
 """Width of the border of the person that is left out of `HeadScore.inside`, in heads: about a

@@ -195,7 +195,7 @@ MECHANISMS = [
         code=(
             "avatar.kernels.numba_priors.toward_sources",
             "avatar.training.unseen_skin",
-            "avatar.training.skin_evidence",
+            "avatar.training.unseen_skin",
         ),
     ),
 ]

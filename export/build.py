@@ -4,6 +4,8 @@
 
 The checks compare a package's player with its rays, composited by a compiled kernel, and with the
 volume renderer.
+
+The smallest package needs no avatar: a browser that has drawn it has compiled what draws one.
 """
 
 import io
@@ -22,7 +24,7 @@ from PIL import Image
 from avatar.avatar_model import Avatar
 from avatar.evaluation.image_metrics import psnr
 from avatar.render import render
-from avatar.rig import Rig
+from avatar.rig import Rig, canonical_rotations
 from capture.input_error import InputError
 from export.bake.bake_tables import BakeConfig, ExportRefused, bake_tables, sample_field
 from export.bake.compositor import draw_traced
@@ -44,12 +46,18 @@ from export.package.package_file import (
     COARSE_GRAPH,
     AvatarPackage,
     PackageWriter,
+    write_package,
 )
 from export.package.player_tables import (
+    BRICK_NODES,
     QUALITY_TIERS,
     THICK_FIELD_TIERS,
+    WEIGHT_SCALE,
+    BrickTable,
     PlayerTables,
     RenderSettings,
+    SkinningGrid,
+    SurfelTable,
 )
 from export.package.table_codec import TableLayout, estimate_brick_bytes
 from export.player import (
@@ -61,6 +69,7 @@ from export.player import (
     straighten,
 )
 from export.player_inputs import fit_camera
+from preprocess.body.kinematics import PARENTS
 
 GRAPH_CHECK_PICTURES = {"hq": 2, "lite": 1}
 """Golden frames on which each tier's graph is compared with its rays composited here. They test the
@@ -467,3 +476,37 @@ def quality_warnings(score: float) -> list[str]:
         return []
     text = POOR_WARNING if score < POOR_PSNR else SIMPLIFIED_WARNING
     return [text.format(score=score, good=GOOD_PSNR)]
+
+
+def write_warm_up_package(path: Path) -> None:
+    """Write a package of two surfels, as high as a person, and an empty brick."""
+    origin = np.zeros(3, np.float32)
+    tables = PlayerTables(
+        surfels=SurfelTable(
+            low=origin - 1.0, extent_m=2.0, spacing_m=0.01,
+            position_codes=np.array([[1 << 15, 0, 1 << 15], [1 << 15, 65535, 1 << 15]], np.uint16),
+            normal_codes=np.array([[0, 0, 127]] * 2, np.int8),
+            thickness_codes=np.full(2, 40, np.uint8),
+        ),
+        bricks=BrickTable(
+            low=origin, voxel_m=0.01, index=np.ones((1, 1, 1), np.int32),
+            voxels=np.zeros((2, *[BRICK_NODES] * 3, 4), np.uint8),
+        ),
+        skinning=SkinningGrid(
+            low=origin - 2.0, step_m=origin + 4.0,
+            index=np.arange(1, 9, dtype=np.int32).reshape(2, 2, 2),
+            weight_codes=np.eye(24, 1, dtype=np.uint16).repeat(9, axis=1) * WEIGHT_SCALE,
+        ),
+        pelvis=origin, reach_m=2.0,
+    )  # fmt: skip
+    manifest = Manifest(
+        rest_joints=np.zeros((24, 3)), parents=np.array(PARENTS),
+        canonical_rotations=canonical_rotations(), tiers=describe_tiers(tables, QUALITY_TIERS),
+        golden=(), metrics={}, sha256={},
+    )  # fmt: skip
+    package = AvatarPackage(
+        manifest=manifest, graphs={}, tables=dict.fromkeys(QUALITY_TIERS, tables), golden=(),
+        preview=encode_png(np.zeros((1, 1, 4), np.uint8)),
+    )  # fmt: skip
+    graphs = {tier: serialize_graph(package, tier) for tier in QUALITY_TIERS}
+    write_package(replace(package, graphs=graphs | build_coarse_graph(package)), path)

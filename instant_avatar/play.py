@@ -140,8 +140,7 @@ def _run_web(arguments: PlayArguments, port: int, console: Console) -> int:
     from export.player import Player
     from export.player_page import build_page, encode_motion, runtime_files
     from instant_avatar.animation.driving_motion import load_driving_motion, pose_rate
-    from instant_avatar.animation.sample_motions import sample_motions
-    from instant_avatar.animation.web_server import serve_site, write_site
+    from instant_avatar.animation.web_server import sample_motions, serve_site, write_site
     from instant_avatar.cli.shared_options import check_output_folder
 
     if not 0 < port < 1 << 16:

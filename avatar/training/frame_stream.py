@@ -11,13 +11,14 @@ from avatar.config import TrainConfig
 from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.held_out import HeldOutFrame
 from avatar.rig import Rig
-from avatar.training.head_picture import head_pixels, picture_head
 from avatar.training.training_pixels import (
     PixelRuns,
     RayView,
     TrainingPixels,
     around_person,
+    head_pixels,
     near_person_mask,
+    picture_head,
     premultiplied_rgba,
 )
 from capture.camera import Camera

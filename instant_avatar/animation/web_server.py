@@ -1,5 +1,7 @@
 """ia-play --web: the player page, served on the loopback address or written as a folder.
 
+It offers short motions, each a loop on the spot.
+
 Run as a module (`make web`), it fetches onnxruntime-web with npm, which the page needs.
 """
 
@@ -15,12 +17,19 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
+import numpy as np
+from scipy.interpolate import CubicSpline
+
 from capture.atomic_files import atomic_folder
 from capture.input_error import InputError
+from capture.source import ASSUMED_FPS
 from export import player_page
+from instant_avatar.animation.driving_motion import demo_motion
 from instant_avatar.cli.command_line import DONE, parse_arguments, run_command, stop_on_interrupt
 from instant_avatar.cli.console import Console
 from instant_avatar.cli.shared_options import HOST
+from instant_avatar.studio.gestures import UNFILMED_DANCE, Arm, Gesture, Leg
+from preprocess.body.body_pose import Motion
 
 PORTS_TRIED = 20
 """Consecutive ports to try."""
@@ -38,6 +47,26 @@ HEADERS = {
     "Cache-Control": "no-cache", "X-Content-Type-Options": "nosniff",
 }  # fmt: skip
 """Headers of all answers; the first two isolate the page, so that its player may use threads."""
+HANGING = Arm(lift=-72, elbow=14)
+GREETINGS = tuple(
+    Gesture(left=Arm(lift=12, forward=10, twist=72, elbow=elbow), right=HANGING, tilt=-5)
+    for elbow in (55, 100)
+)
+"""A raised hand, in and out."""
+STRIDE = Gesture(
+    left=Arm(lift=-62, forward=-48, elbow=18),
+    right=Arm(lift=-62, forward=62, elbow=32),
+    left_leg=Leg(out=3, forward=26, knee=8),
+    right_leg=Leg(out=3, forward=-16, knee=20, heel=22),
+    turn=-8,
+)
+PASSING = Gesture(
+    left=HANGING,
+    right=HANGING,
+    left_leg=Leg(out=3, forward=3, knee=6),
+    right_leg=Leg(out=3, forward=24, knee=58, heel=10),
+)
+"""One leg passes the other, which stands."""
 
 
 def write_site(files: Mapping[str, bytes], path: Path) -> None:
@@ -162,3 +191,30 @@ def _fetch_tarball() -> bytes:
 
 if __name__ == "__main__":
     sys.exit(main())
+
+
+def sample_motions() -> dict[str, Motion]:
+    """The motions by their names on the page; the first is the built-in one."""
+    steps = (STRIDE, PASSING, STRIDE.mirror(), PASSING.mirror())
+    return {
+        "Turn": demo_motion(),
+        "Wave": _looped(GREETINGS, 24),
+        "Walk": _looped(steps, 36),
+        "Dance": _looped(UNFILMED_DANCE[:-1], 180),
+    }
+
+
+def _looped(gestures: tuple[Gesture, ...], frames: int) -> Motion:
+    """Through the gestures and back to the first, smooth to the second derivative."""
+    keys = np.stack([gesture.joint_rotations().as_rotvec() for gesture in (*gestures, gestures[0])])
+    times = np.linspace(0.0, frames, len(keys))
+    still = np.zeros((frames, 3))
+    return Motion(
+        root_rotations=still,
+        root_translations=still,
+        joint_rotations=CubicSpline(times, keys, bc_type="periodic")(np.arange(frames)),
+        valid=np.ones(frames, dtype=bool),
+        betas=np.zeros(10),
+        body_model="body24",
+        times_s=np.arange(frames) / ASSUMED_FPS,
+    )

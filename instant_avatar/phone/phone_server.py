@@ -16,6 +16,7 @@ from urllib.parse import quote
 from aiohttp import web
 
 from capture.input_error import InputError
+from export.build import write_warm_up_package
 from export.package.package_file import read_package
 from export.player_page import (
     ORT_WEB_VERSION,
@@ -25,10 +26,9 @@ from export.player_page import (
     player_files,
     titled,
 )
-from export.warm_up_package import write_warm_up_package
 from instant_avatar.animation import web_server
 from instant_avatar.animation.driving_motion import pose_rate
-from instant_avatar.animation.sample_motions import sample_motions
+from instant_avatar.animation.web_server import sample_motions
 from instant_avatar.cli.console import Console
 from instant_avatar.export import ExportArguments, export
 from instant_avatar.phone.access_control import AccessControl

@@ -9,8 +9,7 @@ from jaxtyping import Float, Int
 from markupsafe import Markup
 from scipy.spatial import KDTree
 
-from avatar.evaluation.coverage import MIN_WELL_SEEN_COSINE, Coverage
-from avatar.evaluation.skin_patches import pose_patches
+from avatar.evaluation.coverage import MIN_WELL_SEEN_COSINE, Coverage, pose_patches
 from avatar.rig import canonical_rotations
 from instant_avatar.report.page_rendering import render_template
 from instant_avatar.report.report_schema import Report

@@ -14,12 +14,12 @@ from capture.input_error import InputError
 from export.bake import compositor
 from export.bake.compositor import VoxelCodes, composite_segments
 from export.bake.traced_rays import RaySegments, RayTracer
+from export.build import write_warm_up_package
 from export.graph.player_graph import build_graph
 from export.package.package_file import COARSE_GRAPH, read_package
 from export.package.player_tables import QUALITY_TIERS, RenderSettings
 from export.player import PictureDifference, Player, premultiply
 from export.skinned_mesh import LevelSet, extract_mesh, skinning_weights
-from export.warm_up_package import write_warm_up_package
 from preprocess.body.body_pose import BodyPose
 
 

@@ -3,8 +3,13 @@
 import numpy as np
 import pytest
 
-from avatar.evaluation.coverage import Coverage, VisibilityStage
-from avatar.evaluation.skin_patches import PART_NAMES, SIDE_NAMES, pose_patches
+from avatar.evaluation.coverage import (
+    PART_NAMES,
+    SIDE_NAMES,
+    Coverage,
+    VisibilityStage,
+    pose_patches,
+)
 from preprocess.body.body_surface import visible_points
 
 L_SHOULDER, R_SHOULDER = 15, 16

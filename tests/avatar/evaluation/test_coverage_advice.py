@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from avatar.evaluation.coverage import (
+    PART_NAMES,
     SEEN_COMPLETELY,
+    SIDE_NAMES,
     Coverage,
     VisibilityStage,
     coverage_advice,
 )
-from avatar.evaluation.skin_patches import PART_NAMES, SIDE_NAMES
 
 AROUND = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
 

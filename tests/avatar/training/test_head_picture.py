@@ -9,7 +9,7 @@ import pytest
 from avatar.config import MAX_HEAD_PX
 from avatar.evaluation.held_out import HeldOutFrame
 from avatar.training.frame_stream import separate_held_out
-from avatar.training.head_picture import picture_head
+from avatar.training.training_pixels import picture_head
 
 
 def corner_of_head(camera, head_camera):

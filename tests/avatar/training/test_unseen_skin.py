@@ -9,9 +9,8 @@ from avatar.kernels import numba_priors
 from avatar.kernels.numba_priors import OPACITY_LENGTH_M
 from avatar.training import checkpoint
 from avatar.training.frame_stream import prepare_frame
-from avatar.training.skin_evidence import SkinEvidence
 from avatar.training.trainer import Trainer, cosine_decay
-from avatar.training.unseen_skin import HEAD, MIN_WEIGHT, UnseenSkin
+from avatar.training.unseen_skin import HEAD, MIN_WEIGHT, SkinEvidence, UnseenSkin
 from preprocess.body.kinematics import HEAD_JOINT
 
 TORSO, LEFT_THIGH, LEFT_FOREARM, RIGHT_FOREARM = 0, 1, 10, 11

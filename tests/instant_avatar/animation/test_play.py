@@ -19,7 +19,7 @@ from export.package.package_file import read_package, write_package
 from export.player import Player
 from instant_avatar.animation.driving_motion import FollowingCamera, canonical_pose_of, demo_motion
 from instant_avatar.animation.player_checks import REFERENCE_GRAPH
-from instant_avatar.animation.sample_motions import sample_motions
+from instant_avatar.animation.web_server import sample_motions
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import rotation_matrices
 from preprocess.poses.pose_format_registry import read_poses

@@ -19,7 +19,7 @@ from export.player import PictureDifference, Player, premultiply
 from export.player_inputs import graph_initializers
 from instant_avatar.animation import web_server
 from instant_avatar.animation.driving_motion import FollowingCamera, demo_motion
-from instant_avatar.animation.sample_motions import sample_motions
+from instant_avatar.animation.web_server import sample_motions
 from preprocess.poses.pose_format_registry import read_poses
 from tests.instant_avatar.browser import Browser, in_browser, serving, until, with_runtime
 
