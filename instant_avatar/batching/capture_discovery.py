@@ -142,7 +142,7 @@ def _make_capture(
         each.name: value
         for each in fields(parsed)
         if (value := getattr(parsed, each.name)) != each.default
-        and each.name not in ("video", "threads")
+        and each.name not in ("video", "threads", "force")  # of an avatar that is done, no change
     }
     chosen |= {option: Path(path).name for option, path in paths.items()}
     return BatchCapture(

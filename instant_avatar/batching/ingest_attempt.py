@@ -48,6 +48,8 @@ KEPT_FILES = (
 """Files of a run that are brought back."""
 STATUSES = {DONE: "done", BAD_INPUT: "refused"}
 """Status of a capture by the exit code of ia-ingest; all others are failures."""
+BATCH_FORCE = "the same command with --again, and --force after --"
+"""How a batch goes on with poses that are not good enough; what is done is left alone."""
 GRACE_S = 60.0
 """Time after --limit in which an attempt may end by itself before its process is ended, seconds."""
 OBJECT_STORE_BYTES = 200_000_000
@@ -184,8 +186,10 @@ def _ingest(
     except Exception as error:
         failure = describe_failure(error)
         if failure is not None:
+            from instant_avatar.run.run_tracking import FORCE
+
             code, cause = failure
-            return code, cause.replace(f"{run}{os.sep}", "")
+            return code, cause.replace(f"{run}{os.sep}", "").replace(FORCE, BATCH_FORCE)
         traceback.print_exc(file=log)
         return NO_AVATAR, f"{type(error).__name__}: {error}"
 

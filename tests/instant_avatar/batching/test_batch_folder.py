@@ -17,6 +17,7 @@ from instant_avatar.batching.ingest_attempt import AttemptFailure, learn_capture
 from instant_avatar.batching.remote_files import fetch_files, list_files, open_remote, read_text
 from instant_avatar.cli.command_line import CommandExit
 from instant_avatar.cli.console import Console
+from instant_avatar.run.run_tracking import FORCE
 
 
 @pytest.fixture(params=["file", "memory"])
@@ -193,6 +194,9 @@ def test_the_cause_is_what_ia_ingest_raised(attempt):
     def refuse(arguments, console):
         raise InputError("no video")
 
+    def refuse_poses(arguments, console):
+        raise InputError(f"{arguments.out}/tracking/skeleton.mp4 shows it. Or {FORCE}.")
+
     def fail(arguments, console):
         raise CommandExit("no usable avatar", 1)
 
@@ -201,6 +205,10 @@ def test_the_cause_is_what_ia_ingest_raised(attempt):
 
     refused = attempt(refuse).record
     assert (refused.status, refused.exit_code, refused.cause) == ("refused", 2, "no video")
+    refused = attempt(refuse_poses).record
+    shown, advice = refused.cause.split(" shows it. Or ")
+    assert shown == "tracking/skeleton.mp4"
+    assert advice == "the same command with --again, and --force after --."
     with pytest.raises(AttemptFailure, match="no usable avatar") as failed:
         attempt(fail)
     assert failed.value.attempt.record.exit_code == 1

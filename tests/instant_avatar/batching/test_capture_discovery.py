@@ -90,7 +90,7 @@ def test_a_capture_has_changed_if_a_file_or_an_option_has(tmp_path):
         return capture.input_key, capture.options_key
 
     first = keys("--steps", "5")
-    assert keys("--steps=5", "--threads", "3") == first
+    assert keys("--steps=5", "--threads", "3", "--force") == first
     assert keys("--steps", "6")[1] != first[1]
     assert keys("--steps", "5", "--body", "b.npz")[1] != first[1]
     os.utime(tmp_path / "anna" / "poses.npz", ns=(1, 1))
