@@ -118,7 +118,8 @@ class FilmQueue:
         """Begin a film of a new person, or of one whose avatar exists; refuse what cannot be."""
         suffix = SUFFIXES.get(kind.split(";")[0].strip().lower())
         if suffix is None:
-            raise FilmRefused(415, f"{kind or 'A file without a type'} is no video.")
+            found = f" ({kind})" if kind else ""
+            raise FilmRefused(415, f"That file is no video{found}: choose an MP4, MOV or WebM.")
         if size is not None and not 0 < size <= MAX_FILM_BYTES:
             raise FilmRefused(413, f"A film has 1 byte to {MAX_FILM_BYTES >> 30} GiB.")
         free = shutil.disk_usage(self.folder).free - MIN_FREE_BYTES

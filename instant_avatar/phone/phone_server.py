@@ -14,6 +14,7 @@ from typing import Any, final
 from urllib.parse import quote
 
 from aiohttp import web
+from rich.console import Console as RichConsole
 
 from capture.input_error import InputError
 from export.build import write_warm_up_package
@@ -410,5 +411,5 @@ def _exported(package: Path, file: str, author: str) -> bytes:
         named = author if author and to == "vrm" else None
         triangles = None if to == "splats" else MESH_TRIANGLES
         chosen = ExportArguments(run=package, to=to, out=out, triangles=triangles, author=named)
-        export(chosen, Console())
+        export(chosen, Console(RichConsole(quiet=True)))  # the folder is gone soon
         return out.read_bytes()

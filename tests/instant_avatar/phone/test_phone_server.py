@@ -185,6 +185,12 @@ def test_films_that_cannot_be_are_refused(phone, given, status):
     assert phone.ask("POST", "/films", json.dumps(note)).status == status
 
 
+def test_a_file_that_is_no_video_is_refused_with_what_to_choose(phone):
+    note = {"name": "Anna", "type": "text/plain", "size": 100}
+    message = json.loads(phone.ask("POST", "/films", json.dumps(note)).content)["message"]
+    assert message == "That file is no video (text/plain): choose an MP4, MOV or WebM."
+
+
 @pytest.mark.parametrize("body", ["[]", "5", "null", '"x"', "[" * 100_000, "{"])
 def test_what_is_no_note_of_a_film_is_malformed(phone, body, caplog):
     answer = phone.ask("POST", "/films", body)
@@ -370,9 +376,10 @@ def test_an_avatar_is_saved_as_vrm_with_the_author_who_was_named(phone, anna):
 
 
 @pytest.mark.slow
-def test_an_avatar_is_saved_as_splats(phone, anna):
+def test_an_avatar_is_saved_as_splats(phone, anna, capsys):
     answer = phone.ask("GET", "/avatars/Anna/avatar.spz")
     assert answer.status == 200
+    assert capsys.readouterr().err == ""  # no path of a file that is gone
     assert gzip.decompress(answer.content).startswith(b"NGSP")
 
 
