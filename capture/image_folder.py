@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageOps
 
-from capture.input_error import InputError
+from capture.input_error import InputError, counted
 from capture.source import ASSUMED_FPS, Frame, FrameSelection, FrameSource, RgbImage
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"})
@@ -121,8 +121,9 @@ class ImageFolder(FrameSource):
         self.frame_count = selection.count(self.frames_in_file)
         if not self.frame_count:
             raise InputError(
-                f"{path} holds {self.frames_in_file} pictures ({', '.join(sorted(IMAGE_SUFFIXES))})"
-                f"; at least one was expected from number {selection.start} on."
+                f"{path} holds {counted(self.frames_in_file, 'picture')} "
+                f"({', '.join(sorted(IMAGE_SUFFIXES))}); at least one was "
+                f"expected from number {selection.start} on."
             )
         self.duration_s = selection.span(self.frames_in_file) / ASSUMED_FPS
         self.size_px = self._look()

@@ -26,6 +26,11 @@ def quote_command(*words: object) -> str:
     return subprocess.list2cmdline(text) if sys.platform == "win32" else shlex.join(text)
 
 
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun: 1 frame, 2 frames."""
+    return f"{number} {noun}{'s' * (number != 1)}"
+
+
 def install_command(extras: str = "") -> str:
     """Return the command that adds extras to this installation, from where it was installed."""
     pip, checkout = (sys.executable, "-m", "pip", "install"), Path(__file__).resolve().parents[1]

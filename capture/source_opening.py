@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from capture.image_folder import IMAGE_SUFFIXES, ImageFolder, list_images
-from capture.input_error import InputError
+from capture.input_error import InputError, counted
 from capture.live_sources import CameraDevice, WatchedImageFolder
 from capture.received_video import ReceivedVideo, note_of
 from capture.source import Frame, FrameSelection, FrameSource, PacingClock, RotatedSource
@@ -64,12 +64,12 @@ def describe_recording(source: FrameSource) -> str:
     """Name, number, size and rate of a recording's frames, as its container states them."""
     size = f"{source.size_px[0]}x{source.size_px[1]} px"
     chosen = "" if source.frame_count == source.frames_in_file else f"{source.frame_count} of "
-    count = f"{source.path.name}: {chosen}{source.frames_in_file}"
+    name, in_file = f"{source.path.name}: {chosen}", source.frames_in_file
     if not source.duration_s or source.path.is_dir():
-        return f"{count} image{'s' * (source.frames_in_file != 1)} of {size}"
-    rate = source.selection.span(source.frames_in_file) / source.duration_s
+        return f"{name}{counted(in_file, 'image')} of {size}"
+    rate = source.selection.span(in_file) / source.duration_s
     hdr = ", HDR (tone mapped)" if source.is_hdr else ""
-    return f"{count} frames of {size}, {rate:.3g} a second{hdr}"
+    return f"{name}{counted(in_file, 'frame')} of {size}, {rate:.3g} a second{hdr}"
 
 
 def _open_recording(path: Path, selection: FrameSelection) -> VideoFile | ImageFolder:

@@ -12,7 +12,7 @@ from av.error import FFmpegError
 from jaxtyping import Float32, UInt8, UInt16
 
 from capture.image_folder import refuse_pipe
-from capture.input_error import InputError, quote_command
+from capture.input_error import InputError, counted, quote_command
 from capture.source import Frame, FrameSelection, FrameSource, RgbImage
 
 VIDEO_SUFFIXES = frozenset(
@@ -92,8 +92,8 @@ class VideoFile(FrameSource):
         self.duration_s = span / self._fps if self._fps > 0.0 else None
         if not self.frame_count:
             raise InputError(
-                f"{path} has {self.frames_in_file} frames; none of them is among the frames asked "
-                f"for, which start at {selection.start}."
+                f"{path} has {counted(self.frames_in_file, 'frame')}; none of them is "
+                f"among the frames asked for, which start at {selection.start}."
             )
         self._warn_of_wide_pixels(pixel_aspect)
 
@@ -168,7 +168,9 @@ class VideoFile(FrameSource):
         if not self.selection.is_past_end(index):
             self._compare_with_claim(count, time_s)
         if damaged:
-            self._warn(f"{self.path.name}: {damaged} of {count} frames are damaged; left out.")
+            self._warn(
+                f"{self.path.name}: {counted(damaged, 'damaged frame')} of {count}; left out."
+            )
 
     def _decode_all(self) -> Iterator[DecodedFrame]:
         with av.open(str(self.path)) as container:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
+from capture.input_error import counted
 from instant_avatar.batching.batch_arguments import BatchArguments
 from instant_avatar.batching.batch_folder import (
     RESULTS_NAME,
@@ -65,7 +66,7 @@ def batch(arguments: BatchArguments, ingest_words: Sequence[str], console: Conso
         states = {c.name: folder.settled(c, again=arguments.again) for c in captures}
         waiting = [capture for capture in captures if states[capture.name] is None]
         console.info(
-            f"{len(states)} captures, {len(states) - len(waiting)} of them settled before."
+            f"{counted(len(states), 'capture')}, {len(states) - len(waiting)} settled before."
         )
         try:
             if waiting:

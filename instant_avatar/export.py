@@ -14,7 +14,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from capture.atomic_files import atomic_file
 from capture.camera import Camera
-from capture.input_error import InputError
+from capture.input_error import InputError, counted
 from export.gltf import SkeletonAnimation, encode_glb, encode_vrm, text_of_glb
 from export.package.manifest import Manifest
 from export.package.package_file import AvatarPackage, read_package
@@ -264,7 +264,9 @@ def _export_package(folder: Path, out: Path, console: Console, *, fine_tune: boo
             raise CommandExit(str(error), NO_AVATAR) from error
     for warning in exported.warnings:
         console.warning(warning)
-    console.info(f"Trained on {trainer.frames_seen} frames for {trainer.wall_seconds:.1f} s.")
+    console.info(
+        f"Trained on {counted(trainer.frames_seen, 'frame')} for {trainer.wall_seconds:.1f} s."
+    )
 
 
 def synthetic_views(rig: "Rig") -> list[tuple[BodyPose, Camera]]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from capture.input_error import InputError
+from capture.input_error import InputError, counted
 from instant_avatar.animation.play_arguments import DEFAULT_TURN_S, WEB_PORT, PlayArguments
 from instant_avatar.cli.command_line import (
     BAD_INPUT,
@@ -130,8 +130,9 @@ def _run_benchmark(arguments: PlayArguments, console: Console) -> int:
     console.info(
         f"{result.cpu_ms_per_frame:.1f} CPU-ms per {result.size} px frame, "
         f"{result.pictures_per_second:.1f} frames/s with --workers {result.workers} "
-        f"({result.frames} frames, {result.pixels_covered:.0%} covered, {result.provider}); "
-        f"loaded in {result.load_ms:.0f} ms; reference graph {result.reference_ms:.1f} ms"
+        f"({counted(result.frames, 'frame')}, {result.pixels_covered:.0%} covered, "
+        f"{result.provider}); loaded in {result.load_ms:.0f} ms; reference "
+        f"graph {result.reference_ms:.1f} ms"
     )
     return DONE
 

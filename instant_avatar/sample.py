@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from capture.input_error import quote_command
+from capture.input_error import counted, quote_command
 from instant_avatar.cli.command_line import DONE, parse_arguments, run_command
 from instant_avatar.cli.console import Console
 from instant_avatar.cli.shared_options import Flag, check_output_folder
@@ -60,7 +60,7 @@ def _film(config: SampleArguments, console: Console) -> int:
         error.add_note("Nothing was written.")
         raise
     video, poses = (quote_command(config.out / name) for name in ("video.mp4", "poses.npz"))
-    console.info(f"Filmed {config.shoot.frames} frames into {config.out}.")
+    console.info(f"Filmed {counted(config.shoot.frames, 'frame')} into {config.out}.")
     if not config.shoot.like_a_phone:
         console.info(f"Preview for a browser: {config.out / 'preview.mp4'}.")
     console.info("Next:")

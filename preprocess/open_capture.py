@@ -168,10 +168,12 @@ def align_capture(
         warnings = tuple(plausibility_warnings(motion))
         motion = require_plausible(motion, imported.paths.poses)
     capture = _place(imported, motion, avatar_body, size_px or max(imported.source.size_px))
+    if not any(each.part == "tracking" for each in imported.provenance):  # its grade names them
+        warnings = (*lost_pose_warnings(imported.motion), *warnings)
     poses = Provenance(
         "poses",
         imported.paths.poses.name,
-        (motion.note, *lost_pose_warnings(imported.motion), *warnings),
+        (motion.note, *warnings),
         uncertainty=1.0 if motion.is_fitted else 0.0,
     )
     cameras = Provenance("cameras", capture.cameras.source, (capture.cameras.note,))

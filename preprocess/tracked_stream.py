@@ -19,7 +19,7 @@ from jaxtyping import Float32
 
 from capture.camera import Camera
 from capture.inbox import Inbox
-from capture.input_error import InputError
+from capture.input_error import InputError, counted
 from capture.source import Frame, FrameSource, WrappedSource
 from preprocess.alignment.silhouette_objective import spaced_indices
 from preprocess.body.body_pose import BodyPose, Motion
@@ -271,7 +271,7 @@ class LiveTracking:
         seen = sorted(self._seen.values(), key=lambda each: each.time_s)
         if not seen:
             raise InputError(
-                f"No person was found in {self.stream.path} ({len(self.times_s)} frames were "
+                f"No person was found in {self.stream.path} ({counted(len(self.times_s), 'frame')} "
                 "searched). Tracking needs one person, from head to feet in the picture."
             )
         motion, person, camera = fit_first_frames(
@@ -295,9 +295,10 @@ class LiveTracking:
         """Messages for the user that need the frames to have come."""
         looked, stream = len(self.times_s), self.stream
         if looked < stream.count:
+            later = f", {stream.tracked_later} of them after the last one had come"
             yield (
-                f"{looked} of {stream.count} frames were tracked, {stream.tracked_later} of them "
-                "after the last one had come."
+                f"{looked} of {stream.count} frames were tracked"
+                f"{later if stream.tracked_later else ''}."
             )
         if self.lost:
             times = [self.times_s[number] for number in self.lost]

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from capture.camera import Camera
-from capture.input_error import InputError
+from capture.input_error import InputError, counted
 from capture.source import ASSUMED_FPS
 from export.player import Player
 from instant_avatar.animation.play_arguments import CLOSE_UP_ZOOM, Viewpoint
@@ -83,7 +83,7 @@ def load_driving_motion(
     if lost == len(motion):
         raise InputError(f"None of the {len(motion)} poses in {path} is valid.")
     if lost:
-        console.warning(f"{lost} of {len(motion)} poses are invalid and were skipped.")
+        console.warning(f"Skipped: {lost} of {counted(len(motion), 'pose')}, not valid.")
     return motion
 
 

@@ -15,6 +15,7 @@ from avatar.render import render
 from avatar.training import checkpoint
 from avatar.training.held_out_pose_fitting import fit_test_poses
 from avatar.training.trainer import Trainer
+from capture.input_error import counted
 from export.player import Player, premultiply
 from instant_avatar.cli.console import Console
 from instant_avatar.evaluation.evaluate_arguments import EvaluateArguments
@@ -112,7 +113,7 @@ class EvaluationSession:
                 if self.stop.is_set():
                     break
                 if scorer.fits_poses:
-                    bar.update(float(done), f"fitting poses to {len(group)} frames")
+                    bar.update(float(done), f"fitting poses to {counted(len(group), 'frame')}")
                     scorer.score_fitted(group)
         return AvatarEvaluation(
             name=name,

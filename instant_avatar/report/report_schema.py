@@ -22,6 +22,7 @@ from avatar.evaluation.image_metrics import (
     overall_verdict,
 )
 from avatar.events import HeldOutScore
+from capture.input_error import counted
 from preprocess.observation import DroppedFrame
 from preprocess.tracking.video_tracking import NOT_FOUND
 
@@ -72,7 +73,7 @@ class FrameStats:
             words = [DROP_REASONS.get(cause, f"with {cause}") for cause in causes]
             reasons = ", ".join(f"{count} {word}" for word, count in Counter(words).most_common())
             parts.append(f"{left_out} left out ({reasons})")
-        return f"{self.read} frames read: {', '.join(parts)}."
+        return f"{counted(self.read, 'frame')} read: {', '.join(parts)}."
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ from avatar.evaluation.image_metrics import (
 )
 from capture.atomic_files import atomic_file, write_text_atomically
 from capture.hardware import peak_memory_mb
-from capture.input_error import quote_command
+from capture.input_error import counted, quote_command
 from capture.live_sources import camera_address
 from export.build import GOOD_PSNR
 from export.player import Player
@@ -55,7 +55,7 @@ def diagnose_failure(report: Report) -> str | None:
     held = report.held_out_refined or report.held_out
     what = f"The result is no usable avatar: {_describe_scores(held)}."
     if report.training.steps < MIN_STEPS_TO_JUDGE:
-        return f"{what} Only {report.training.steps} steps were made: {TRAIN_LONGER}."
+        return f"{what} Only {counted(report.training.steps, 'step')} of training: {TRAIN_LONGER}."
     return (
         f"{what} The model did not converge to the person. Usual causes: masks that include "
         "background, or poses from another video. Compare video and avatar in report.html"
@@ -238,7 +238,8 @@ class ReportWriter:
         training = report.training
         console.info(report.frames.sentence())
         console.info(
-            f"Trained for {training.wall_seconds:.1f} s ({training.steps} steps); {score}."
+            f"Trained for {training.wall_seconds:.1f} s ({counted(training.steps, 'step')}); "
+            f"{score}."
         )
         if result.refusal is None and diagnose_failure(report) is None:
             console.info(describe_verdict(report, None, is_final=True))

@@ -4,6 +4,7 @@ from contextlib import ExitStack
 from typing import final
 
 from avatar.events import Evaluated, FrameArrived, FrameLeftOut, Stepped, Warned
+from capture.input_error import counted
 from instant_avatar.cli.console import Console, ProgressBar
 from instant_avatar.report.report_schema import format_percent, format_psnr
 from instant_avatar.run.session_events import (
@@ -77,8 +78,9 @@ class ConsoleReader:
             score = format_psnr(last.psnr, last.verdict, digits=1, provisional=True)
             parts.append(f"held-out PSNR {score}")
         parts += [
-            f"{format_percent(session.coverage.seen_share)} seen", f"{trainer.frames_seen} frames"
-        ]  # fmt: skip
+            f"{format_percent(session.coverage.seen_share)} seen",
+            counted(trainer.frames_seen, "frame"),
+        ]
         if session.meter.is_paced:
             parts.append(f"{1000.0 * session.meter.current_latency_s:.0f} ms behind")
         return " · ".join(parts)

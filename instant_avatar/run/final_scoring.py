@@ -43,6 +43,7 @@ from avatar.training.checkpoint import (
 from avatar.training.frame_stream import rebuild_frame
 from avatar.training.held_out_pose_fitting import fit_test_poses
 from avatar.training.trainer import Trainer
+from capture.input_error import counted
 from capture.work_ahead import map_ahead
 from export.build import ExportReport
 from instant_avatar.cli.console import Console
@@ -180,7 +181,9 @@ def score_finally(
     with closing(_score_in_given_poses(trainer.avatar, held_out, is_late)) as given:
         while not is_left_out() and (one := next(given, None)) is not None:
             scored.append(one)
-            report_progress(f"scoring {len(held_out)} held-out frames", len(scored) / len(held_out))
+            report_progress(
+                f"scoring {counted(len(held_out), 'held-out frame')}", len(scored) / len(held_out)
+            )
     half_transparent = None
     if not is_left_out():
         half_transparent = half_transparent_share(
@@ -313,7 +316,7 @@ class EarlierVideos:
         """Put the key frames of earlier videos back into the replay buffer."""
         if not self._kept:
             return
-        with console.status(f"preparing {len(self._kept)} frames of the earlier video"):
+        with console.status(f"preparing {counted(len(self._kept), 'frame')} of the earlier video"):
             for frame in self._kept:
                 restored = rebuild_frame(*frame[:4], trainer.avatar.rig, head=frame.head)
                 trainer.add_frame(restored, is_restored=True)

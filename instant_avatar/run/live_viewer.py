@@ -22,6 +22,7 @@ from avatar.events import Finished
 from avatar.render import render
 from avatar.rig import canonical_rotations
 from capture.camera import Camera
+from capture.input_error import counted
 from capture.source import RgbImage
 from export.bake.bake_tables import ExportRefused
 from instant_avatar.animation.driving_motion import demo_motion, pose_rate
@@ -354,7 +355,7 @@ def _progress_text(session: TrainingSession) -> str:
 
 def _quality_text(session: TrainingSession) -> str:
     trainer, seen = session.trainer, format_percent(session.coverage.seen_share)
-    parts = [f"{trainer.frames_seen} frames", f"{trainer.steps:,} steps", f"{seen} seen"]
+    parts = [counted(trainer.frames_seen, "frame"), f"{trainer.steps:,} steps", f"{seen} seen"]
     if session.curve:
         last = session.curve[-1]
         score = format_psnr(last.psnr, last.verdict, digits=1, provisional=True)

@@ -7,7 +7,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 
 from capture.atomic_files import atomic_file
-from capture.input_error import InputError
+from capture.input_error import InputError, counted
 from capture.source import Frame, FrameSource
 from instant_avatar.capture_validation import correction_hint, preflight_check
 from instant_avatar.cli.console import Console
@@ -156,7 +156,7 @@ def _open_stream(
 def _describe(capture: Capture, console: Console) -> None:
     """Print what was opened, and what is to be said about it."""
     console.info(
-        f"{len(capture.motion)} poses, body {capture.shaped.body.family}, camera: "
+        f"{counted(len(capture.motion), 'pose')}, body {capture.shaped.body.family}, camera: "
         f"{capture.cameras.source}"
     )
     for note in capture.notes:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from capture.atomic_files import OutputFileList, write_text_atomically
-from capture.input_error import InputError
+from capture.input_error import InputError, counted
 from instant_avatar.cli.command_line import INTERRUPTED, CommandExit, stop_on_interrupt
 from instant_avatar.cli.console import Console
 from instant_avatar.run.ingest_arguments import IngestArguments
@@ -24,6 +24,9 @@ from instant_avatar.tracked_video import write_tracked_video
 from preprocess.capture_inputs import CaptureInputs, find_own_poses
 from preprocess.capture_session import Provenance
 from preprocess.open_capture import ImportedCapture, read_capture
+
+FORCE = "the same command with --resume --force"
+"""How a run goes on with poses that are not good enough."""
 
 
 def import_tracked(
@@ -64,8 +67,8 @@ def import_tracked(
     write_text_atomically(run.tracking_grade, json.dumps(stored, indent=1) + "\n")
     if stop.is_set():
         raise CommandExit(
-            f"stopped by Ctrl-C. {grade.frames} tracked frames are kept in {run.tracking}: to go "
-            "on from there, run the same command with --resume.",
+            f"stopped by Ctrl-C. {counted(grade.frames, 'tracked frame')} kept in {run.tracking}: "
+            "to go on from there, run the same command with --resume.",
             INTERRUPTED,
         )
     print_doubts(grade, console)
@@ -80,7 +83,7 @@ def import_tracked(
 def _refusal(verdict: str, run: RunFolder) -> InputError:
     return InputError(
         f"{verdict} The tracked video is {run.tracked_video}. Look at it and film again, or give "
-        "--poses of another tracker. To train anyway: the same command with --resume --force."
+        f"--poses of another tracker. To train anyway: {FORCE}."
     )
 
 

@@ -17,8 +17,9 @@ from avatar.rig import Rig
 from avatar.training import checkpoint, train
 from avatar.training.trainer import Trainer
 from capture.hardware import usable_cores
-from capture.input_error import InputError
+from capture.input_error import InputError, counted
 from capture.live_sources import DONE_FILE_NAME
+from capture.source import FrameSource
 from export.bake import proxy_surface
 from instant_avatar.cli.command_line import exit_on_interrupt, stop_on_interrupt
 from instant_avatar.cli.console import Console
@@ -89,7 +90,7 @@ def prepare_trainer(
         prepared = _new_run(arguments, capture, rig)
     _warm_up(prepared.trainer, console)
     _announce_coverage(capture, console)
-    _announce_duration(arguments, prepared.trainer, console)
+    _announce_duration(arguments, prepared.trainer, capture.source, console)
     return prepared
 
 
@@ -326,7 +327,9 @@ def _announce_coverage(capture: Capture, console: Console) -> None:
         )
 
 
-def _announce_duration(arguments: IngestArguments, trainer: Trainer, console: Console) -> None:
+def _announce_duration(
+    arguments: IngestArguments, trainer: Trainer, source: FrameSource, console: Console
+) -> None:
     """Print how long training will take, and roughly what comes after it."""
     config = trainer.config
     if arguments.live and arguments.seconds is None and arguments.steps is None:
@@ -343,7 +346,9 @@ def _announce_duration(arguments: IngestArguments, trainer: Trainer, console: Co
         return  # a run that is resumed without a larger budget, as a warning says
     duration = f"{seconds:.0f} s" if seconds >= 10.0 else f"{seconds:.1g} s"
     if config.steps:
-        duration = f"{config.steps - trainer.steps} steps"
+        duration = counted(config.steps - trainer.steps, "step")
+        if not source.paced and config.steps - trainer.steps < (source.frame_count or 0):
+            duration += " at least (each frame that is learnt from takes one)"
     console.info(
         f"Training for {duration}; the avatar can be played some seconds later, and half a minute "
         "of finer detail and scores follows, on an otherwise idle machine."

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from typing import TypeVar, final
 
 from avatar.training.frame_stream import RedundantFrame
+from capture.input_error import counted
 from capture.source import Frame, FrameSource
 from instant_avatar.report.report_schema import Percentiles, StreamStats
 from preprocess.observation import DroppedFrame, Observation
@@ -121,9 +122,9 @@ class StreamMeter:
         late = Percentiles.of(self.lateness_s)
         if dropped:
             yield (
-                f"{dropped} frames were dropped because tracking or preprocessing is slower than "
-                "the frame rate. The others are enough if the person moves slowly; else reduce "
-                "--size."
+                f"Dropped: {counted(dropped, 'frame')}, because tracking or preprocessing is "
+                "slower than the frame rate. The others are enough if the person moves slowly; "
+                "else reduce --size."
             )
         is_playback = self._source.paced and self._source.frame_count is not None
         is_playback = is_playback and not self._source.skippable

@@ -33,6 +33,7 @@ from avatar.training.frame_stream import (
 from avatar.training.train import train
 from avatar.training.trainer import Trainer
 from capture.inbox import Inbox
+from capture.input_error import counted
 from export.bake.bake_tables import ExportRefused
 from export.build import ExportReport, write_draft
 from export.package.package_file import update_metrics
@@ -320,7 +321,7 @@ class TrainingSession:
         """Read frames back into the replay buffer; return how many."""
         seen = 0
         while seen < count and not (inbox.finished or self.stop.is_set()):
-            self._report_progress(f"reading back {count} frames", seen / count)
+            self._report_progress(f"reading back {counted(count, 'frame')}", seen / count)
             for item in inbox.take(timeout_s=0.1):
                 if isinstance(item, HeldOutFrame):
                     add_held_out(self.held_out, item)

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from capture.input_error import InputError
+from capture.input_error import InputError, counted
 from capture.source import ASSUMED_FPS
 from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import JOINT_NAMES, axis_angles_from_matrices, rotation_matrices
@@ -157,8 +157,8 @@ def lost_pose_warnings(motion: Motion) -> Iterator[str]:
     lost = len(motion) - int(motion.valid.sum())
     if lost:
         yield (
-            f"{lost} of {len(motion)} poses are not numbers, or marked as not valid; their "
-            "frames are left out."
+            f"Left out: {lost} of {counted(len(motion), 'pose')}, not numbers or marked as not "
+            "valid."
         )
 
 
@@ -169,23 +169,24 @@ def plausibility_warnings(motion: Motion) -> Iterator[str]:
     bent = int(exceeds_joint_limits(motion.joint_rotations[motion.valid]).sum())
     if bent:
         yield (
-            f"{bent} of {len(motion)} poses bend a joint by more than "
-            f"{np.rad2deg(MAX_JOINT_ANGLE_RAD):.0f}°, which no pose needs; they are left out."
+            f"Left out: {bent} of {counted(len(motion), 'pose')}, with a joint bent by more than "
+            f"{np.rad2deg(MAX_JOINT_ANGLE_RAD):.0f}°, which no pose needs."
         )
     flips = np.flatnonzero(find_flips(motion))
     if len(flips):
         yield (
-            f"{len(flips)} of {len(motion)} poses (the first is row {flips[0]}) face another way "
-            "than those just before and after them: front was taken for back. They are left out."
+            f"Left out: {len(flips)} of {counted(len(motion), 'pose')} (the first is row "
+            f"{flips[0]}), facing another way than those just before and after: front was taken "
+            "for back."
         )
     kept = invalidate_implausible_rows(motion)
     moved = (kept.joint_rotations != motion.joint_rotations).any(axis=-1) & kept.valid[:, None]
     if moved.any():
         row, joint = np.argwhere(moved)[0]
         yield (
-            f"{int(moved.any(axis=1).sum())} of {len(motion)} poses (the first is row {row}) turn "
-            "a joint another way than those just before and after them (there the "
-            f"{JOINT_NAMES[joint + 1].replace('_', ' ')}). It is interpolated."
+            f"Interpolated: a joint in {int(moved.any(axis=1).sum())} of "
+            f"{counted(len(motion), 'pose')} (the first is row {row}) that turns another way than "
+            f"just before and after (there the {JOINT_NAMES[joint + 1].replace('_', ' ')})."
         )
     distance_m = _median_distance_m(motion)
     if distance_m > SUSPICIOUS_DISTANCE_M:

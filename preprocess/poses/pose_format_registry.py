@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from capture.image_folder import refuse_pipe
-from capture.input_error import InputError
+from capture.input_error import InputError, counted
 from preprocess.body.body_pose import Motion
 from preprocess.capture_inputs import resolve_pose_path
 from preprocess.file_content import explain_damage, read_untrusted_file
@@ -58,8 +58,8 @@ def read_poses(path: Path, *, person: str | None = None, prefer_world: bool = Fa
     filled = int(whole.valid.sum() - motion.valid.sum())
     if filled:
         said = (
-            f"{filled} poses that {tool} had lost were filled in between their neighbours (gaps of "
-            f"up to {MAX_GAP_FRAMES} frames)."
+            f"Filled in between their neighbours: {counted(filled, 'pose')} that {tool} had lost "
+            f"(gaps of up to {MAX_GAP_FRAMES} frames)."
         )
         note = said if note is None else f"{note} {said}"
     return replace(whole, program=program, note=note)
@@ -114,5 +114,5 @@ def _select_person(people: MotionByPerson, person: str | None, path: Path) -> Mo
 
 
 def _list_people(people: MotionByPerson) -> str:
-    listed = [f"{name} ({int(held.valid.sum())} poses)" for name, held in people.items()]
+    listed = [f"{name} ({counted(int(held.valid.sum()), 'pose')})" for name, held in people.items()]
     return ", ".join(listed[:12]) + (f" and {len(listed) - 12} more" if len(listed) > 12 else "")

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from capture.camera import Camera
+from capture.input_error import counted
 from preprocess.alignment.capture_geometry import MIN_VIEW_COVERAGE, view_sector_share
 from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import rotation_matrices
@@ -158,8 +159,8 @@ class TrackingGrade:
             verdict += " The sides that the camera never saw will be guesses: let the person turn."
         if self.left_out:
             verdict += (
-                f" {len(self.left_out)} frames in which another person is near, or body and mask "
-                "disagree, are left out."
+                f" Left out: {counted(len(self.left_out), 'frame')} in which another person is "
+                "near, or body and mask disagree."
             )
         return verdict
 

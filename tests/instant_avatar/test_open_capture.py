@@ -128,7 +128,7 @@ def test_a_pose_that_no_body_has_is_named_once(capture, own, changed):
     changed(capture / "poses.npz", body_pose=bent.reshape(24, -1))
     notes = open_capture(CaptureInputs(video=capture)).notes
     (sentence,) = (note for note in notes if "of 24 poses" in note)
-    assert sentence.startswith("1 of 24 poses bend a joint")
+    assert sentence.startswith("Left out: 1 of 24 poses, with a joint bent")
 
 
 def test_a_new_format_is_one_importer(film, own, in_camera, tmp_path, monkeypatch):

@@ -247,7 +247,7 @@ def test_of_a_fast_camera_every_second_frame_is_taken(standing):
 
 
 def test_a_stream_without_a_person_is_bad_input(standing):
-    with pytest.raises(InputError, match="24 frames were searched"):
+    with pytest.raises(InputError, match="24 frames searched"):
         started(Tracker(standing, absent=set(range(COUNT))))
 
 

@@ -2,6 +2,7 @@
 
 import json
 import signal
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -80,6 +81,20 @@ def test_a_refusal_names_its_cause_and_keeps_the_tracked_video(ingest_video, vid
     assert forced.code == 0, forced.err
 
 
+@pytest.mark.usefixtures("without_baking")
+def test_what_is_left_out_and_how_long_it_takes_is_said_once_and_true(ingest_video, monkeypatch):
+    graded = person_tracking._grade
+    monkeypatch.setattr(
+        person_tracking, "_grade", lambda *parts: replace(graded(*parts), left_out=(3,))
+    )
+    done, _ = ingest_video("--force")
+    assert done.err.count("eft out: 1 ") == 1, done.err
+    assert "Left out: 1 frame in which another person is near" in done.err
+    assert "Training for 10 steps at least (each frame that is learnt from takes one);" in done.err
+    assert "Trained for" in done.err
+    assert "(17 steps)" in done.err
+
+
 class CountingTracker(BlazePoseTracker):
     """Ctrl-C comes in the ninth frame of all that it is shown."""
 
@@ -99,7 +114,7 @@ def test_ctrl_c_keeps_the_frames_that_were_tracked(ingest_video, monkeypatch):
     monkeypatch.setattr(person_tracking, "make_tracker", lambda name, person: CountingTracker())
     done, out = ingest_video()
     assert done.code == 130
-    assert "9 tracked frames are kept" in done.complaint()
+    assert "9 tracked frames kept" in done.complaint()
     assert "--resume" in done.complaint()
     first = read_poses(out / "tracking" / "poses.npz").keypoints
     again, out = ingest_video("--resume")

@@ -73,6 +73,11 @@ def test_three_frames_are_too_few(shaped):
     assert "nan" not in found.describe()
 
 
+def test_one_frame_is_no_frames(shaped):
+    assert "Left out: 1 frame in which" in replace(grade(shaped), left_out=(7,)).describe()
+    assert "Left out: 2 frames in which" in replace(grade(shaped), left_out=(7, 8)).describe()
+
+
 def test_jitter_grows_with_noise(shaped):
     calm, noisy = grade(shaped), grade(shaped, motion=a_motion(noise_rad=0.05))
     assert calm.jitter_mm < 5.0
