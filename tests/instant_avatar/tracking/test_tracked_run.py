@@ -82,7 +82,7 @@ def test_a_refusal_names_its_cause_and_keeps_the_tracked_video(ingest_video, vid
 
 
 @pytest.mark.usefixtures("without_baking")
-def test_what_is_left_out_and_how_long_it_takes_is_said_once_and_true(ingest_video, monkeypatch):
+def test_frames_left_out_and_steps_of_each_frame_are_named_once(ingest_video, monkeypatch):
     graded = person_tracking._grade
     monkeypatch.setattr(
         person_tracking, "_grade", lambda *parts: replace(graded(*parts), left_out=(3,))
