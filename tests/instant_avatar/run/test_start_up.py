@@ -101,9 +101,10 @@ def equal_captures(inputs):
     return [open_capture(inputs, size_px=SIZE_PX) for _ in range(2)]
 
 
-def assert_same_fit(one, other):
+def assert_same(one, other):
+    """Equal but for rounding: sums of BLAS follow its number of threads, which a process chooses."""
     for name, value in vars(one).items():
-        np.testing.assert_array_equal(value, getattr(other, name))
+        np.testing.assert_allclose(value, getattr(other, name), rtol=1e-5, atol=1e-5)
 
 
 def test_another_process_fits_and_remembers_what_this_one_would(inputs):
@@ -112,10 +113,9 @@ def test_another_process_fits_and_remembers_what_this_one_would(inputs):
         fitting.send(there, None, with_rig=True)
         found = fitting.fit(there)
         sent_rig = fitting.rig()
-    assert_same_fit(found, fit_capture(here))
+    assert_same(found, fit_capture(here))
     rig = Rig.from_shaped_body(apply_fit(here, found).shaped)
-    for name, value in vars(sent_rig).items():
-        np.testing.assert_array_equal(value, getattr(rig, name))
+    assert_same(sent_rig, rig)
     assert not there.masks.needs_all_frames  # it has compared borders, as the other one
     assert there.masks.refine._ratios == here.masks.refine._ratios
 
@@ -125,7 +125,7 @@ def test_a_process_that_fails_is_done_without(inputs, monkeypatch):
     here, there = equal_captures(inputs)
     with fitting_beside() as fitting:
         fitting.send(there, None, with_rig=True)
-        assert_same_fit(fitting.fit(there), fit_capture(here))
+        assert_same(fitting.fit(there), fit_capture(here))
         assert fitting.rig() is None
 
 
@@ -134,7 +134,7 @@ def test_what_cannot_be_sent_is_fitted_by_this_process(inputs):
     there.masks.plugin = lambda: None  # not to be pickled
     with fitting_beside() as fitting:
         fitting.send(there, None, with_rig=False)
-        assert_same_fit(fitting.fit(there), fit_capture(here))
+        assert_same(fitting.fit(there), fit_capture(here))
 
 
 def test_a_process_without_a_capture_ends_before_training(started):
