@@ -102,7 +102,7 @@ def equal_captures(inputs):
 
 
 def assert_same(one, other):
-    """Equal but for rounding: sums of BLAS follow its number of threads, which a process chooses."""
+    """Equal but for rounding, which follows the number of threads of a process."""
     for name, value in vars(one).items():
         np.testing.assert_allclose(value, getattr(other, name), rtol=1e-5, atol=1e-5)
 
