@@ -221,9 +221,7 @@ class TrainingSession:
                 ready_at = self.result.ready_at or time.perf_counter()
                 self._result = replace(self.result, exported=exported, ready_at=ready_at)
                 yield PackageWritten(path=self._run.package, result=self.result, is_final=is_final)
-                self._scores = self._scores or beside.submit(
-                    self._compute_scores, get_num_threads()
-                )
+                self._begin_scoring(beside)
         except ExportRefused as error:  # of the fine-tuned one: that as baked stays
             if self.result.exported is None:
                 self._result = replace(self.result, refusal=str(error))
