@@ -67,6 +67,7 @@ def current_state(trainer: Trainer, *, notes: dict[str, Any] | None = None) -> d
         "shading": trainer.learner.shading.coefficients,
         "seen": torch.from_numpy(evidence.cosines),
         "seen_frames": torch.from_numpy(evidence.seen_frames),
+        "seen_colors": torch.from_numpy(evidence.color_sums),
         "evidence_frame_count": evidence.frame_count,
         "notes": notes or {},
     }
@@ -140,6 +141,7 @@ def _restored(state: dict[str, Any]) -> Trainer:
     evidence, cosines = trainer.unseen.evidence, state["seen"].numpy()
     evidence.cosines[:] = cosines
     evidence.seen_frames[:] = state.get("seen_frames", cosines > 0.0)  # of earlier versions
+    evidence.color_sums[:] = state.get("seen_colors", 0.0)
     evidence.frame_count = state.get("evidence_frame_count", 1)
     for name in COUNTERS:
         setattr(trainer, name, state["counts"][name])

@@ -11,6 +11,9 @@ The source of a patch is the candidate of the least cost: the distance to it, in
 the bone count more than those around it, a cost of each kind of reflection, and one of candidates
 that were seen obliquely: the outline, which lies nearest to the unseen side, is stained most.
 
+What the front shows, but not the outline at its height, as a print or a neckline, is not likely to
+go round: pairs are drawn to the skin around the limb as far as its color is more common there.
+
 A face that was seen from one side alone could have any depth; it is kept near the body model's.
 
 Which skin frames show, how squarely and from how many sides is kept by patch, a seed of the rig
@@ -27,6 +30,7 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int, Int64
 from scipy.sparse import coo_array
 from scipy.spatial import KDTree
+from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from avatar.rig import CLOTHING_BAND_M, HEAD_PART, Rig
@@ -51,6 +55,13 @@ FACE_COST_M = 1.0
 """Cost of a face as the source of anything but a face, metres."""
 OBLIQUE_COST_M = 0.2
 """Cost of a source that is seen at a right angle to its normal, metres."""
+RARE_COST_M = 0.1
+"""Cost of a source around the limb whose color is e times rarer at the outline, metres."""
+LEVEL_FACTOR = 3.0
+"""Factor, beside that of lengths along the bone, by which such a source keeps its height."""
+ROW_M, COLOR_SPREAD, LEAST_SHARE = 0.08, 0.12, 0.02
+"""Standard deviations of height along the bone, metres, and of color within which patches are
+compared, and the least share of a color at the outline."""
 ALONG_BONE_FACTOR = 4.0
 """Factor of lengths along the bone; none of the head, whose hair comes from above."""
 NECK_SHARE = 0.3
@@ -116,11 +127,13 @@ class SkinEvidence:
         cosines: Largest cosine at which it was seen, in [0, 1]; 0 if it never was.
         seen_frames: Number of frames that showed it squarely; an oblique view counts less.
         frame_count: Number of all frames.
+        color_sums: Sums of its colors in the frames times their cosines, and of these.
     """
 
     cosines: Float32[np.ndarray, "seeds"]
     seen_frames: Float32[np.ndarray, "seeds"]
     frame_count: int
+    color_sums: Float32[np.ndarray, "seeds 4"]
 
     def __init__(self, rig: Rig) -> None:
         """Starts with every patch unseen."""
@@ -129,6 +142,7 @@ class SkinEvidence:
         self.cosines = np.zeros(len(rig.seeds), dtype=np.float32)
         self._direction_sums, self._frames = np.zeros((len(rig.seeds), 3)), np.zeros(len(rig.seeds))
         self.seen_frames, self.frame_count = np.zeros(len(rig.seeds), dtype=np.float32), 0
+        self.color_sums = np.zeros((len(rig.seeds), 4), dtype=np.float32)
 
     def add(self, frame: TrainingFrame) -> None:
         """Takes in what a frame shows: patches that face the camera, unoccluded, in the mask."""
@@ -146,13 +160,14 @@ class SkinEvidence:
             return
         plane = in_camera[:, :2] / depths[:, None] * depths.mean()
         shown = visible_points(plane, depths, cosines, margin_cells=LIMB_MARGIN_CELLS)
-        within = _pixels_within_border(in_camera, frame)
+        within, colors = _pixels_of(in_camera, frame)
         shown &= within > 0.0
         cosines = cosines * _smooth_step(within, *BORDER_PX)
         cosines = np.where(shown, cosines, 0.0)
         np.maximum(self.cosines, cosines, out=self.cosines)
         self.seen_frames += _smooth_step(cosines, UNSEEN_COSINE, SEEN_COSINE)
         self.frame_count += 1
+        self.color_sums += cosines[:, None] * np.column_stack([colors, np.ones(len(colors))])
         canonical = np.einsum("pab,pa->pb", blends[..., :3], to_camera)
         canonical /= np.maximum(np.linalg.norm(canonical, axis=1, keepdims=True), 1e-9)
         self._direction_sums += shown[:, None] * canonical
@@ -164,6 +179,11 @@ class SkinEvidence:
         shares = self.seen_frames / max(self.frame_count, 1)
         squarely = _smooth_step(self.cosines, UNSEEN_COSINE, SEEN_COSINE)
         return squarely * _smooth_step(shares, 0.0, SEEN_FRAME_SHARE)
+
+    @property
+    def colors(self) -> Float32[np.ndarray, "seeds 3"]:
+        """Mean color of each patch in the frames, in [0, 1]; black where it was never seen."""
+        return self.color_sums[:, :3] / np.maximum(self.color_sums[:, 3:], 1e-6)
 
     @property
     def depth_known(self) -> Float32[np.ndarray, "seeds"]:
@@ -184,19 +204,21 @@ def _smooth_step(
     return (share * share * (3.0 - 2.0 * share)).astype(np.float32)
 
 
-def _pixels_within_border(
+def _pixels_of(
     in_camera: Float[np.ndarray, "points 3"], frame: TrainingFrame
-) -> Float32[np.ndarray, "points"]:
-    """Distance of points in camera axes to the person's outline, pixels; 0 beside the person."""
+) -> tuple[Float32[np.ndarray, "points"], Float32[np.ndarray, "points 3"]]:
+    """Distance of points in camera axes to the outline, pixels; 0 beside the person; and colors."""
     camera = replace(frame.view.camera, camera_from_world=np.eye(4))
     width, height = camera.size_px
     column, row = np.floor(camera.project(in_camera)).astype(np.int64).T
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    near = frame.view.near_person()
-    alpha = np.zeros((height, width), dtype=np.uint8)
-    alpha[near] = frame.colors[:, 3] > MIN_PERSON_ALPHA
-    distances = cv2.distanceTransform(alpha, cv2.DIST_L2, 3)
-    return np.where(inside, distances.reshape(-1)[(row * width + column) * inside], 0.0)
+    picture = np.zeros((height, width, 4), dtype=np.uint8)
+    picture[frame.view.near_person()] = frame.colors
+    is_person = (picture[..., 3] > MIN_PERSON_ALPHA).astype(np.uint8)
+    distances = cv2.distanceTransform(is_person, cv2.DIST_L2, 3).reshape(-1)
+    at = (row * width + column) * inside
+    colors = picture.reshape(-1, 4)[at, :3].astype(np.float32) / 255.0
+    return np.where(inside, distances[at], 0.0), colors
 
 
 class Sources(NamedTuple):
@@ -206,11 +228,15 @@ class Sources(NamedTuple):
         reflection: 0: none, the source lies around the limb; 1: mirrored; 2: the limb's other face;
             3: both.
         weight: How strongly the patch is drawn to its source, in [0, 1].
+        around: The source around the limb at the same height; -1: none.
+        around_share: Share of pairs, in [0, 1], that are drawn to that one instead.
     """
 
     patch: Int[np.ndarray, "seeds"]
     reflection: Int[np.ndarray, "seeds"]
     weight: Float32[np.ndarray, "seeds"]
+    around: Int[np.ndarray, "seeds"]
+    around_share: Float32[np.ndarray, "seeds"]
 
 
 class SourcePairs(NamedTuple):
@@ -351,16 +377,23 @@ class UnseenSkin:
         corner = np.stack(np.unravel_index(cells, self._shape), axis=1)
         points = (self._rig.box_low + (corner + within) / self._rig.cells_per_m).astype(np.float32)
         seeds = self._seed_of_cell[cells]
-        sources, is_near = self._source_points(points, seeds)
+        is_around = (
+            torch.rand(count, generator=generator).numpy() < self.sources.around_share[seeds]
+        )
+        sources, is_near = self._source_points(points, seeds, is_around)
         return points[is_near], sources[is_near], self.sources.weight[seeds[is_near]]
 
     def _source_points(
-        self, points: Float32[np.ndarray, "points 3"], seeds: Int[np.ndarray, "points"]
+        self,
+        points: Float32[np.ndarray, "points 3"],
+        seeds: Int[np.ndarray, "points"],
+        is_around: Bool[np.ndarray, "points"],
     ) -> tuple[Float32[np.ndarray, "points 3"], Bool[np.ndarray, "points"]]:
         """The sources of points, and whether they lie near the skin."""
         assert self.sources is not None
-        rig, target = self._rig, self.sources.patch[seeds]
-        normals, reflection = rig.seed_normals[seeds], self.sources.reflection[seeds]
+        rig, normals = self._rig, self._rig.seed_normals[seeds]
+        target = np.where(is_around, self.sources.around[seeds], self.sources.patch[seeds])
+        reflection = np.where(is_around, 0, self.sources.reflection[seeds])
         heights = ((points - rig.seeds[seeds]) * normals).sum(axis=1)
         parts = rig.seed_parts[seeds]
         at = reflect(self._frames, points, parts, reflection, self._middle_x)
@@ -409,8 +442,9 @@ def find_sources(rig: Rig, frames: _BoneFrames, evidence: SkinEvidence, middle_x
     seen = evidence.seen
     parts = rig.seed_parts.astype(np.int64)
     best, cost = np.zeros(len(parts), dtype=np.int64), np.full(len(parts), np.inf)
-    kind = np.zeros(len(parts), dtype=np.int64)
+    kind, around = np.zeros(len(parts), dtype=np.int64), np.full(len(parts), -1, dtype=np.int64)
     face = _faces(frames, rig)
+    rarity = _rarity_at_outline(rig, frames, evidence)
     sources = np.flatnonzero(seen > MIN_SOURCE_SEEN)
     for reflection in range(4):
         places = reflect(
@@ -436,6 +470,11 @@ def find_sources(rig: Rig, frames: _BoneFrames, evidence: SkinEvidence, middle_x
                 away[2] *= ALONG_BONE_FACTOR
             costs = np.sqrt(away[0] ** 2 + away[1] ** 2 + away[2] ** 2) + extra[there]
             costs += FACE_COST_M * np.maximum(0.0, face[sources[there]] - face[here][:, None])
+            if reflection == 0:
+                level = (
+                    costs + RARE_COST_M * rarity[sources[there]] + LEVEL_FACTOR * np.abs(away[2])
+                )
+                around[here] = sources[there[level.argmin(axis=1)]]
             chosen = costs.argmin(axis=1)
             least = costs[np.arange(len(here)), chosen]
             better = least < cost[here]
@@ -444,7 +483,31 @@ def find_sources(rig: Rig, frames: _BoneFrames, evidence: SkinEvidence, middle_x
             kind[here[better]] = reflection
     trust = np.clip(2.0 - 2.0 * cost / MAX_COST_M, 0.0, 1.0)
     weight = np.where(np.isfinite(cost), (1.0 - seen) * trust * seen[best], 0.0)
-    return Sources(best, kind, weight.astype(np.float32))
+    rarer = np.maximum(rarity[best] - rarity[around], 0.0)
+    share = np.where((kind > 1) & (around >= 0), 1.0 - np.exp(-rarer), 0.0)
+    return Sources(best, kind, weight.astype(np.float32), around, share.astype(np.float32))
+
+
+def _rarity_at_outline(
+    rig: Rig, frames: _BoneFrames, evidence: SkinEvidence
+) -> Float[np.ndarray, "seeds"]:
+    """Minus the logarithm of the share of each patch's color at its limb's outline, at its height.
+
+    The outline are patches that were seen obliquely; 0 on heads, and where it was not seen.
+    """
+    rarity = np.zeros(len(rig.seeds))
+    outline = evidence.seen * (1.0 - evidence.cosines)
+    for part in range(len(BONE_OF_PART)):
+        here = np.flatnonzero((rig.seed_parts == part) & (evidence.seen > 0.0))
+        if part == HEAD or not len(here):
+            continue
+        height = frames.to_bone(rig.seeds[here], rig.seed_parts[here])[:, 2] / ROW_M
+        near = np.exp(-0.5 * np.subtract.outer(height, height) ** 2) * outline[here]
+        apart = cdist(evidence.colors[here], evidence.colors[here], "sqeuclidean")
+        alike = (near * np.exp(-0.5 / COLOR_SPREAD**2 * apart)).sum(axis=1)
+        share = (alike + 1e-6) / (near.sum(axis=1) + 1e-6)
+        rarity[here] = -np.log(np.maximum(share, LEAST_SHARE))
+    return rarity
 
 
 def _faces(frames: _BoneFrames, rig: Rig) -> Float[np.ndarray, "seeds"]:

@@ -125,6 +125,31 @@ def test_the_back_is_drawn_to_what_was_seen_squarely(rig, of_front):
     assert np.median(of_front.evidence.cosines[of_front.sources.patch[back]]) > 0.8
 
 
+def test_a_print_stays_in_front_and_a_stripe_goes_round(rig, frame):
+    """A shirt with a print on its chest, and one with a stripe at the same height."""
+    torso, height = rig.seed_parts == TORSO, rig.seeds[:, 1]
+    chest = facing(rig, TORSO, 1.0) & (np.abs(rig.seeds[:, 0]) < 0.06)
+    stripe = torso & (np.abs(height - np.median(height[chest])) < 0.05)
+    white_backs = []
+    for is_white in (stripe & chest, stripe):
+        unseen = UnseenSkin(rig)
+        unseen.add(frame())
+        unseen.evidence.color_sums[is_white, :3] = unseen.evidence.color_sums[is_white, 3:]
+        assert (unseen.evidence.colors[is_white & chest] == 1.0).all()
+        unseen.update()
+        patch, around, share = (
+            numbers[stripe & facing(rig, TORSO, -1.0)]
+            for numbers in (
+                unseen.sources.patch,
+                unseen.sources.around,
+                unseen.sources.around_share,
+            )
+        )
+        white_backs.append((is_white[patch] * (1.0 - share) + is_white[around] * share).mean())
+    assert white_backs[0] < 0.05
+    assert white_backs[1] > 0.8
+
+
 def test_the_back_of_a_head_is_drawn_to_hair_and_never_to_a_face(rig, of_front, generator):
     head = rig.seeds[rig.seed_parts == HEAD]
     low, top = head[:, 1].min(), head[:, 1].max()
@@ -253,3 +278,4 @@ def test_a_checkpoint_keeps_what_was_seen(rig, frame, tmp_path):
     np.testing.assert_array_equal(kept.cosines, seen.cosines)
     assert kept.seen[facing(rig, TORSO, 1.0)].mean() > 0.95
     np.testing.assert_array_equal(kept.seen, seen.seen)
+    np.testing.assert_array_equal(kept.colors, seen.colors)
