@@ -180,6 +180,11 @@ class Browser:
             mobile=width < 600,
         )
 
+    def save_to(self, folder: Path) -> None:
+        """Downloads are allowed, into a folder."""
+        how = {"behavior": "allow", "downloadPath": str(folder)}
+        self._ask("Browser.setDownloadBehavior", whole=True, **how)
+
     def claim_cores(self, count: int) -> None:
         """What the machine says of its cores."""
         self._ask("Emulation.setHardwareConcurrencyOverride", hardwareConcurrency=count)

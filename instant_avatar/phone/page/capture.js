@@ -270,6 +270,27 @@ addEventListener("message", ({ source, origin, data }) => {
   Object.assign(finer, { className: "", id: "player" });
 });
 
+/** Save a file for other programs, which the computer makes when it is wanted: half a minute of its time. */
+async function save(event) {
+  event.preventDefault();
+  const link = event.currentTarget, { href, textContent } = link, name = shown;
+  if (link.ariaBusy === "true") return; // pressed again
+  link.ariaBusy = "true";
+  $("saving").textContent = `Making the ${textContent} of ${name}: half a minute on an idle computer, longer while it learns …`;
+  $("saving").hidden = false;
+  try {
+    const answer = await fetch(href);
+    if (!answer.ok) throw new Error((await answer.json()).message);
+    const address = URL.createObjectURL(await answer.blob());
+    Object.assign(document.createElement("a"), { href: address, download: `${name}.${link.id}` }).click();
+    $("saving").textContent = `The ${textContent} of ${name} is saved.`;
+  } catch (error) {
+    $("saving").hidden = true;
+    warn(`The ${textContent} was not saved: ${error.message}`);
+  }
+  link.ariaBusy = "false";
+}
+
 async function share(name) {
   const blob = await (await fetch($("package").href)).blob();
   const file = new File([blob], `${name}.iavatar`, { type: "application/zip" });
@@ -291,6 +312,7 @@ async function listEarlier() {
   }));
 }
 
+for (const id of ["glb", "vrm", "spz", "ply", "obj"]) $(id).onclick = save;
 $("file").onchange = () => upload($("file").files[0]);
 $("stored").onchange = () => upload($("stored").files[0]);
 $("live").onclick = live;

@@ -196,6 +196,22 @@ def test_a_film_begins_without_the_figures_of_the_one_before(page):
     assert text_of(browser, "sent") == ""
 
 
+def test_a_file_for_other_programs_is_said_to_be_made_until_it_is_saved(page, tmp_path):
+    browser, queue = page
+    browser.save_to(tmp_path)
+    browser.click("Anna")
+    glb = "document.getElementById('glb')"
+    browser.run(f"{glb}.click(); {glb}.click()")  # the second one is not another file
+    assert "Making the GLB of Anna: half a minute" in browser.text()
+    until(lambda: "The GLB of Anna is saved." in browser.text(), 300.0)
+    until(lambda: list(tmp_path.glob("*.glb")), 60.0)
+    assert [path.name for path in tmp_path.glob("*.glb")] == ["Anna.glb"]
+    assert (tmp_path / "Anna.glb").read_bytes()[:4] == b"glTF"
+    queue.package("Anna").unlink()
+    browser.run("document.getElementById('vrm').click()")
+    until(lambda: "The VRM was not saved: There is no avatar 'Anna'." in browser.text(), 60.0)
+
+
 def reload(browser):
     browser.run("window.before = true")
     browser.go(browser.run("location.href"))
