@@ -37,6 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def evaluate(arguments: EvaluateArguments, console: Console) -> int:
     """Score avatars, print the table, and write the files that were asked for."""
     arguments.validate()
+    _check_targets(arguments.targets)
     with console.status("loading torch"):
         from avatar.evaluation.perceptual import Lpips
         from capture.atomic_files import write_text_atomically
@@ -76,6 +77,20 @@ def evaluate(arguments: EvaluateArguments, console: Console) -> int:
     return INTERRUPTED if stop.is_set() else DONE
 
 
+def _check_targets(targets: Sequence[Path]) -> None:
+    """Refuse folders that hold nothing to score, before torch is loaded."""
+    from instant_avatar.evaluation.datasets import find_neuman, find_people_snapshot
+
+    for path in targets:
+        is_avatar = path.is_file() or RunFolder(path=path).has_checkpoint()
+        if not (is_avatar or find_people_snapshot(path) or find_neuman(path)):
+            raise InputError(
+                f"{path} is neither a run (with checkpoint/), nor an .iavatar package, nor a "
+                "folder with subjects of PeopleSnapshot (such as male-3-casual) or of NeuMan (such "
+                "as seattle)."
+            )
+
+
 def _evaluate_all(session: "EvaluationSession") -> "Iterator[AvatarEvaluation]":
     from instant_avatar.evaluation.datasets import find_neuman, find_people_snapshot
 
@@ -88,19 +103,13 @@ def _evaluate_all(session: "EvaluationSession") -> "Iterator[AvatarEvaluation]":
             yield _evaluate_package(path, session)
         elif run.has_checkpoint():
             yield _evaluate_run(run, session)
-        elif subjects := find_people_snapshot(path) or find_neuman(path):
+        else:
             if arguments.on is not None:
                 raise InputError(f"{path} is a dataset with its own test frames; omit --on.")
             above = arguments.out or Path("runs") / path.resolve().name
-            for subject in subjects:
+            for subject in find_people_snapshot(path) or find_neuman(path):
                 if not stop.is_set():
                     yield from _evaluate_subject(subject, above, session)
-        else:
-            raise InputError(
-                f"{path} is neither a run (with checkpoint/), nor an .iavatar package, nor a "
-                "folder with subjects of PeopleSnapshot (such as male-3-casual) or of NeuMan (such "
-                "as seattle)."
-            )
 
 
 def _evaluate_package(path: Path, session: "EvaluationSession") -> "AvatarEvaluation":

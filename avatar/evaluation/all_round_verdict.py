@@ -43,8 +43,8 @@ FIRM = WordBounds(0.87, 0.8)
 """Share of pixels that are not half transparent."""
 PLAYER_PSNR = WordBounds(34.0, 28.0)
 """PSNR of the player's best tier to the renderer, dB."""
-TRAIN_LONGER = "train longer: the same command with --resume and more --seconds (or --steps)"
-"""The cure of what more training mends."""
+TRAIN_LONGER = "train longer: ia-ingest with --resume and more --seconds (or --steps)"
+"""The cure of what more training mends, also of a film that ia-capture took."""
 
 
 @dataclass(frozen=True, kw_only=True)

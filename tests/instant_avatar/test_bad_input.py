@@ -65,6 +65,13 @@ def test_a_name_that_nothing_has_is_refused_before_heavy_code_is_loaded(
     assert name in done.stderr
 
 
+def test_a_folder_with_nothing_to_score_is_refused_before_torch_is_loaded(tmp_path):
+    script = "import sys; from instant_avatar import evaluate; evaluate.main(sys.argv[1:])"
+    command = [sys.executable, "-c", f"{script}; assert 'torch' not in sys.modules", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "neither a run" in done.stderr
+
+
 @pytest.mark.slow
 def test_a_video_that_cannot_be_tracked_well_leaves_what_was_tracked(
     call_ingest, capture, tmp_path

@@ -30,6 +30,7 @@ from instant_avatar.report.report_schema import (
 )
 from instant_avatar.report.report_writer import describe_verdict, diagnose_failure
 from preprocess.observation import DroppedFrame
+from tests.instant_avatar.browser import Browser, until, with_chromium
 
 
 def point(seconds, psnr, psnr_mask=None):
@@ -248,6 +249,37 @@ def test_an_avatar_of_one_side_is_not_called_sharp():
     assert verdict.endswith("Turn round.")
     assert verdict in report_page(kept, name="clip", verdict=verdict)
     assert diagnose_failure(kept) is None
+
+
+WORDS_IN_TWO_LINES = """
+[...document.querySelectorAll(":not(details) > table td, .tile b")].flatMap((cell) => {
+  const text = cell.firstChild, range = document.createRange();
+  return [...text.data.matchAll(/[0-9.]+ dB|[0-9A-Za-z.]+/g)].filter(({ index, 0: word }) => {
+    range.setStart(text, index);
+    range.setEnd(text, index + word.length);
+    return new Set([...range.getClientRects()].map(({ top }) => top)).size > 1;
+  }).map(String);
+})
+"""
+"""Words of tables, and figures, that a page breaks in two."""
+
+
+@pytest.mark.slow
+@with_chromium
+def test_a_page_of_360_px_breaks_no_word_and_no_figure(tmp_path):
+    parts = [
+        {"part": "poses", "name": "poses.npz of unknown origin", "licence": "unknown"},
+        {"part": "tracker", "name": "BlazePose, of Google's MediaPipe", "licence": "Apache-2.0"},
+    ]
+    licence = {"parts": parts, "commercial_use": "unknown", "because": "poses.npz"}
+    held_out = HeldOutStats.of(scores((39.14, 30.78)), (64, 48))
+    page = report_page(report(licence=licence, held_out=held_out), name="clip", verdict="Sharp.")
+    (tmp_path / "report.html").write_text(page, encoding="utf-8")
+    with Browser(tmp_path / "browser", size=(360, 740)) as browser:
+        browser.emulate(scheme="light", size=(360, 740))
+        browser.go((tmp_path / "report.html").as_uri())
+        until(lambda: "What it was made with" in browser.text(), 60.0)
+        assert browser.run(WORDS_IN_TWO_LINES) == []
 
 
 def test_scores_that_ended_before_the_verdict_are_not_called_missing():
