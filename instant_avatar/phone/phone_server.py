@@ -3,6 +3,8 @@
 import asyncio
 import json
 import socket
+import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -14,7 +16,6 @@ from typing import Any, final
 from urllib.parse import quote
 
 from aiohttp import web
-from rich.console import Console as RichConsole
 
 from capture.input_error import InputError
 from export.build import write_warm_up_package
@@ -30,8 +31,7 @@ from export.player_page import (
 from instant_avatar.animation import web_server
 from instant_avatar.animation.driving_motion import pose_rate
 from instant_avatar.animation.web_server import sample_motions
-from instant_avatar.cli.console import Console
-from instant_avatar.export import ExportArguments, export
+from instant_avatar.cli.command_line import DONE
 from instant_avatar.phone.access_control import AccessControl
 from instant_avatar.phone.film_queue import Film, FilmQueue, FilmRefused
 
@@ -404,12 +404,19 @@ def _warm_up_package() -> bytes:
 
 
 def _exported(package: Path, file: str, author: str) -> bytes:
-    """A file of an avatar for other programs, as ia-export writes it; a VRM names its author."""
+    """A file of an avatar for other programs, as ia-export writes it; a VRM names its author.
+
+    A process of its own makes it: what unwraps textures stops all threads of its process for
+    seconds, and the film that is being learnt from, too.
+    """
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / file
-        to: Any = "splats" if out.suffix == ".spz" else out.suffix[1:]
-        named = author if author and to == "vrm" else None
-        triangles = None if to == "splats" else MESH_TRIANGLES
-        chosen = ExportArguments(run=package, to=to, out=out, triangles=triangles, author=named)
-        export(chosen, Console(RichConsole(quiet=True)))  # the folder is gone soon
+        to = "splats" if out.suffix == ".spz" else out.suffix[1:]
+        words = [str(package), f"--to={to}", f"--out={out}"]
+        words += [] if to == "splats" else [f"--triangles={MESH_TRIANGLES}"]
+        words += [f"--author={author}"] if author and to == "vrm" else []
+        command = [sys.executable, "-m", "instant_avatar.export", *words]
+        done = subprocess.run(command, capture_output=True, encoding="utf-8", check=False)
+        if done.returncode != DONE:
+            raise InputError(done.stderr.strip())
         return out.read_bytes()

@@ -16,6 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from urllib.parse import quote
 
+import psutil
 import pytest
 
 pytest.importorskip("aiohttp")
@@ -381,6 +382,21 @@ def test_an_avatar_is_saved_as_splats(phone, anna, capsys):
     assert answer.status == 200
     assert capsys.readouterr().err == ""  # no path of a file that is gone
     assert gzip.decompress(answer.content).startswith(b"NGSP")
+
+
+@pytest.mark.slow
+def test_what_makes_a_mesh_is_no_thread_of_the_page(phone, anna):
+    with ThreadPoolExecutor() as pool:
+        waiting = pool.submit(phone.ask, "GET", "/avatars/Anna/avatar.glb")
+        commands = []
+        while not waiting.done():
+            for child in psutil.Process().children():
+                with suppress(psutil.Error):
+                    commands += child.cmdline()
+            assert phone.ask("GET", "/avatars").status == 200
+            time.sleep(0.05)
+    assert "instant_avatar.export" in commands
+    assert waiting.result().content.startswith(b"glTF")
 
 
 @pytest.mark.slow
