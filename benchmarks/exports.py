@@ -157,7 +157,7 @@ def measure(job: ExportJob) -> int:
     files = {f"{number}.ply": encode_ply(each) for number, each in enumerate(splats)}
     files |= {f"{number}.spz": encode_spz(each) for number, each in enumerate(splats)}
     files |= {"index.html": PAGE.encode(), "mesh.glb": mesh, **packages(job.node)}
-    files["rest.spz"] = encode_spz(build_splats(package))
+    files["rest.spz"] = encode_spz(build_splats(package, None))
     files[SKINNING.name] = SKINNING.read_bytes()
     with serve(files) as browser:
         drawn[f"mesh of {job.triangles:,} triangles"] = draw_meshes(browser, package, views)

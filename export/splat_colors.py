@@ -13,16 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from capture.camera import Camera
 
-VIEWS = 8
-"""Cameras around the avatar."""
 ELEVATION_RAD = 0.3
 """Angle by which every second one looks down, and the others up."""
 DISTANCE_SIZES = 1.5
 """Distance of the cameras from the avatar's middle, in widths of what they see."""
 MARGIN = 1.15
 """Width of what they see, in diagonals of the avatar's box."""
-PIXEL_M = 0.005
-"""Size of their pixels on the avatar, about, metres."""
 ITERATIONS = 8
 """Iterations of least squares."""
 OWN_WEIGHT = 0.3
@@ -38,7 +34,7 @@ MIN_ALPHA = 1.0 / 512.0
 
 
 def cameras_around(
-    positions: Float[np.ndarray, "points 3"], views: int = VIEWS, pixel_m: float = PIXEL_M
+    positions: Float[np.ndarray, "points 3"], *, views: int, pixel_m: float
 ) -> list[Camera]:
     """Cameras around points, y up, that show all of them; pixels are squares of `pixel_m`."""
     low, high = positions.min(axis=0), positions.max(axis=0)

@@ -64,6 +64,10 @@ COARSE_PIXEL_M = 0.0092
 DEPTH_PER_PIXEL = 0.37
 """Change of the shells' depth by the size of a film's pixels: an avatar filmed in finer pixels is
 viewed from nearer, where a viewer's blur of half a pixel is narrower. Chosen on three avatars."""
+VIEWS = 8
+"""Pictures of the avatar from around it, to which colors are fitted."""
+PIXEL_M = 0.005
+"""Size of their pixels on the avatar, about, metres."""
 SH_BASE = 0.28209479177387814
 """Spherical harmonics' constant function, by which 3DGS divides colors."""
 SPZ_MAGIC, SPZ_VERSION = 0x5053474E, 2
@@ -90,8 +94,8 @@ class GaussianSplats:
     rotations: Float32[np.ndarray, "splats 4"]
 
 
-def build_splats(package: AvatarPackage, pose: BodyPose | None = None) -> GaussianSplats:
-    """Lay Gaussians under an avatar's surface, and move them to a pose (default: canonical)."""
+def build_splats(package: AvatarPackage, pose: BodyPose | None) -> GaussianSplats:
+    """Lay Gaussians under an avatar's surface, and move them to a pose (None: canonical)."""
     tables, player = package.tables["hq"], Player(package)
     level = LevelSet.of(tables.bricks, FIRM_DENSITY)
     crossings = sum(np.count_nonzero(np.diff(level.heights > 0.0, axis=axis)) for axis in range(3))
@@ -106,7 +110,7 @@ def build_splats(package: AvatarPackage, pose: BodyPose | None = None) -> Gaussi
     positions, axes, colors, opacities, joints, weights = (
         np.concatenate(each) for each in zip(*parts, strict=True)
     )
-    cameras = cameras_around(positions)
+    cameras = cameras_around(positions, views=VIEWS, pixel_m=PIXEL_M)
     pictures = [picture_on_white(premultiply(player.render_canonical(each))) for each in cameras]
     colors = fit_colors(positions, axes, opacities, colors, cameras, pictures)
     if pose is not None:

@@ -33,7 +33,10 @@ def package(exported):
 
 @pytest.fixture(scope="module")
 def splats(package):
-    return build_splats(package)
+    """In colors of coarse pictures: what is seen from afar is tested by itself."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("export.splats.PIXEL_M", 0.02)
+        return build_splats(package, None)
 
 
 def covariances(scales, rotations):
@@ -145,7 +148,8 @@ def test_they_lie_in_shells_under_the_surface_and_clear_of_it(package, splats):
 
 def test_wide_clothes_have_gaussians_farther_apart(package, splats, monkeypatch):
     monkeypatch.setattr("export.splats.MAX_CROSSED_M2", 0.2)
-    fewer = build_splats(package)
+    monkeypatch.setattr("export.splats.PIXEL_M", 0.02)
+    fewer = build_splats(package, None)
     assert len(fewer.positions) < 0.6 * len(splats.positions)
     area = [np.sort(each.scales, axis=1)[:, 1:].prod(axis=1).sum() for each in (fewer, splats)]
     assert area[0] == pytest.approx(area[1], rel=0.1)  # each is wider
@@ -154,7 +158,8 @@ def test_wide_clothes_have_gaussians_farther_apart(package, splats, monkeypatch)
 @pytest.mark.slow
 def test_shells_of_a_finer_film_lie_nearer_to_the_surface(package, splats):
     metrics = {**package.manifest.metrics, "recipe": {"finest_m": COARSE_PIXEL_M - 0.005}}
-    fine = build_splats(replace(package, manifest=replace(package.manifest, metrics=metrics)))
+    finer = replace(package, manifest=replace(package.manifest, metrics=metrics))
+    fine = build_splats(finer, None)
     surface = KDTree(extract_mesh(package.tables["hq"]).positions)
     for shell in SHELLS[:2]:
         depths = [
@@ -180,7 +185,7 @@ def test_colors_are_fitted_so_that_blurred_and_overlapping_gaussians_show_the_pi
         scales=np.float32(scales),
         rotations=np.float32(turned.as_quat(scalar_first=True)),
     )
-    cameras = cameras_around(true.positions)
+    cameras = cameras_around(true.positions, views=8, pixel_m=0.005)
     pictures = [np.float32(rasterize(true, each)) for each in cameras]
     assert all((picture[0] == 1.0).all() for picture in pictures)  # the whole ball is seen
     gray = np.full((len(normals), 3), 0.5)

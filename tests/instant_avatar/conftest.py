@@ -12,6 +12,7 @@ import pytest
 from avatar.rig import Rig
 from avatar.training import held_out_pose_fitting, train
 from capture.atomic_files import write_text_atomically
+from export import mesh_texture, splats
 from export.bake import bake_tables, fine_tuning
 from export.build import ExportReport
 from export.player import Player
@@ -61,13 +62,15 @@ BRIEF = pytest.MonkeyPatch()
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup():
-    """Bake coarser voxels, fine-tune on fewer, smaller images, fit poses in fewer steps, and show
-    a shorter film."""
+    """Bake coarser voxels, fine-tune on fewer, smaller images, color exports by coarser ones, fit
+    poses in fewer steps, and show a shorter film."""
     BRIEF.setattr(bake_tables, "MIN_VOXEL_M", BRIEF_VOXEL_M)
     BRIEF.setattr(bake_tables, "MAX_VOXEL_M", BRIEF_VOXEL_M)
     BRIEF.setattr(bake_tables, "FINE_TUNING_PICTURES", 4)
     BRIEF.setattr(fine_tuning, "TRAINING_PX", 128)
     BRIEF.setattr(fine_tuning, "VALIDATION_PX", 128)
+    BRIEF.setattr(splats, "PIXEL_M", 0.02)
+    BRIEF.setattr(mesh_texture, "PIXEL_M", 0.01)
     BRIEF.setattr(held_out_pose_fitting, "CORRECTIONS_PER_FRAME", 4)
     BRIEF.setattr(report_writer, "ANIMATION_PX", 96)
     BRIEF.setattr(report_writer, "ANIMATION_FRAMES", 4)
