@@ -103,12 +103,6 @@ class Camera:
         width, height = (max(1, round(side * scale)) for side in self.size_px)
         return self.resize((width, height))
 
-    def pixel_centers(self) -> Float[np.ndarray, "height width 2"]:
-        """The centre (x, y) of every pixel."""
-        width, height = self.size_px
-        x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        return np.stack([x, y], axis=-1)
-
     def ray_directions(
         self, pixels: Float[np.ndarray, "*batch 2"]
     ) -> Float[np.ndarray, "*batch 3"]:

@@ -291,11 +291,10 @@ def find_provider(name: str) -> str:
     )
 
 
-def shorten_error(error: Exception, max_length: int = 400) -> str:
-    """Return onnxruntime's message on one line, its middle cut out beyond `max_length`."""
+def shorten_error(error: Exception) -> str:
+    """Return onnxruntime's message on one line, its middle cut out beyond 400 characters."""
     message = " ".join(str(error).split())
-    half = max_length // 2
-    return message if len(message) <= max_length else f"{message[:half]} … {message[-half:]}"
+    return message if len(message) <= 400 else f"{message[:200]} … {message[-200:]}"
 
 
 def create_session(

@@ -58,41 +58,39 @@ MISSING_MESSAGE = (
 """Message of `runtime_files` for a missing file."""
 
 
-def install_runtime(tarball: bytes, folder: Path | None = None) -> None:
-    """Store what the page needs of npm's tarball in a folder, `RUNTIME_FOLDER` if None.
+def install_runtime(tarball: bytes) -> None:
+    """Store what the page needs of npm's tarball in `RUNTIME_FOLDER`.
 
     Raises:
         InputError: If its checksum is another.
     """
-    folder = folder or RUNTIME_FOLDER
     found = "sha512-" + base64.b64encode(hashlib.sha512(tarball).digest()).decode()
     if found != INTEGRITY:
         raise InputError(
             f"The tarball is not onnxruntime-web {ORT_WEB_VERSION}: its checksum is {found}, "
             f"expected {INTEGRITY}. Nothing was kept."
         )
-    folder.mkdir(parents=True, exist_ok=True)
+    RUNTIME_FOLDER.mkdir(parents=True, exist_ok=True)
     with tarfile.open(fileobj=io.BytesIO(tarball)) as archive:
         for name, member in TARBALL_MEMBERS.items():
             file = archive.extractfile(member)
             assert file is not None
-            with atomic_file(folder / name) as part:
+            with atomic_file(RUNTIME_FOLDER / name) as part:
                 part.write_bytes(file.read())
     for name in LICENCE_FILES:
         notice = resources.files("onnxruntime").joinpath(name)
-        with atomic_file(folder / name) as part:
+        with atomic_file(RUNTIME_FOLDER / name) as part:
             part.write_bytes(notice.read_bytes())
 
 
-def runtime_files(folder: Path | None = None) -> dict[str, bytes]:
+def runtime_files() -> dict[str, bytes]:
     """Read the stored files by name; `InputError` says how to fetch a missing one."""
-    folder = folder or RUNTIME_FOLDER
     wanted = (*TARBALL_MEMBERS, *LICENCE_FILES)
-    missing = [name for name in wanted if not (folder / name).is_file()]
+    missing = [name for name in wanted if not (RUNTIME_FOLDER / name).is_file()]
     if missing:
         command = quote_command(sys.executable, "-m", "instant_avatar.animation.web_server")
-        raise InputError(MISSING_MESSAGE.format(folder=folder, command=command))
-    return {name: (folder / name).read_bytes() for name in wanted}
+        raise InputError(MISSING_MESSAGE.format(folder=RUNTIME_FOLDER, command=command))
+    return {name: (RUNTIME_FOLDER / name).read_bytes() for name in wanted}
 
 
 PAGE_SUFFIXES = (".html", ".css", ".js", ".svg")

@@ -16,6 +16,8 @@ from avatar.events import HeldOutScore
 from avatar.kernels.operands import HashLevels
 from avatar.rig import Rig
 from avatar.training.frame_stream import prepare_stream
+from avatar.training.pose_correction import SIGMA_OF_ROW
+from avatar.training.pose_optimizer import PoseOptimizer
 from avatar.training.trainer import Trainer, cosine_decay
 from capture.camera import Camera
 from capture.source import Frame
@@ -69,6 +71,18 @@ def levels() -> HashLevels:
         low.astype(np.float32), high.astype(np.float32),
         coarsest_m=0.2, finest_m=0.02, levels=4, table_size=4096,
     )  # fmt: skip
+
+
+def pixel_centers(camera: Camera) -> np.ndarray:
+    """The centre (x, y) of every pixel, row after row."""
+    width, height = camera.size_px
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    return np.stack([x, y], axis=-1).reshape(-1, 2)
+
+
+def pose_gradient(poses: PoseOptimizer, slot: int) -> np.ndarray:
+    """Gradient of the accumulated rays' losses with respect to a slot's correction, (25, 3)."""
+    return poses._rays.equations(slot).gradient[:75].reshape(25, 3) / SIGMA_OF_ROW[:, None]
 
 
 @pytest.fixture

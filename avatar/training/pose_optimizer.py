@@ -23,7 +23,6 @@ from avatar.kernels.operands import SkinningVolume
 from avatar.rig import Rig
 from avatar.training.pose_correction import (
     MIN_EVIDENCE,
-    SIGMA_OF_ROW,
     JointFrames,
     RaySums,
     TemporalPosePrior,
@@ -282,10 +281,6 @@ class PoseOptimizer:
         """Motion of the slot's rays by its root correction."""
         turn, shift = self._joints.root_turns[slot], self.corrections[slot, 24]
         return RootCorrection(rotation=turn, shift=shift, pivot=self.rig.rest_joints[0])
-
-    def pose_gradient(self, slot: int) -> Float[np.ndarray, "25 3"]:
-        """Gradient of the accumulated rays' losses with respect to the slot's correction."""
-        return self._rays.equations(slot).gradient[:75].reshape(25, 3) / SIGMA_OF_ROW[:, None]
 
     def _apply_correction(self, slot: int, correction: Float[np.ndarray, "25 3"]) -> None:
         """Applies a correction, or the part of it that the frame's roots can follow."""

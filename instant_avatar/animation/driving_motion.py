@@ -37,7 +37,7 @@ L_HIP, R_HIP, L_KNEE, R_KNEE, L_SHOULDER, R_SHOULDER, L_ELBOW, R_ELBOW = range(8
 _JOINTS = np.array([1, 2, 4, 5, 16, 17, 18, 19]) - 1
 
 
-def demo_motion(frames: int = 90, *, fps: float = ASSUMED_FPS) -> Motion:
+def demo_motion(frames: int = 90) -> Motion:
     """Turn once at the world's origin, wave and lift the knees; the motion is a loop."""
     phase = np.linspace(0.0, 2.0 * np.pi, frames, endpoint=False)
     steps = np.sin(2.0 * phase)
@@ -61,7 +61,7 @@ def demo_motion(frames: int = 90, *, fps: float = ASSUMED_FPS) -> Motion:
         valid=np.ones(frames, dtype=bool),
         betas=np.zeros(10),
         body_model="body24",
-        times_s=np.arange(frames) / fps,
+        times_s=np.arange(frames) / ASSUMED_FPS,
     )
 
 

@@ -111,15 +111,15 @@ def dancing_motion(actor: Actor, *, frames: int, fps: float, turns: float, seed:
     return _motion_from_gestures(actor, _interpolate_gestures(keys, frames, turns), fps)
 
 
-def unfilmed_dance(actor: Actor, *, frames: int = 150, fps: float = 30.0) -> Motion:
-    """The driving motion: a dance with one turn that no camera has seen."""
+def unfilmed_dance(actor: Actor) -> Motion:
+    """The driving motion: five seconds of a dance with one turn that no camera has seen."""
     keys = [replace(key, hop=0.03 if key is KICK else 0.0) for key in UNFILMED_DANCE]
-    return _motion_from_gestures(actor, _interpolate_gestures(keys, frames, 1.0), fps)
+    return _motion_from_gestures(actor, _interpolate_gestures(keys, 150, 1.0), 30.0)
 
 
-def novel_poses(actor: Actor, *, fps: float = 30.0) -> Motion:
+def novel_poses(actor: Actor) -> Motion:
     """Twelve poses that neither film holds: arms up and down, bent knees, steps, from all sides."""
-    return _motion_from_gestures(actor, list(NOVEL_POSES), fps)
+    return _motion_from_gestures(actor, list(NOVEL_POSES), 30.0)
 
 
 def _interpolate_gestures(

@@ -23,8 +23,6 @@ from preprocess.capture_session import Capture
 from preprocess.fitting.outlines import IMAGE_BORDER_PX
 from preprocess.fitting.silhouettes import read_first_silhouettes
 
-START_FRAMES = 16
-"""Frames whose boxes are compared."""
 SIGMA_SHIFT_M = 0.2
 """Prior standard deviation of the pelvis's shift, metres: from one side, a smaller distance and a
 shift towards the camera look alike."""
@@ -76,7 +74,7 @@ def start_distances(
     Returns:
         The capture, words for people, and figures for the report.
     """
-    samples = read_first_silhouettes(capture, START_FRAMES)
+    samples = read_first_silhouettes(capture)
     if not samples:
         return capture, "" if capture.masks.is_given else NO_PERSON_FOUND, None
     start = _find_start(capture, samples, by_focal_length=False)
@@ -110,7 +108,7 @@ def start_distances(
 
 def start_focal_length(capture: Capture) -> Capture:
     """Multiply a focal length that no file states, so that the body fits the masks."""
-    samples = read_first_silhouettes(capture, START_FRAMES)
+    samples = read_first_silhouettes(capture)
     start = _find_start(capture, samples, by_focal_length=True) if samples else None
     if start is None or not start.is_taken:
         return capture

@@ -12,6 +12,8 @@ from preprocess.capture_session import Capture
 from preprocess.fitting.outlines import OUTLINE_PERSON_PX
 from preprocess.observation import Observation, associate_cameras
 
+START_FRAMES = 16
+"""Frames of the first masks, spread evenly."""
 FIRST_FRAMES = 240
 """Frames at the beginning of a video over which the first masks are spread that are estimated:
 decoding takes longest."""
@@ -22,14 +24,14 @@ LEAST_PICTURE_PX, MOST_PICTURE_PX = 480, 960
 them at 256 px, and 50 take 80 MB."""
 
 
-def read_first_silhouettes(capture: Capture, count: int) -> tuple[MaskSample, ...]:
+def read_first_silhouettes(capture: Capture) -> tuple[MaskSample, ...]:
     """Masks as they are given, or as the beginning of the video shows them; none without any."""
     with suppress(InputError):
         if capture.masks.is_given:
-            return _read_given(capture, count)
+            return _read_given(capture, START_FRAMES)
         total = min(capture.source.frame_count or 1, FIRST_FRAMES)
         small = replace(capture, size_px=min(capture.size_px, FIRST_SIZE_PX))
-        return _observe(small, count, total)
+        return _observe(small, START_FRAMES, total)
     return ()
 
 

@@ -20,10 +20,11 @@ from avatar.kernels.operands import MAX_LOG_DENSITY, MarchSettings, RayBatch
 from avatar.render import EMPTY_LOG_DENSITY, body_frame_rays, correspondence_tables, render
 from baselines import torch_reference
 from capture.camera import Camera
+from tests.avatar_fixtures import pixel_centers
 
 
 def rays_of(camera: Camera, world_from_body: np.ndarray) -> RayBatch:
-    return body_frame_rays(camera.pixel_centers().reshape(-1, 2), camera, world_from_body)
+    return body_frame_rays(pixel_centers(camera), camera, world_from_body)
 
 
 def lattice_samples(avatar: Avatar, pose, camera, cells: CorrespondenceGrid):

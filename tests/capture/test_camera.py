@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from capture.camera import Camera
+from tests.avatar_fixtures import pixel_centers
 
 
 def camera_at(seed: int, distortion: tuple[float, ...] = ()) -> Camera:
@@ -34,7 +35,7 @@ def test_a_point_on_a_ray_projects_back_to_its_pixel(seed, depth, distortion):
 
 def test_directions_are_unit_and_start_at_the_camera_center():
     camera = camera_at(3)
-    directions = camera.ray_directions(camera.pixel_centers())
+    directions = camera.ray_directions(pixel_centers(camera))
     np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1.0)
     center = camera.camera_from_world @ np.append(camera.center_world, 1.0)
     np.testing.assert_allclose(center[:3], 0.0, atol=1e-12)
@@ -49,13 +50,6 @@ def test_the_camera_looks_along_z_with_x_right_and_y_down():
     )
     np.testing.assert_allclose(camera.ray_directions(np.array([50.0, 50.0])), [0.0, 0.0, 1.0])
     np.testing.assert_allclose(camera.project(np.array([1.0, 2.0, 4.0])), [75.0, 100.0])
-
-
-def test_the_first_pixel_has_its_center_at_a_half():
-    centers = camera_at(0).pixel_centers()
-    assert centers.shape == (150, 200, 2)
-    np.testing.assert_array_equal(centers[0, 0], [0.5, 0.5])
-    np.testing.assert_array_equal(centers[-1, -1], [199.5, 149.5])
 
 
 def test_a_resized_camera_sees_the_same_directions():

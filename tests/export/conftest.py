@@ -15,6 +15,7 @@ from export.build import ExportReport, export_field
 from export.package.player_tables import PlayerTables
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import body_from_rest
+from tests.avatar_fixtures import pixel_centers
 
 RADII_CM = [12, 8, 8, 12, 6, 6, 13, 5, 5, 13, 5, 5, 7, 7, 7, 10, 6, 6, 5, 5, 4, 4, 4, 4]
 STEP_M = 0.005
@@ -36,7 +37,7 @@ class StandIn:
         """The exact picture: every sample is carried into canonical space by itself."""
         width, height = camera.size_px
         root = self.rig.world_from_body(pose)
-        directions = camera.ray_directions(camera.pixel_centers()).reshape(-1, 3) @ root[:3, :3]
+        directions = camera.ray_directions(pixel_centers(camera)) @ root[:3, :3]
         origin = (camera.center_world - root[:3, 3]) @ root[:3, :3]
         bones = self.rig.body_from_canonical(pose.joint_rotations)
         skin, nearest = _posed(self.rig, self.rig.seeds, bones), 0.10

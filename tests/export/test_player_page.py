@@ -81,16 +81,17 @@ def test_every_file_that_the_page_names_is_there(files):
     assert {"runtime/LICENSE", "runtime/ThirdPartyNotices.txt"} <= files.keys()
 
 
-def test_a_missing_runtime_is_refused_with_the_command_to_run(tmp_path):
+def test_a_missing_runtime_is_refused_with_the_command_to_run(tmp_path, monkeypatch):
+    monkeypatch.setattr(player_page, "RUNTIME_FOLDER", tmp_path)
     with pytest.raises(InputError, match=r"instant_avatar\.animation\.web_server"):
-        player_page.runtime_files(tmp_path)
+        player_page.runtime_files()
 
 
-def test_an_altered_tarball_is_refused_and_leaves_nothing(tmp_path):
-    folder = tmp_path / "runtime"
+def test_an_altered_tarball_is_refused_and_leaves_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(player_page, "RUNTIME_FOLDER", tmp_path / "runtime")
     with pytest.raises(InputError, match="Nothing was kept"):
-        player_page.install_runtime(b"something else", folder)
-    assert not folder.exists()
+        player_page.install_runtime(b"something else")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_what_changes_with_every_picture_is_not_read_aloud():

@@ -20,6 +20,7 @@ from avatar.training.training_step import (
     compute_gradients,
 )
 from baselines import torch_reference
+from tests.avatar_fixtures import pose_gradient
 
 FIRM_SHARE = 0.25
 """Far from 0 and 1, so that no term may be left out."""
@@ -162,7 +163,7 @@ def test_half_of_the_samples_give_nearly_the_steps_whole_gradient(trainer):
             dataclasses.replace(CONFIG, faint_gradient_share=share), hard_surface_share=1.0,
             poses=poses, generator=torch.Generator().manual_seed(4),
         )  # fmt: skip
-        pulls = torch.cat([torch.from_numpy(poses.pose_gradient(slot)) for slot in range(4)])
+        pulls = torch.cat([torch.from_numpy(pose_gradient(poses, slot)) for slot in range(4)])
         found.append((trainer.field.table_grad.clone(), pulls))
     for whole, drawn in zip(*found, strict=True):
         assert not torch.equal(whole, drawn)

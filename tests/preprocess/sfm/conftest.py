@@ -9,6 +9,7 @@ import pytest
 
 from capture.camera import Camera
 from preprocess.sfm.camera_solution import SparseModel
+from tests.avatar_fixtures import pixel_centers
 
 HALF_M, HEIGHT_M = 3.0, 2.6
 PIXELS_PER_M = 160
@@ -75,7 +76,7 @@ class Room:
         """The picture, 8-bit RGB."""
         width, height = camera.size_px
         eye = camera.center_world
-        rays = camera.ray_directions(camera.pixel_centers()).reshape(-1, 3)
+        rays = camera.ray_directions(pixel_centers(camera))
         low, high = np.array([-HALF_M, 0.0, -HALF_M]), np.array([HALF_M, HEIGHT_M, HALF_M])
         with np.errstate(divide="ignore"):
             ahead = np.where(rays > 0, (high - eye) / rays, (low - eye) / rays)
