@@ -27,10 +27,9 @@ class SampleArguments:
 
         ia-ingest demo/capture/video.mp4 --poses demo/capture/poses.npz
 
-    With --motion walkaround a phone is carried around the actor in a furnished room, with --motion
-    pan it turns after the actor from where it is held. Like a phone video it comes without
-    cameras: poses.npz is relative to the camera of each frame, with K; the true cameras are in
-    OUT/truth/cameras.npz, for comparison or for --cameras.
+    With --motion walkaround a phone is carried around the actor in a furnished room. Like a phone
+    video it comes without cameras: poses.npz is relative to the camera of each frame, with K; the
+    true cameras are in OUT/truth/cameras.npz, for comparison or for --cameras.
 
     With --like-a-phone everything is a little wrong, as in reality. OUT/truth then holds the exact
     body, poses, cameras and masks; the options --body, --poses, --cameras and --masks of ia-ingest

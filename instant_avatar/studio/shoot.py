@@ -68,8 +68,6 @@ PHONE_ARM_LIFT_DEG = -64.0
 PHONE_TURNS, WALK_TURNS, TURNS = 1.25, -0.75, 2.0
 """Turns of the actor before a phone, a phone that is carried around, or the studio's camera, if the
 user names none."""
-PAN_CROSSING_M = 2.0
-"""Way of the actor across the room while a phone turns after it."""
 
 
 def _write_phone_capture(folder: Path, config: ShootConfig, progress: ShootProgress) -> None:
@@ -120,7 +118,6 @@ def _choose_motion(actor: Actor, config: ShootConfig) -> Motion:
         "turn": staging.turning_motion,
         "dance": staging.dancing_motion,
         "walkaround": staging.gesturing_motion,
-        "pan": partial(staging.gesturing_motion, crossing_m=PAN_CROSSING_M),
     }
     if config.like_a_phone:
         turns = PHONE_TURNS
@@ -310,8 +307,7 @@ def _build_scenes(
     if config.camera_moves:
         tall = staging.actor_height_m(actor)
         at = (truth.root_translations + actor.shaped.joints[0])[:, [0, 2]]
-        arc = staging.ARC_DEG if config.motion == "walkaround" else 0.0
-        cameras = staging.handheld_cameras(at, tall, config.size, config.seed, arc_deg=arc)
+        cameras = staging.handheld_cameras(at, tall, config.size, config.seed)
         apart = staging.standing_camera(tall, config.size)
     else:
         apart = static_camera(actor, config.size)

@@ -25,10 +25,10 @@ class ShootConfig:
     """Of the swaying, the clutter and the noise; from 1 on it varies the actor's looks, too."""
     subject: Literal[1, 2, 3] = 1
     """Which of the three actors."""
-    motion: Literal["turn", "dance", "walkaround", "pan"] = "turn"
+    motion: Literal["turn", "dance", "walkaround"] = "turn"
     """What happens: the actor turns with arms held off the body, or dances; or gestures while a
-    phone is carried around, or crosses the room while a phone turns after it (poses.npz is then
-    in the camera of each frame, with K; the cameras lie in truth/cameras.npz)."""
+    phone is carried around (poses.npz is then in the camera of each frame, with K; the cameras lie
+    in truth/cameras.npz)."""
     track: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Pose file whose motion is filmed instead of a turn of the studio's own, such as a track of
     PeopleSnapshot; `frames` of its poses, evenly spread, on the spot."""
@@ -56,7 +56,7 @@ class ShootConfig:
     @property
     def camera_moves(self) -> bool:
         """Tell whether the camera moves."""
-        return self.motion in ("walkaround", "pan")
+        return self.motion == "walkaround"
 
     @property
     def effective_background(self) -> Literal["plain", "clutter", "room", "tiles"]:
@@ -83,7 +83,7 @@ class ShootConfig:
         if self.camera_moves and self.effective_background in ("plain", "clutter"):
             raise InputError(
                 f"--background {self.effective_background} is painted for a static camera; with "
-                f"--motion {self.motion} use room or tiles."
+                "--motion walkaround use room or tiles."
             )
 
     def _validate_phone(self) -> None:
@@ -91,5 +91,5 @@ class ShootConfig:
         if self.camera_moves or self.background in ("room", "tiles") or own_noise:
             raise InputError(
                 "--like-a-phone films --motion turn or dance before --background plain or clutter, "
-                "and has noise of its own: leave out --motion walkaround or pan and the noise."
+                "and has noise of its own: leave out --motion walkaround and the noise."
             )

@@ -24,6 +24,7 @@ from instant_avatar.studio.gestures import (
     Gesture,
     Leg,
 )
+from instant_avatar.studio.input_errors import smooth_noise
 from preprocess.body.body_pose import BodyPose, Motion
 
 ARM_LIFT_DEG = -44.0
@@ -65,16 +66,10 @@ def _turning_gesture(
     )
 
 
-def gesturing_motion(
-    actor: Actor, *, frames: int, fps: float, turns: float, seed: int, crossing_m: float = 0.0
-) -> Motion:
-    """Gesture for a moving camera: arms, knees, a slow turn, shifts, `crossing_m` sideways."""
+def gesturing_motion(actor: Actor, *, frames: int, fps: float, turns: float, seed: int) -> Motion:
+    """Gesture for a moving camera: arms, knees, a slow turn, shifts."""
     phases = np.random.default_rng([seed, 8]).uniform(0.0, 2.0 * np.pi, 12)
-    gestures = []
-    for share in np.arange(frames) / frames:
-        gesture = _waving_gesture(share, turns, phases)
-        aside = -0.5 * crossing_m * np.cos(np.pi * share)
-        gestures.append(replace(gesture, shift=(gesture.shift[0] + aside, gesture.shift[1])))
+    gestures = [_waving_gesture(share, turns, phases) for share in np.arange(frames) / frames]
     return _motion_from_gestures(actor, gestures, fps)
 
 
@@ -291,12 +286,7 @@ SHAKE_FRAMES = 2.5
 
 
 def handheld_cameras(
-    actor_xz_m: Float[np.ndarray, "frames 2"],
-    height_m: float,
-    size: int,
-    seed: int,
-    *,
-    arc_deg: float = ARC_DEG,
+    actor_xz_m: Float[np.ndarray, "frames 2"], height_m: float, size: int, seed: int
 ) -> tuple[Camera, ...]:
     """Return one camera a frame, on an arc around the actor, the actor in the image.
 
@@ -304,17 +294,16 @@ def handheld_cameras(
     """
     frames = len(actor_xz_m)
     generator = np.random.default_rng([seed, 7])
-    shake = _smooth_gaussian_noise(generator, frames, 6, SHAKE_FRAMES)
-    slow = _smooth_gaussian_noise(generator, frames, 3, max(frames / 6.0, 1.0))
+    shake = smooth_noise(generator, (frames, 6), SHAKE_FRAMES)
+    slow = smooth_noise(generator, (frames, 3), max(frames / 6.0, 1.0))
     share = np.linspace(0.0, 1.0, frames) + 0.02 * np.sin(2.0 * np.pi * np.linspace(0, 1, frames))
-    angles = np.deg2rad(arc_deg) * (share - 0.5)
+    angles = np.deg2rad(ARC_DEG) * (share - 0.5)
     steps = np.arange(frames) * (2.0 * np.pi / 16.0)  # a step lifts the hand, twice a second
-    walks = float(arc_deg > 0.0)
-    away = WALK_DISTANCE_HEIGHTS * height_m + walks * 0.05 * np.tanh(slow[:, 0])
+    away = WALK_DISTANCE_HEIGHTS * height_m + 0.05 * np.tanh(slow[:, 0])
     eyes = np.column_stack(
         [away * np.sin(angles), np.full(frames, HANDHELD_HEIGHT_M), away * np.cos(angles)]
     )
-    eyes[:, 1] += walks * (0.03 * np.tanh(slow[:, 1]) + 0.012 * np.sin(steps))
+    eyes[:, 1] += 0.03 * np.tanh(slow[:, 1]) + 0.012 * np.sin(steps)
     eyes += SHAKE_M * shake[:, :3]
     turned = np.deg2rad(SHAKE_DEG) * shake[:, 3:]
     turned[:, 2] += np.deg2rad(1.5) * np.tanh(slow[:, 2])
@@ -357,13 +346,3 @@ def _aim_handheld_camera(
     axes = np.stack([cosine * right + sine * down, cosine * down - sine * right, forward])
     height = max(1, round(size * WALK_ASPECT[1] / WALK_ASPECT[0]))
     return Camera.at(eye, axes, FOCAL_SHARE * size, (size, height))
-
-
-def _smooth_gaussian_noise(
-    generator: np.random.Generator, frames: int, columns: int, over: float
-) -> Float[np.ndarray, "frames columns"]:
-    """Return Gaussian noise of unit variance, smoothed over a number of frames."""
-    margin = int(4 * over) + 1
-    white = generator.standard_normal((frames + 2 * margin, columns))
-    smooth = gaussian_filter1d(white, over, axis=0)[margin : margin + frames]
-    return smooth * np.sqrt(2.0 * np.sqrt(np.pi) * over)  # the power of a Gaussian filter
