@@ -184,7 +184,10 @@ def test_the_page_needs_nothing_else(run):
     assert "<svg" in page
 
 
-def test_an_older_run_is_not_lost_by_accident(capture, call_ingest, tmp_path):
+def test_an_older_run_is_not_lost_by_accident_but_replaced_where_told(
+    capture, call_ingest, without_baking, tmp_path, changed
+):
+    """Lost poses are left out and listed."""
     run = RunFolder(path=tmp_path / "run")
     run.start_run(resume=False)
     write_text_atomically(run.report_json, "{}")
@@ -192,17 +195,22 @@ def test_an_older_run_is_not_lost_by_accident(capture, call_ingest, tmp_path):
     assert outcome.code == 2
     assert "--overwrite" in outcome.complaint()
     assert run.report_json.read_text() == "{}"
-
-
-def test_overwriting_replaces_it(capture, call_ingest, without_baking, tmp_path):
-    run = RunFolder(path=tmp_path / "run")
-    run.start_run(resume=False)
-    write_text_atomically(run.report_json, "{}")
+    with np.load(capture / "poses.npz") as archive:
+        places = archive["transl"].copy()
+    places[[3, 7]] = np.nan
+    changed(capture / "poses.npz", transl=places)
     copy = tmp_path / "copy.json"
-    outcome = call_ingest(capture, *FEW, "--out", tmp_path / "run", "--overwrite", "--json", copy)
+    outcome = call_ingest(capture, *FEW, "--out", run.path, "--overwrite", "--json", copy)
     assert outcome.code == 0
-    assert json.loads((tmp_path / "run" / "report.json").read_text())["format"] == 1
-    assert copy.read_text() == (tmp_path / "run" / "report.json").read_text()
+    assert copy.read_text() == run.report_json.read_text()
+    report = json.loads(copy.read_text())
+    assert report["format"] == 1
+    assert report["frames"]["dropped"] == [
+        {"index": 3, "reason": "pose invalid"},
+        {"index": 7, "reason": "pose invalid"},
+    ]
+    assert report["frames"]["read"] == 8
+    assert {path.name for path in tmp_path.iterdir()} == {"capture", "run", "copy.json"}
 
 
 def test_a_run_goes_on_where_it_stopped(capture, call_ingest, without_baking, tmp_path):
@@ -296,21 +304,3 @@ def test_ctrl_c_saves_what_was_learnt(film, tmp_path):
     assert len(report["held_out"]["frames"]) >= 1
     Player.load(tmp_path / "run" / "avatar.iavatar")
     assert (tmp_path / "run" / "checkpoint" / "state.pt").exists()
-
-
-def test_lost_poses_are_left_out_and_listed(
-    capture, call_ingest, without_baking, tmp_path, changed
-):
-    with np.load(capture / "poses.npz") as archive:
-        places = archive["transl"].copy()
-    places[[3, 7]] = np.nan
-    changed(capture / "poses.npz", transl=places)
-    outcome = call_ingest(capture, *FEW, "--out", tmp_path / "run")
-    assert outcome.code == 0
-    report = json.loads((tmp_path / "run" / "report.json").read_text())
-    assert report["frames"]["dropped"] == [
-        {"index": 3, "reason": "pose invalid"},
-        {"index": 7, "reason": "pose invalid"},
-    ]
-    assert report["frames"]["read"] == 8
-    assert {path.name for path in tmp_path.iterdir()} == {"capture", "run"}

@@ -1,6 +1,5 @@
 """The public names of the package: what they cost to import, and training in one call."""
 
-import json
 import subprocess
 import sys
 
@@ -32,12 +31,3 @@ def test_training_refuses_bad_input_by_an_error(tmp_path):
     with pytest.raises(InputError, match="--steps"):
         train(tmp_path, tmp_path / "run", steps=0)
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.usefixtures("call_ingest", "without_baking")  # which make it fast
-def test_training_returns_package_and_report(film, tmp_path, capsys):
-    avatar = train(film, tmp_path / "run", frames="0:12", steps=10, quiet=True)
-    assert avatar.report == json.loads((tmp_path / "run" / "report.json").read_text())
-    assert avatar.verdict == avatar.report["verdict"]
-    assert avatar.package is None or avatar.package.is_file()
-    assert capsys.readouterr().err == ""

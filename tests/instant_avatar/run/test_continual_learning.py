@@ -76,12 +76,10 @@ def test_an_added_video_keeps_the_avatars_body_and_says_how_its_own_differs(
     np.testing.assert_allclose(trainer.avatar.rig.rest_joints, rig.rest_joints, atol=1e-6)
 
 
-def test_an_added_video_of_another_body_is_refused(
-    capture, call_ingest, without_baking, tmp_path, changed
-):
+def test_an_added_video_of_another_body_is_refused(run, capture, call_ingest, tmp_path, changed):
     out, other = tmp_path / "run", tmp_path / "other"
     shutil.copytree(capture, other)
-    assert call_ingest(capture, "--out", out, *FEW).code == 0
+    shutil.copytree(run, out)
     for arguments, word in (
         (("--height-cm", "150"), "--height-cm is 150"),
         (("--body", small_body(tmp_path)), "Give the same --body"),

@@ -68,8 +68,25 @@ def learn(capture, call_ingest, without_baking, tmp_path):
     return learn
 
 
-def test_a_reader_of_a_few_lines_learns_all_about_a_run(learn, tmp_path):
-    learn(EventLog(tmp_path / "events.jsonl"))
+def test_a_reader_of_a_few_lines_learns_all_about_a_run(learn, tmp_path, capsys):
+    """Package and page are there before scores are made, and the call returns both."""
+    page, unscored = tmp_path / "run" / "report.html", []
+
+    def read(event):
+        if isinstance(event, PackageWritten):
+            assert (tmp_path / "run" / "avatar.iavatar").exists()
+        if isinstance(event, Scored):
+            unscored.append(page.read_text())
+
+    avatar = learn(EventLog(tmp_path / "events.jsonl"), read)
+    assert "ia-play" in unscored[0]
+    assert "scores are being made" in unscored[0]
+    assert "not learnt from" not in unscored[0]  # no frame is scored yet
+    assert "not learnt from" in page.read_text()
+    assert avatar.report == json.loads((tmp_path / "run" / "report.json").read_text())
+    assert avatar.report["held_out"]["psnr"] is not None
+    assert avatar.verdict == avatar.report["verdict"]
+    assert capsys.readouterr().err == ""
     events = [json.loads(line) for line in (tmp_path / "events.jsonl").read_text().splitlines()]
     counts = Counter(event["event"] for event in events)
     assert counts["Stepped"] == 10
@@ -79,23 +96,6 @@ def test_a_reader_of_a_few_lines_learns_all_about_a_run(learn, tmp_path):
     assert [name for name in names if name in ends] == ends
     (package,) = (event for event in events if event["event"] == "PackageWritten")
     assert package["path"] == "avatar.iavatar"
-
-
-def test_package_and_page_are_there_before_scores_are_made(learn, tmp_path):
-    page, unscored = tmp_path / "run" / "report.html", []
-
-    def read(event):
-        if isinstance(event, PackageWritten):
-            assert (tmp_path / "run" / "avatar.iavatar").exists()
-        if isinstance(event, Scored):
-            unscored.append(page.read_text())
-
-    avatar = learn(read)
-    assert "ia-play" in unscored[0]
-    assert "scores are being made" in unscored[0]
-    assert "not learnt from" not in unscored[0]  # no frame is scored yet
-    assert "not learnt from" in page.read_text()
-    assert avatar.report["held_out"]["psnr"] is not None
 
 
 def write_twice(avatar, path, *, progress, psnr_db=(40.0, 40.0), **options):
@@ -136,11 +136,13 @@ def test_the_animation_is_drawn_again_only_where_fine_tuning_shows(
     drawn = []
     monkeypatch.setattr(snapshot_writer, "export_avatar", partial(write_twice, psnr_db=psnr_db))
     monkeypatch.setattr(report_writer, "demo_animation", lambda player: drawn.append(0) or b"")
-    learn()
+    avatar = learn()
     assert len(drawn) == drawings
+    assert avatar.report["package"]["bytes"] == 8  # scores are stored in the finer one
+    assert avatar.package.read_bytes() == b"aa"
 
 
-@pytest.mark.parametrize("when", [None, "first", pytest.param("final", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("when", ["first", pytest.param("final", marks=pytest.mark.slow)])
 def test_ctrl_c_after_the_package_leaves_out_the_rest_and_keeps_everything(
     learn, tmp_path, monkeypatch, when
 ):
@@ -150,16 +152,13 @@ def test_ctrl_c_after_the_package_leaves_out_the_rest_and_keeps_everything(
         if isinstance(event, PackageWritten) and when == ("final" if event.is_final else "first"):
             signal.raise_signal(signal.SIGINT)
 
-    if when is None:
+    with pytest.raises(KeyboardInterrupt):
         learn(read)
-    else:
-        with pytest.raises(KeyboardInterrupt):
-            learn(read)
     out = tmp_path / "run"
     report = json.loads((out / "report.json").read_text())
-    if when != "final":  # by then it may have been scored, beside the fine-tuning
-        assert (report["verdict"] is None) is (when is not None)
-    sizes = {None: [8], "first": [1], "final": [2, 8]}[when]  # scores are stored in 8 bytes
+    if when == "first":  # later it may have been scored, beside the fine-tuning
+        assert report["verdict"] is None
+    sizes = {"first": [1], "final": [2, 8]}[when]  # scores are stored in 8 bytes
     assert report["package"]["bytes"] in sizes
     assert "ia-play" in (out / "report.html").read_text()
     assert (out / "checkpoint" / "frames.tensors").exists()

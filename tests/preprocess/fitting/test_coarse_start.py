@@ -94,8 +94,10 @@ def pixels_off(capture: Capture, person: ShapedBody, motion: Motion) -> float:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("factor", [0.88, 1.12])
-@pytest.mark.parametrize("given", ["masks", "alpha", "neither"])
+@pytest.mark.parametrize(
+    ("factor", "given"),
+    [(0.88, "masks"), (1.12, "neither"), pytest.param(1.12, "alpha", marks=pytest.mark.slow)],
+)
 def test_the_size_of_strangers_poses_is_found(tmp_path, body, factor, given):
     """Their tracker assumes a person of another size, and has the pelvis 6 cm lower."""
     motion = turning("smpl")
@@ -149,8 +151,10 @@ def betas_of(body: BodyModel, amount: float) -> np.ndarray:
     return amount * np.sign(heights[chosen] - mean) * np.eye(10)[chosen]
 
 
-@pytest.mark.parametrize("given", ["masks", "alpha", "neither"])
-@pytest.mark.parametrize("amount", [-1.5, 1.5])
+@pytest.mark.parametrize(
+    ("amount", "given"),
+    [(-1.5, "masks"), (1.5, "neither"), pytest.param(1.5, "alpha", marks=pytest.mark.slow)],
+)
 def test_an_added_video_is_aligned_to_the_avatars_person(tmp_path, body, amount, given):
     """Its tracker assumed a larger person farther away, or a smaller one nearer."""
     person, betas, motion = body.with_shape(), betas_of(body, amount), turning("body24")
