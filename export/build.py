@@ -100,8 +100,6 @@ class ExportReport:
     Attributes:
         seconds: Wall time of sampling, baking, checking and writing.
         psnr_to_renderer: Mean over the views, dB, by tier.
-        fine_tuning_psnr: PSNR to the renderer before and after fine-tuning, dB, on pictures that it
-            was not trained on; None without fine-tuning.
         largest_difference: Between the graph and its rays composited by the compiled kernel, in
             1/255.
     """
@@ -110,7 +108,6 @@ class ExportReport:
     bytes: int
     seconds: float
     psnr_to_renderer: Mapping[str, float]
-    fine_tuning_psnr: tuple[float, float] | None
     largest_difference: float
     warnings: tuple[str, ...]
 
@@ -294,7 +291,6 @@ class _PackageDraft:
             seconds=seconds + time.perf_counter() - started,
             psnr_to_renderer={name: tier.psnr_to_renderer for name, tier in tiers.items()},
             largest_difference=max(tier.largest_difference for tier in tiers.values()),
-            fine_tuning_psnr=tuned.psnr,
             warnings=tuple(package.manifest.metrics["warnings"]),
         )
 

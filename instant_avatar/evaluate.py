@@ -100,7 +100,8 @@ def _evaluate_all(session: "EvaluationSession") -> "Iterator[AvatarEvaluation]":
             return
         run = RunFolder(path=path)
         if path.is_file():
-            yield _evaluate_package(path, session)
+            frames = session.frames_of_capture(RunFolder(path=path.parent))
+            yield session.evaluate_package(path, frames)
         elif run.has_checkpoint():
             yield _evaluate_run(run, session)
         else:
@@ -110,11 +111,6 @@ def _evaluate_all(session: "EvaluationSession") -> "Iterator[AvatarEvaluation]":
             for subject in find_people_snapshot(path) or find_neuman(path):
                 if not stop.is_set():
                     yield from _evaluate_subject(subject, above, session)
-
-
-def _evaluate_package(path: Path, session: "EvaluationSession") -> "AvatarEvaluation":
-    """Score the player alone, on the capture of --on."""
-    return session.evaluate_package(path, session.frames_of_capture(RunFolder(path=path.parent)))
 
 
 def _evaluate_run(run: RunFolder, session: "EvaluationSession") -> "AvatarEvaluation":

@@ -274,7 +274,8 @@ def fine_tune(
     for turn in range(FREE_ROUNDS + SHARED_ROUNDS):
         update = solver.descend(codes, cells)
         if turn == FREE_ROUNDS - 1:
-            price = MIN_ERROR_SHARE * _squared_error(first, pixels)
+            squared_error = 3.0 * pixels * 255.0**2 * 10.0 ** (-0.1 * first)  # of channels, 1/255²
+            price = MIN_ERROR_SHARE * squared_error
             cells = share_codes_within_budget(
                 tables.bricks, codes, update, baked, price, executor=inputs.executor
             )
@@ -332,8 +333,3 @@ def _take_step(
     low, high = middle - MAX_DENSITY_CODE_CHANGE, middle + MAX_DENSITY_CODE_CHANGE
     codes.color[:] = np.clip(codes.color - color_step, 0.0, 255.0)
     codes.density[:] = np.clip(np.clip(codes.density - density_step, low, high), 0.0, 255.0)
-
-
-def _squared_error(psnr: float, pixels: int) -> float:
-    """Return the squared error of pictures with this mean PSNR (dB) over all channels, 1/255²."""
-    return 3.0 * pixels * 255.0**2 * 10.0 ** (-0.1 * psnr)

@@ -138,7 +138,8 @@ def sample_field_grid(
     field_at: FieldFunction, rig: Rig, occupied: UInt8[np.ndarray, "cx cy cz"], voxel_m: float
 ) -> FieldGrid:
     """Sample the field at every node inside an occupied cell; the others are empty."""
-    first, last = _occupied_bounds(occupied)
+    cells = np.argwhere(occupied)
+    first, last = cells.min(axis=0), cells.max(axis=0)
     cell = (rig.box_high - rig.box_low) / occupied.shape
     low = (rig.box_low + (first - 1) * cell).astype(np.float32)
     extent = (last - first + 3) * cell
@@ -157,13 +158,6 @@ def sample_field_grid(
         rgb.reshape(-1, 3)[place] = np.round(np.clip(colors.numpy(), 0, 1) * 255.0).astype(np.uint8)
     dilate_colors(density > MIN_DENSITY, rgb)
     return FieldGrid(low=low, voxel_m=voxel_m, density=density, rgb=rgb)
-
-
-def _occupied_bounds(
-    occupied: UInt8[np.ndarray, "cx cy cz"],
-) -> tuple[Int[np.ndarray, "3"], Int[np.ndarray, "3"]]:
-    axes = [np.flatnonzero(occupied.any(axis=tuple({0, 1, 2} - {axis}))) for axis in range(3)]
-    return np.array([a[0] for a in axes]), np.array([a[-1] for a in axes])
 
 
 def _occupied_nodes(

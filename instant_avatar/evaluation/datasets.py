@@ -151,14 +151,12 @@ def _open_prepared(
             "prepared first, by InstantAvatar's preprocess_PeopleSnapshot.py (docs/evaluation.md)."
         )
     train, test = (
-        SplitFrames(folder=place, poses=_existing(place / poses), frames=frames)
-        for poses, frames in zip((TRAIN_POSES, TEST_POSES), SPLITS[name], strict=True)
+        SplitFrames(folder=place, poses=poses if poses.is_file() else None, frames=frames)
+        for poses, frames in zip(
+            (place / TRAIN_POSES, place / TEST_POSES), SPLITS[name], strict=True
+        )
     )
     return train, test
-
-
-def _existing(path: Path) -> Path | None:
-    return path if path.is_file() else None
 
 
 POSES = Path("4d_humans/smpl_optimized_aligned_scale.npz")

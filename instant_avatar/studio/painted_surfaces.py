@@ -18,7 +18,7 @@ SUPERSAMPLING = 3
 def paint_backdrop(kind: Backdrop, camera: Camera, generator: np.random.Generator) -> RgbImage:
     """The empty studio, as the camera sees it: wall and floor, cluttered or plain."""
     width, height = camera.size_px
-    floor = _floor_row(camera)
+    floor = float(camera.project(np.array([0.0, 0.0, -1.5]))[1])  # of a wall 1.5 m behind
     large = np.zeros((height * SUPERSAMPLING, width * SUPERSAMPLING, 3), dtype=np.uint8)
     horizon = int(np.clip(floor * SUPERSAMPLING, 0, height * SUPERSAMPLING))
     large[:horizon] = (214, 207, 196) if kind == "plain" else (176, 187, 178)
@@ -47,11 +47,6 @@ def add_foot_shadows(
         far = ((x - column) / wide) ** 2 + ((y - row) / tall) ** 2
         light *= (1.0 - 0.30 * np.exp(-2.0 * far)).astype(np.float32)
     return (background * light[..., None]).astype(np.uint8)
-
-
-def _floor_row(camera: Camera) -> float:
-    """Return the row in which the wall, 1.5 m behind the actor, meets the floor."""
-    return float(camera.project(np.array([0.0, 0.0, -1.5]))[1])
 
 
 def _furnish(large: RgbImage, horizon: int, generator: np.random.Generator) -> None:

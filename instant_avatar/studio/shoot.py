@@ -275,7 +275,9 @@ def _write_capture(folder: Path, config: ShootConfig, progress: ShootProgress) -
     novel = staging.novel_poses(actor)
     total = len(truth) + len(novel)
     _write_video(folder, stages[0], truth, config, lambda done: progress(done, total))
-    _write_preview(folder, config.fps)
+    # browsers and phones play no lossless video
+    video = VideoFile(folder / "video.mp4", FrameSelection()).frames()
+    write_video(folder / "preview.mp4", (frame.rgb for frame in video), config.fps, H264)
     cameras, apart = stages[0].cameras, stages[1].cameras[0]
     _write_novel(
         folder / "truth" / "novel", novel, stages[1].render_all(novel),
@@ -338,9 +340,3 @@ def _write_video(
             mask = add_mask_noise(alpha, config.mask_noise_px, generator)
             write_png(folder / "masks" / f"{index:04d}.png", _to_uint8(mask))
             done(index + 1)
-
-
-def _write_preview(folder: Path, fps: float) -> None:
-    """Write preview.mp4: the film for browsers and phones, which play no lossless video."""
-    video = VideoFile(folder / "video.mp4", FrameSelection())
-    write_video(folder / "preview.mp4", (frame.rgb for frame in video.frames()), fps, H264)

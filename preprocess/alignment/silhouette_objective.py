@@ -210,7 +210,8 @@ def reduce_masks(
 
     Each mask shows a person; `full_px` is the width and height of the frames.
     """
-    tall = float(np.median([_mask_height(each.alpha) for each in samples]))
+    rows = [np.flatnonzero((each.alpha > 0.5).any(axis=1)) for each in samples]
+    tall = float(np.median([np.ptp(each) + 1 for each in rows]))
     longer = max(samples[0].alpha.shape) * person_px / max(tall, 1.0)
     small = _scaled_size(full_px, min(longer, 4.0 * person_px))
     return tuple(replace(each, alpha=_resize_alpha(each.alpha, small)) for each in samples)
@@ -232,11 +233,6 @@ def _read_masks(
 def _scaled_size(size_px: tuple[int, int], longer: float) -> tuple[int, int]:
     scale = min(1.0, longer / max(size_px))
     return max(8, round(size_px[0] * scale)), max(8, round(size_px[1] * scale))
-
-
-def _mask_height(alpha: AlphaMask) -> int:
-    rows = np.flatnonzero((alpha > 0.5).any(axis=1))
-    return int(rows[-1] - rows[0] + 1)
 
 
 def _resize_alpha(alpha: Float32[np.ndarray, "_ _"], size_px: tuple[int, int]) -> AlphaMask:

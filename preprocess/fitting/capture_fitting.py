@@ -194,7 +194,8 @@ def _take_keypoints(capture: Capture, fitter: ClipFitter, error_rad: float) -> f
 
 def _expected_error_rad(fitter: ClipFitter) -> float:
     """Error that outlines leave in given poses, mean over the joints, by how far they turned."""
-    return ERROR_PER_TURN * _mean_turn(fitter.corrections)
+    joints = fitter.corrections[:, 3:66].reshape(-1, 21, 3)  # without hands' inner ones and root
+    return ERROR_PER_TURN * float(np.linalg.norm(joints, axis=2).mean())
 
 
 def _count_keypoint_frames(error_rad: float) -> int:
@@ -368,8 +369,3 @@ def _find_keypoints(
         if person.presence >= MIN_PRESENCE:
             persons[frame.index], times_s[frame.index] = person, frame.time_s
     return KeypointTrack.of(list(persons), list(persons.values()), size_px, list(times_s.values()))
-
-
-def _mean_turn(steps: Float[np.ndarray, "frames 75"]) -> float:
-    """Mean rotation of the joints but hands' inner ones and root, radians."""
-    return float(np.linalg.norm(steps[:, 3:66].reshape(-1, 21, 3), axis=2).mean())

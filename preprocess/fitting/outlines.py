@@ -204,7 +204,8 @@ class OutlineModel:
         in_camera = np.column_stack([focal, -(focal * plane).sum(axis=1)]) / depth[:, None]
         in_world = in_camera @ rotation
         weights = self._weights[rows].T.astype(np.float64)
-        turns, places = transforms[:, :3, :3], self._posed_joints(transforms)
+        turns = transforms[:, :3, :3]
+        places = np.einsum("jab,jb->ja", turns, self.joints) + transforms[:, :3, 3]
         # each bone's part of the points, summed over the bones that a joint moves
         by_bone = (
             self._rest[rows].astype(np.float64) @ turns.swapaxes(1, 2) + transforms[:, None, :3, 3]
@@ -231,10 +232,6 @@ class OutlineModel:
             ),
             focal_jacobian=(focal * plane).sum(axis=1),
         )
-
-    def _posed_joints(self, transforms: Float[np.ndarray, "24 4 4"]) -> Float[np.ndarray, "24 3"]:
-        turned = np.einsum("jab,jb->ja", transforms[:, :3, :3], self.joints)
-        return turned + transforms[:, :3, 3]
 
     def _shape_jacobian(
         self,

@@ -288,7 +288,10 @@ def place_by_pixels(
 def _refocus_motion(motion: Motion, shaped: ShapedBody, camera: Camera) -> Motion:
     """The motion as the true camera sees it, if the tracker took another focal length."""
     intrinsic = tracker_intrinsic_matrix(motion, camera.size_px)
-    if intrinsic is None or _same_intrinsics(intrinsic, camera):
+    if intrinsic is None:
+        return motion
+    off = np.abs(intrinsic - camera.intrinsic)[:2]
+    if (off <= FOCAL_TOLERANCE * max(camera.focal_px)).all():
         return motion
     shifted = motion.root_translations.copy()
     for row in np.flatnonzero(motion.valid):
@@ -296,11 +299,6 @@ def _refocus_motion(motion: Motion, shaped: ShapedBody, camera: Camera) -> Motio
         if (joints[:, 2] > 0.0).all():
             shifted[row] += refocus_translation(joints, intrinsic, camera)
     return replace(motion, root_translations=shifted)
-
-
-def _same_intrinsics(intrinsic: Float[np.ndarray, "3 3"], camera: Camera) -> bool:
-    off = np.abs(intrinsic - camera.intrinsic)[:2]
-    return bool((off <= FOCAL_TOLERANCE * max(camera.focal_px)).all())
 
 
 def _camera_of(motion: Motion, row: int, cameras: CameraTrack) -> Float[np.ndarray, "4 4"]:

@@ -189,13 +189,6 @@ class MetricScale:
     spread: float
     rejection_reason: str | None = None
 
-    @classmethod
-    def of_person(cls) -> "MetricScale":
-        """The scale of a world without any path of the camera: the person's."""
-        return cls(
-            metres_per_unit=1.0, cues=("the person",), ground=None, place=None, spread=float("nan")
-        )
-
 
 def estimate_metric_scale(standing: PersonInCameras, floor: FloorPlane | None) -> MetricScale:
     """Estimate the scale by all cues that hold; `floor` is None if it was not seen."""
@@ -347,7 +340,10 @@ def place_in_metric_world(
     assert solved.model is not None
     up = _estimate_up(solved, motion, frames, usable)
     if solved.model.only_turns:  # in one place: the person's own metres are the world's
-        floor, scale = None, MetricScale.of_person()
+        floor = None
+        scale = MetricScale(
+            metres_per_unit=1.0, cues=("the person",), ground=None, place=None, spread=float("nan")
+        )
     else:
         floor = fit_floor_plane(solved.model, up)
         scale = estimate_metric_scale(standing, floor)

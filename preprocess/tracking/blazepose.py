@@ -287,7 +287,8 @@ class BlazePoseTracker:
     def _watch(self, rgb: RgbImage, found: FoundLandmarks) -> None:
         """Look for other persons every few frames; while there are none, learn this one's looks."""
         self._crowded_frames = max(0, self._crowded_frames - 1)
-        self._follow_beside(rgb, found)
+        if self._beside is not None:  # it is where it was in the last frame
+            self._see_beside(found.square, self._find_landmarks(rgb, self._beside.square))
         self._frames_to_watch -= 1
         if self._frames_to_watch > 0:
             return
@@ -311,11 +312,6 @@ class BlazePoseTracker:
         areas = (None, *parts_of_frame(rgb))
         self._watched += 1
         return self._detect(rgb, areas[self._watched % len(areas)])
-
-    def _follow_beside(self, rgb: RgbImage, found: FoundLandmarks) -> None:
-        """Find the person beside this one where it was in the last frame."""
-        if self._beside is not None:
-            self._see_beside(found.square, self._find_landmarks(rgb, self._beside.square))
 
     def _see_beside(self, person: PersonSquare, other: FoundLandmarks) -> None:
         """Remember the other one, unless it is the person itself or far away."""

@@ -190,7 +190,7 @@ def without_baking(monkeypatch) -> None:
         write_text_atomically(path, "stand-in")
         yield ExportReport(
             path=path, bytes=8, seconds=0.0, psnr_to_renderer={"hq": 40.0},
-            largest_difference=0.0, fine_tuning_psnr=None, warnings=(),
+            largest_difference=0.0, warnings=(),
         )  # fmt: skip
 
     monkeypatch.setattr(snapshot_writer, "export_avatar", export_nothing)
