@@ -62,15 +62,17 @@ BRIEF = pytest.MonkeyPatch()
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup():
-    """Bake coarser voxels, fine-tune on fewer, smaller images, color exports by coarser ones, fit
-    poses in fewer steps, and show a shorter film."""
+    """Bake coarser voxels, fine-tune on fewer, smaller images, export fewer Gaussians
+    and texels, fit poses in fewer steps, and show a shorter film."""
     BRIEF.setattr(bake_tables, "MIN_VOXEL_M", BRIEF_VOXEL_M)
     BRIEF.setattr(bake_tables, "MAX_VOXEL_M", BRIEF_VOXEL_M)
     BRIEF.setattr(bake_tables, "FINE_TUNING_PICTURES", 4)
     BRIEF.setattr(fine_tuning, "TRAINING_PX", 128)
     BRIEF.setattr(fine_tuning, "VALIDATION_PX", 128)
+    BRIEF.setattr(splats, "MAX_CROSSED_M2", 0.4)
     BRIEF.setattr(splats, "PIXEL_M", 0.02)
     BRIEF.setattr(mesh_texture, "PIXEL_M", 0.01)
+    BRIEF.setattr(mesh_texture, "TEXEL_M", 0.005)
     BRIEF.setattr(held_out_pose_fitting, "CORRECTIONS_PER_FRAME", 4)
     BRIEF.setattr(report_writer, "ANIMATION_PX", 96)
     BRIEF.setattr(report_writer, "ANIMATION_FRAMES", 4)
