@@ -163,6 +163,7 @@ def test_a_video_played_at_its_own_speed_is_tracked_meanwhile(ingest_video, monk
     assert 2 <= learnt <= 10  # every second one, or fewer where the machine is busy
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_baking")
 def test_a_stream_learns_from_given_masks(ingest_video, filmed, monkeypatch):
     monkeypatch.setattr(MaskRefiner, "__call__", lambda *given: pytest.fail("a mask is refined"))
