@@ -222,7 +222,7 @@ def evaluate_gates(model: SparseModel, keys: int) -> list[QualityGate]:
             failure_reason=f"points are seen {residual:.2f} px beside where they should be",
         ),
         QualityGate(
-            name="focal", value=focal, bound=FOCAL_RANGE[0],
+            name="focal", value=focal, bound=FOCAL_RANGE[int(focal > 1.0)],
             passed=FOCAL_RANGE[0] <= focal <= FOCAL_RANGE[1],
             failure_reason=f"the focal length came out as {focal:.2f} times the longer side",
         ),

@@ -196,7 +196,7 @@ def test_a_film_begins_without_the_figures_of_the_one_before(page):
     assert text_of(browser, "sent") == ""
 
 
-def test_a_file_for_other_programs_is_said_to_be_made_until_it_is_saved(page, tmp_path):
+def test_the_page_names_a_file_for_other_programs_until_it_is_saved(page, tmp_path):
     browser, queue = page
     browser.save_to(tmp_path)
     browser.click("Anna")

@@ -54,11 +54,14 @@ def test_key_frames_that_are_missing_are_counted(model):
     assert failed(evaluate_gates(model, round(len(model.frames) / 0.89))) == ["registered"]
 
 
-@pytest.mark.parametrize("share", [0.3, 2.6])
-def test_an_impossible_focal_length_is_refused(cameras, room_points, exact_model, share):
+@pytest.mark.parametrize(("share", "bound"), [(0.3, "0.5"), (2.6, "2")])
+def test_an_impossible_focal_length_is_refused(cameras, room_points, exact_model, share, bound):
     focal = share * 640
     lenses = [replace(camera, focal_px=(focal, focal)) for camera in cameras]
-    assert "focal" in failed(evaluate_gates(exact_model(lenses, room_points), len(cameras)))
+    gates = evaluate_gates(exact_model(lenses, room_points), len(cameras))
+    assert "focal" in failed(gates)
+    (focal_gate,) = (gate for gate in gates if gate.name == "focal")
+    assert focal_gate.describe_failure().endswith(f"the bound is {bound})")
 
 
 def test_a_camera_that_hardly_moves_is_refused(walked, room_points, exact_model):
