@@ -70,7 +70,7 @@ class ConsoleReader:
         elif session.meter.grows:
             position = f"{elapsed_s:.0f} s"
         elif elapsed_s <= budget_s:
-            position = f"{elapsed_s:.0f} of {budget_s:g} s"
+            position = f"{elapsed_s:.0f} of {round(budget_s, 1):g} s"
         else:
             position = f"{elapsed_s:.0f} s: the first pass over the video goes on"
         parts = [position]

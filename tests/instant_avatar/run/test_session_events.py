@@ -277,13 +277,21 @@ def test_poses_without_a_frame_do_not_count(folder):
     assert len(announced(capture)) == 1
 
 
-@pytest.mark.parametrize(("steps", "shown"), [(60, "step 60 of 60, 7 s"), (96, "step 96, 7 s")])
-def test_steps_beyond_the_wish_are_not_counted_against_it(steps, shown):
-    """A stream makes a least number of them, and each frame takes one."""
+@pytest.mark.parametrize(
+    ("steps", "budget", "shown"),
+    [
+        (60, {"seconds": 3.0, "steps": 60}, "step 60 of 60, 7 s"),
+        (96, {"seconds": 3.0, "steps": 60}, "step 96, 7 s"),
+        (96, {"seconds": 68.3112, "steps": None}, "7 of 68.3 s"),
+    ],
+)
+def test_what_is_made_is_shown_beside_the_wish(steps, budget, shown):
+    """A stream makes a least number of steps, and each frame takes one; a resumed run adds."""
     session = Mock(spec=TrainingSession, curve=[])
-    budget = SimpleNamespace(seconds=3.0, steps=60)
-    session.trainer = Mock(steps=steps, config=budget, wall_seconds=7.0, frames_seen=9)
-    session.coverage, session.meter = Mock(seen_share=0.5), Mock(is_paced=False)
+    session.trainer = Mock(
+        steps=steps, config=SimpleNamespace(**budget), wall_seconds=7.0, frames_seen=9
+    )
+    session.coverage, session.meter = Mock(seen_share=0.5), Mock(is_paced=False, grows=False)
     with ExitStack() as cleanup:
         text = ConsoleReader(session, Console(), cleanup)._training_text()
     assert text.startswith(f"{shown} · ")
