@@ -23,6 +23,9 @@ MIN_IOU = 0.7
 """Least mean IoU of body and mask of poses that are good enough for an avatar."""
 DOUBTFUL_IOU = 0.65
 """IoU below which a frame is doubtful."""
+USUAL_SPREADS, IOU_NOISE = 5.0, 0.01
+"""Distance below the film's median IoU from which a frame is doubtful, in standard deviations (by
+the median absolute deviation), and the least of these: another person walks by in front."""
 MAX_MISSED_SHARE = 0.3
 """Largest share of the frames with the person in which the tracker may miss them."""
 ABSENCE_S = 1.0
@@ -45,6 +48,8 @@ JUMP_HEIGHTS = 0.1
 """Way of the hips from one frame to the next that may be a cut of the video, body heights."""
 JUMP_STEPS = 8.0
 """The same, in medians of that way."""
+DISAGREE = "body and mask disagree (something may hide the person)"
+"""Reason of frames whose IoU is low, or far below the film's usual."""
 JUMPED = "the person jumps to another place; was the film cut here?"
 """Reason of the frames before and after a cut."""
 
@@ -197,7 +202,8 @@ def grade_tracking(
         iou_of_frame: IoU of posed body and mask of some frames, by their numbers.
     """
     numbers = np.array(sorted(frame_times_s))
-    reasons = _reasons_by_frame(keypoints, frame_times_s, iou_of_frame)
+    disagreeing = _disagreeing(keypoints, iou_of_frame)
+    reasons = _reasons_by_frame(keypoints, frame_times_s, disagreeing)
     missed = _missed(numbers, np.array([frame_times_s[each] for each in numbers]), keypoints.frames)
     shown = len(keypoints) + sum(missed.values())
     doubts = {each: missed.get(each, 1.0) for each in reasons}
@@ -222,14 +228,16 @@ def grade_tracking(
         breadth_seen=_breadth_seen(views),
         main_doubt=main_doubt,
         main_doubt_frames=sum(main_doubt in some for some in reasons.values()),
-        left_out=_frames_to_leave_out(keypoints, iou_of_frame),
+        left_out=_frames_to_leave_out(keypoints, disagreeing),
         stretches=tuple(_stretches(numbers.tolist(), frame_times_s, reasons)),
         doubts={number: "; ".join(words) for number, words in reasons.items()},
     )
 
 
 def _reasons_by_frame(
-    keypoints: KeypointTrack, frame_times_s: Mapping[int, float], iou_of_frame: Mapping[int, float]
+    keypoints: KeypointTrack,
+    frame_times_s: Mapping[int, float],
+    disagreeing: Bool[np.ndarray, "rows"],
 ) -> dict[int, list[str]]:
     """Reasons why frames are doubtful, by their numbers."""
     reasons: dict[int, list[str]] = {}
@@ -242,9 +250,7 @@ def _reasons_by_frame(
     for number in frame_times_s:
         if number not in tracked:
             reasons[number] = ["the person was not found"]
-    for number, iou in iou_of_frame.items():
-        if iou < DOUBTFUL_IOU and number in tracked:
-            reasons.setdefault(number, []).append("body and mask disagree")
+    note(disagreeing, DISAGREE)
     for problem, bit in PROBLEM_BITS.items():
         if keypoints.problems is not None:
             note((keypoints.problems & bit) > 0, problem.value)
@@ -268,13 +274,25 @@ def _missed(
     return weights
 
 
-def _frames_to_leave_out(
+def _disagreeing(
     keypoints: KeypointTrack, iou_of_frame: Mapping[int, float]
+) -> Bool[np.ndarray, "rows"]:
+    """Rows whose IoU, interpolated between graded frames, is low or far below the film's usual."""
+    numbers = [number for number in sorted(iou_of_frame) if np.isfinite(iou_of_frame[number])]
+    if not numbers:
+        return np.zeros(len(keypoints), dtype=bool)
+    ious = np.array([iou_of_frame[number] for number in numbers])
+    usual = float(np.median(ious))
+    spread = max(IOU_NOISE, 1.4826 * float(np.median(np.abs(ious - usual))))  # of a normal's
+    least = max(DOUBTFUL_IOU, usual - USUAL_SPREADS * spread)
+    return np.interp(keypoints.frames, numbers, ious) < least
+
+
+def _frames_to_leave_out(
+    keypoints: KeypointTrack, disagreeing: Bool[np.ndarray, "rows"]
 ) -> tuple[int, ...]:
     """Frames in which another person is near, or body and mask disagree; none if most are such."""
-    numbers = keypoints.frames
-    doubtful = np.array([iou_of_frame.get(int(each), 1.0) < DOUBTFUL_IOU for each in numbers], bool)
-    doubtful |= _crowded(keypoints)
+    numbers, doubtful = keypoints.frames, disagreeing | _crowded(keypoints)
     return tuple(numbers[doubtful].tolist()) if doubtful.sum() <= 0.5 * len(doubtful) else ()
 
 

@@ -10,7 +10,7 @@ from capture.camera import Camera
 from preprocess.body.body_pose import Motion
 from preprocess.body.parametric_body import load_body_model
 from preprocess.tracking.keypoints import KeypointTrack
-from preprocess.tracking.tracking_grade import TrackingGrade, grade_tracking
+from preprocess.tracking.tracking_grade import DISAGREE, TrackingGrade, grade_tracking
 from preprocess.tracking.video_tracking import PROBLEM_BITS, TrackingProblem
 from tests.motions import make_motion, make_track
 
@@ -51,7 +51,7 @@ def grade(shaped, keypoints=None, motion=None, iou=0.85, times=TIMES) -> Trackin
         shaped,
         camera,
         times,
-        dict.fromkeys(range(0, FRAMES, 4), iou),
+        iou if isinstance(iou, dict) else dict.fromkeys(range(0, FRAMES, 4), iou),
     )
 
 
@@ -95,8 +95,18 @@ def test_jitter_is_that_of_tracked_frames_not_of_poses_interpolated_between_them
 def test_disagreeing_masks_are_an_objection(shaped):
     found = grade(shaped, iou=0.4)
     assert not found.is_good_enough
-    assert "IoU" in found.objections[0]
-    assert found.stretches[0].reason == "body and mask disagree"
+    assert "IoU" in found.objections[-1]
+    assert found.stretches[0].reason == DISAGREE
+
+
+def test_frames_far_below_the_films_usual_iou_are_left_out(shaped):
+    """Another person walks by in front in frames 20 to 32, of which every fourth is graded."""
+    usual = {number: 0.9 + 0.005 * (-1) ** (number // 4) for number in range(0, FRAMES, 4)}
+    assert grade(shaped, iou=usual).left_out == ()
+    hidden = grade(shaped, iou=usual | dict.fromkeys(range(20, 33, 4), 0.75))
+    assert {20, 23, 26, 29, 32} <= set(hidden.left_out) <= set(range(17, 36))
+    assert [each.reason for each in hidden.stretches] == [DISAGREE]
+    assert hidden.is_good_enough
 
 
 def test_a_stretched_film_is_an_objection(shaped):
