@@ -144,10 +144,10 @@ class PhoneServer:
                     self._loop.remove_reader(each)
             await asyncio.sleep(0.0)  # one accepted in this moment would be refused, but not closed
             assert self._runner.server is not None
-            transports = [each.transport for each in self._runner.server.connections]
+            transports = [e.transport for e in self._runner.server.connections if e.transport]
             await self._runner.cleanup()
             for each in transports:
-                if each is not None:
+                with suppress(AttributeError):  # of Python 3.11, if TLS has ended meanwhile
                     each.abort()  # TLS would wait for the browser to close, too
             left = asyncio.all_tasks() - {asyncio.current_task()}
             for task in left:

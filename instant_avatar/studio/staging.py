@@ -294,8 +294,9 @@ def handheld_cameras(
     """
     frames = len(actor_xz_m)
     generator = np.random.default_rng([seed, 7])
-    shake = smooth_noise(generator, (frames, 6), SHAKE_FRAMES)
-    slow = smooth_noise(generator, (frames, 3), max(frames / 6.0, 1.0))
+    # two frames more, as in the films of which the figures in docs and log are
+    shake = smooth_noise(generator, (frames + 2, 6), SHAKE_FRAMES)[1:-1]
+    slow = smooth_noise(generator, (frames + 2, 3), max(frames / 6.0, 1.0))[1:-1]
     share = np.linspace(0.0, 1.0, frames) + 0.02 * np.sin(2.0 * np.pi * np.linspace(0, 1, frames))
     angles = np.deg2rad(ARC_DEG) * (share - 0.5)
     steps = np.arange(frames) * (2.0 * np.pi / 16.0)  # a step lifts the hand, twice a second
