@@ -2,6 +2,7 @@
 
 import textwrap
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -35,8 +36,13 @@ LEFT_JOINTS = frozenset({1, 4, 7, 10, 13, 16, 18, 20, 22})
 def write_tracked_video(path: Path, capture: Capture, doubts: Mapping[int, str]) -> int:
     """Draw skeleton, body and mask over each frame, and why a frame is doubtful.
 
-    `doubts` are sentences by frame number. Return the number of frames drawn.
+    `doubts` are sentences by frame number; doubtful frames are drawn, even if they are left out of
+    training. Return the number of frames drawn.
     """
+    motion = capture.motion
+    if motion.frames is not None and motion.keypoints is not None:
+        doubtful = np.isin(motion.frames, np.intersect1d(list(doubts), motion.keypoints.frames))
+        capture = replace(capture, motion=replace(motion, valid=motion.valid | doubtful))
     source = capture.source
     count, duration = source.frame_count or 1, source.duration_s
     fps = min(60.0, max(1.0, count / duration)) if duration else 10.0
