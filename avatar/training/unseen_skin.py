@@ -471,10 +471,9 @@ def find_sources(rig: Rig, frames: _BoneFrames, evidence: SkinEvidence, middle_x
             costs = np.sqrt(away[0] ** 2 + away[1] ** 2 + away[2] ** 2) + extra[there]
             costs += FACE_COST_M * np.maximum(0.0, face[sources[there]] - face[here][:, None])
             if reflection == 0:
-                level = (
-                    costs + RARE_COST_M * rarity[sources[there]] + LEVEL_FACTOR * np.abs(away[2])
-                )
-                around[here] = sources[there[level.argmin(axis=1)]]
+                around_costs = costs + RARE_COST_M * rarity[sources[there]]
+                around_costs += LEVEL_FACTOR * np.abs(away[2])
+                around[here] = sources[there[around_costs.argmin(axis=1)]]
             chosen = costs.argmin(axis=1)
             least = costs[np.arange(len(here)), chosen]
             better = least < cost[here]

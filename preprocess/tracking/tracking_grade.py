@@ -24,8 +24,8 @@ MIN_IOU = 0.7
 DOUBTFUL_IOU = 0.65
 """IoU below which a frame is doubtful."""
 USUAL_SPREADS, IOU_NOISE = 5.0, 0.01
-"""Distance below the film's median IoU from which a frame is doubtful, in standard deviations (by
-the median absolute deviation), and the least of these: another person walks by in front."""
+"""Standard deviations (by the median absolute deviation) below the film's median IoU from which a
+frame is doubtful, as where another person walks by in front, and the least standard deviation."""
 MAX_MISSED_SHARE = 0.3
 """Largest share of the frames with the person in which the tracker may miss them."""
 ABSENCE_S = 1.0

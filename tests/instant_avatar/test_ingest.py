@@ -184,7 +184,7 @@ def test_the_page_needs_nothing_else(run):
     assert "<svg" in page
 
 
-def test_an_older_run_is_not_lost_by_accident_but_replaced_where_told(
+def test_an_older_run_is_not_lost_by_accident_but_replaced_with_overwrite(
     capture, call_ingest, without_baking, tmp_path, changed
 ):
     """Lost poses are left out and listed."""
