@@ -13,6 +13,7 @@ that were seen obliquely: the outline, which lies nearest to the unseen side, is
 
 What the front shows, but not the outline at its height, as a print or a neckline, is not likely to
 go round: pairs are drawn to the skin around the limb as far as its color is more common there.
+Necklines lie higher behind than in front, and the torso's two faces correspond accordingly.
 
 A face that was seen from one side alone could have any depth; it is kept near the body model's.
 
@@ -45,8 +46,12 @@ BONE_OF_PART = (
 """Joints at both ends of each body part's bone."""
 MIRRORED_PART = np.array([0, 2, 1, 4, 3, 6, 5, 7, 9, 8, 11, 10, 13, 12])
 """The part on the other side of the body."""
+TORSO = 0
 HEAD, FEET = HEAD_PART, (5, 6)
 """Parts whose front and back are not alike."""
+NECKLINE_SLOPE, NECKLINE_REACH = 0.4, 0.4
+"""Slope by which a neckline falls from back to front at the neck's base (22°), and the share of the
+torso's height below the neck over which the slope falls to 0."""
 MIRROR_COST_M = 0.03
 """Cost of the mirrored side, as a distance around the limb, metres."""
 REVERSE_COST_M = 0.08
@@ -197,8 +202,8 @@ class SkinEvidence:
 
 
 def _smooth_step(
-    values: Float[np.ndarray, "seeds"] | Float32[np.ndarray, "seeds"], low: float, high: float
-) -> Float32[np.ndarray, "seeds"]:
+    values: Float[np.ndarray, "*shape"] | Float32[np.ndarray, "*shape"], low: float, high: float
+) -> Float32[np.ndarray, "*shape"]:
     """0 up to `low`, 1 from `high` on, without a corner."""
     share = np.clip((values - low) / (high - low), 0.0, 1.0)
     return (share * share * (3.0 - 2.0 * share)).astype(np.float32)
@@ -431,10 +436,31 @@ def reflect(
     """Canonical points reflected as `Sources.reflection` says; the body's middle is `middle_x`."""
     mirrors, reverses = np.isin(reflection, (1, 3)), np.isin(reflection, (2, 3))
     local = frames.to_bone(points, parts)
+    local[:, 2] += np.where(reverses, _neckline_lift(frames, local, parts), 0.0)
     local[:, 0] = np.where(reverses, -local[:, 0], local[:, 0])
     out = np.where(reverses[:, None], frames.from_bone(local, parts), points)
     out[:, 0] = np.where(mirrors, 2.0 * middle_x - out[:, 0], out[:, 0])
     return out
+
+
+def _neckline_lift(
+    frames: _BoneFrames,
+    local: Float[np.ndarray, "points 3"],
+    parts: Int[np.ndarray, "points"],
+) -> Float[np.ndarray, "points"]:
+    """How much higher a point of the torso lies once it is on the other face, metres.
+
+    The slope is the mean of those at both heights, so that a point comes back to where it was.
+    """
+    neck = np.linalg.norm(frames.origin[HEAD] - frames.origin[TORSO])
+    depth = np.where(parts == TORSO, 2.0 * local[:, 0], 0.0)
+    lift = np.zeros(len(local))
+    for _ in range(3):
+        slopes = _smooth_step(
+            np.stack([local[:, 2], local[:, 2] + lift]), (1.0 - NECKLINE_REACH) * neck, neck
+        )
+        lift = NECKLINE_SLOPE * depth * slopes.mean(axis=0)
+    return lift
 
 
 def find_sources(rig: Rig, frames: _BoneFrames, evidence: SkinEvidence, middle_x: float) -> Sources:

@@ -10,10 +10,17 @@ from avatar.kernels.numba_priors import OPACITY_LENGTH_M
 from avatar.training import checkpoint
 from avatar.training.frame_stream import prepare_frame
 from avatar.training.trainer import Trainer, cosine_decay
-from avatar.training.unseen_skin import HEAD, MIN_WEIGHT, SkinEvidence, UnseenSkin
+from avatar.training.unseen_skin import (
+    HEAD,
+    MIN_WEIGHT,
+    TORSO,
+    SkinEvidence,
+    UnseenSkin,
+    reflect,
+)
 from preprocess.body.kinematics import HEAD_JOINT
 
-TORSO, LEFT_THIGH, LEFT_FOREARM, RIGHT_FOREARM = 0, 1, 10, 11
+LEFT_THIGH, LEFT_FOREARM, RIGHT_FOREARM = 1, 10, 11
 
 
 @pytest.fixture(scope="module")
@@ -117,6 +124,21 @@ def test_the_back_is_drawn_to_the_front_and_the_front_to_nothing(rig, of_front):
     assert (of_front.evidence.seen[sources.patch[back]] > 0.5).all()
     apart = rig.seeds[back] - rig.seeds[sources.patch[back]]
     assert np.abs(apart[:, 1]).mean() < 0.03  # stripes go round
+
+
+def test_the_nape_is_drawn_to_below_the_neckline(rig, of_front):
+    """A neckline lies higher behind than in front; a hem is level."""
+    frames, torso = of_front._frames, np.flatnonzero(rig.seed_parts == TORSO)
+    parts, reversed_ = rig.seed_parts[torso], np.full(len(torso), 2)
+    there = reflect(frames, rig.seeds[torso], parts, reversed_, 0.0)
+    back = reflect(frames, there, parts, reversed_, 0.0)
+    assert np.abs(back - rig.seeds[torso]).max() < 0.002
+    height, drop = rig.seeds[torso, 1], rig.seeds[torso, 1] - there[:, 1]
+    behind = rig.seed_normals[torso, 2] < -0.5
+    nape = behind & (height > np.quantile(height, 0.97))
+    hips = behind & (height < np.quantile(height, 0.5))
+    assert drop[nape].mean() > 0.02
+    assert np.abs(drop[hips]).max() < 0.001
 
 
 def test_the_back_is_drawn_to_what_was_seen_squarely(rig, of_front):
