@@ -452,7 +452,7 @@ def _neckline_lift(
 
     The slope is the mean of those at both heights, so that a point comes back to where it was.
     """
-    neck = np.linalg.norm(frames.origin[HEAD] - frames.origin[TORSO])
+    neck = float(np.linalg.norm(frames.origin[HEAD] - frames.origin[TORSO]))
     depth = np.where(parts == TORSO, 2.0 * local[:, 0], 0.0)
     lift = np.zeros(len(local))
     for _ in range(3):
