@@ -190,19 +190,21 @@ def _update_slab(
 
 @compile_kernel(**FAST_MATH)
 def update_roots(
-    thread, threads, packed_cells, cells, grid_low, cell_m, roots, weights, shape, low, nodes_per_m,
-    bones,
+    thread, threads, slots, packed_cells, cells, grid_low, cell_m, roots, weights, shape, low,
+    nodes_per_m, bones,
 ):  # fmt: skip
-    """Moves a frame's roots to follow its pose, by one chord step towards the cell's center.
+    """Moves roots to follow their frames' poses, by one chord step towards the cell's center.
 
-    Cells are flat; their grid has the shape `cells`. Roots are updated in place, inverse Jacobians
-    and second-order terms stay. `bones` are the new pose's matrices (24, 12).
+    The cells of each of `slots` are flat; their grid has the shape `cells`. Roots are updated in
+    place, inverse Jacobians and second-order terms stay. `bones` are the new poses' matrices
+    (slots, 24, 12).
     """
-    for i in range(thread, cells[0], threads):
-        _update_slab(
-            i, packed_cells, cells, grid_low, cell_m, roots, weights, shape, low,
-            nodes_per_m, bones,
-        )  # fmt: skip
+    for slot in slots:
+        for i in range(thread, cells[slot, 0], threads):
+            _update_slab(
+                i, packed_cells[slot], cells[slot], grid_low[slot], cell_m, roots[slot], weights,
+                shape, low, nodes_per_m, bones[slot],
+            )  # fmt: skip
 
 
 @compile_kernel(**FAST_MATH)

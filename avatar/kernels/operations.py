@@ -331,13 +331,16 @@ def scatter_max_density(
 
 
 def update_roots(
-    cells: CorrespondenceTables, slot: int, skin: SkinningVolume, bones: Float32[Tensor, "24 12"]
+    cells: CorrespondenceTables,
+    slots: list[int],
+    skin: SkinningVolume,
+    bones: Float32[Tensor, "slots 24 12"],
 ) -> None:
-    """Moves a slot's roots, in place, to follow its changed pose."""
+    """Moves the roots of some slots, in place, to follow their changed poses; bones are of all."""
     run_threads(
         numba_pose.update_roots,
-        cells.packed_cells[slot].numpy(), cells.shape[slot].numpy(), cells.low[slot].numpy(),
-        np.float32(cells.cell_m), cells.roots[slot].numpy(),
+        np.array(slots, dtype=np.int64), cells.packed_cells.numpy(), cells.shape.numpy(),
+        cells.low.numpy(), np.float32(cells.cell_m), cells.roots.numpy(),
         *_skinning_arrays(skin), bones.numpy(),
     )  # fmt: skip
 

@@ -15,7 +15,7 @@ from avatar.training.frame_stream import prepare_frame
 from avatar.training.pose_correction import interpolate_correction
 from avatar.training.pose_optimizer import PoseOptimizer
 from avatar.training.replay_buffer import ReplayBuffer
-from avatar.training.trainer import Trainer, correct_one_pose, cosine_decay, resolve_correspondences
+from avatar.training.trainer import Trainer, correct_poses, cosine_decay, resolve_correspondences
 from avatar.training.training_step import OccupancySampler, compute_gradients
 
 COMPARED_DENSITY = 2
@@ -102,9 +102,7 @@ def _fit_frames(
         )  # fmt: skip
         if config.estimate_exposures:
             exposures.observe(batch, result.rendered)
-        for _ in range(at_once):
-            rate = cosine_decay(step / steps)
-            correct_one_pose(replay, poses, rate=rate)
+        correct_poses(replay, poses, at_once, rate=cosine_decay(step / steps))
         progress(FITTING_SHARE * (step + 1) / steps)
 
 

@@ -17,8 +17,9 @@ from jaxtyping import Float32, UInt8
 from torch import Tensor
 
 from avatar.correspondence_grid import CORRESPONDENCE_CELL_M, CorrespondenceGrid
-from avatar.kernels.kernel_compiler import INLINED, compile_kernel
+from avatar.kernels.kernel_compiler import INLINED, compile_kernel, prefetch
 from avatar.kernels.operands import CorrespondenceTables, RayBatch
+from avatar.kernels.threads import run_threads
 from avatar.training.frame_stream import TrainingFrame, view_descriptor
 from avatar.training.pose_optimizer import RootCorrection
 from avatar.training.training_pixels import RayView, TrainingPixels
@@ -170,8 +171,8 @@ class ReplayBuffer:
         origins, directions = np.empty((2, count, 3), dtype=np.float32)
         targets = np.empty((count, 4), dtype=np.float32)
         world_from_body = np.empty((count, 3, 3), dtype=np.float32)
-        draw_rays(
-            chances.numpy(), len(self),
+        run_threads(
+            draw_rays, chances.numpy(), len(self),
             (NEAR_PERSON_RAY_SHARE, HEAD_SIDE_RAY_SHARE, MAX_HEAD_RAY_SHARE),
             self._pixels, self._runs.numpy(), self._sights.numpy(), self._colors.numpy(),
             self._origins, self._turns, self._world_from_camera,
@@ -280,8 +281,8 @@ def _find_runs(runs, pixels, pictures, numbers, found):
 
 @compile_kernel(nogil=True, error_model="numpy")
 def draw_rays(
-    chances, frames, shares, pixels, runs, sights, colors, all_origins, turns, world_from_camera,
-    slots, origins, directions, targets, world_from_body,
+    thread, threads, chances, frames, shares, pixels, runs, sights, colors, all_origins, turns,
+    world_from_camera, slots, origins, directions, targets, world_from_body,
 ):  # fmt: skip
     """Draws rays uniformly from the frames, in their order; the last five arguments are written.
 
@@ -303,6 +304,7 @@ def draw_rays(
         world_from_camera: Rotation of each slot's camera.
     """
     rays, stop = slots.shape[0], 0
+    first, last = rays * thread // threads, rays * (thread + 1) // threads
     drawn, numbers, found = np.zeros(frames, I32), np.empty(rays, np.int64), np.empty(rays, I32)
     pictures = np.empty(rays, I32)
     for n in range(rays):
@@ -311,7 +313,7 @@ def draw_rays(
         near, count, head = pixels[2 * slot, 0], pixels[2 * slot, 1], pixels[2 * slot + 1, 0]
         start, stop = stop, stop + drawn[slot]
         in_head = min(F32(shares[1]) * np.sqrt(F32(head) / F32(near)), F32(shares[2]))
-        for ray in range(start, stop):
+        for ray in range(max(start, first), min(stop, last)):
             place, far = chances[2, ray], count - near
             picture, number = 2 * slot, near + np.int64(place * F32(far))
             if chances[1, ray] < F32(shares[0]) or far == 0:
@@ -320,8 +322,10 @@ def draw_rays(
                     picture, number = picture + 1, np.int64(place * F32(head))
             slots[ray], pictures[ray] = slot, picture
             numbers[ray] = min(number, pixels[picture, 1] - 1)
-    _find_runs(runs, pixels[: 2 * frames], pictures, numbers, found)
-    for ray in range(rays):
+            prefetch(colors[picture], numbers[ray], 0)
+    part = slice(first, last)
+    _find_runs(runs, pixels[: 2 * frames], pictures[part], numbers[part], found[part])
+    for ray in range(first, last):
         slot, picture, number = slots[ray], pictures[ray], numbers[ray]
         turn, camera = turns[slot], world_from_camera[slot]
         flat = number + runs[picture, found[ray], 1]

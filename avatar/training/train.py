@@ -378,7 +378,7 @@ def warm_up_rays(trainer: Trainer) -> Trainer:
     render(stand_in.avatar, BodyPose.rest(), camera)
     stand_in.add_frame(_dummy_frame(rig, camera))
     poses = stand_in.poses  # an exact pose does not move, and nothing would have followed it
-    operations.update_roots(stand_in.replay.correspondences, 0, poses.skinning, poses.bones[0])
+    operations.update_roots(stand_in.replay.correspondences, [0], poses.skinning, poses.bones)
     batch = stand_in.replay.sample_rays(stand_in.config.rays, stand_in.generator)
     stand_in.exposures.neutralize(batch)
     count = stand_in.config.rays

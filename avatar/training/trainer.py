@@ -267,11 +267,9 @@ class Trainer:
             self.pose_corrections = {i: c for i, c in self.pose_corrections.items() if i in kept}
 
     def _correct_poses(self, rate: float) -> None:
-        for _ in range(CORRECTIONS_PER_STEP):
-            slot = correct_one_pose(self.replay, self.poses, rate=rate)
-            if slot is not None:
-                correction = self.poses.corrections[slot].copy()
-                self.pose_corrections[self.replay.frame_indices[slot]] = correction
+        for slot in correct_poses(self.replay, self.poses, CORRECTIONS_PER_STEP, rate=rate):
+            correction = self.poses.corrections[slot].copy()
+            self.pose_corrections[self.replay.frame_indices[slot]] = correction
 
     def _update_occupancy(self, surface_share: float) -> None:
         clearing = self.steps < INITIAL_OCCUPANCY_STEPS
@@ -293,24 +291,21 @@ def resolve_correspondences(replay: ReplayBuffer, poses: PoseOptimizer, slot: in
     replay.correct_root(slot, poses.root_correction(slot))
 
 
-def correct_one_pose(replay: ReplayBuffer, poses: PoseOptimizer, *, rate: float) -> int | None:
-    """Corrects one pose by a step times `rate`; its frame's correspondences and rays follow.
+def correct_poses(
+    replay: ReplayBuffer, poses: PoseOptimizer, most: int, *, rate: float
+) -> list[int]:
+    """Corrects poses by a step times `rate`; correspondences and rays of their frames follow.
 
-    Returns the slot, or None if no pose has enough evidence.
+    Returns the slots that move, of the `most` with the most rays: none if no pose has enough.
     """
-    slot = poses.correct_next(rate=rate)
-    if slot is not None:
-        far = poses.needs_resolve(slot)
-        move_correspondences(replay, poses, slot, far=far)
-    return slot
-
-
-def move_correspondences(
-    replay: ReplayBuffer, poses: PoseOptimizer, slot: int, *, far: bool
-) -> None:
-    """Lets a frame's correspondences and rays follow its pose; far poses are solved again."""
-    if far:
-        resolve_correspondences(replay, poses, slot)
-        return
-    operations.update_roots(replay.correspondences, slot, poses.skinning, poses.bones[slot])
-    replay.correct_root(slot, poses.root_correction(slot))
+    tried = [poses.correct_next(rate=rate) for _ in range(most)]
+    moved = [slot for slot in tried if slot is not None]
+    near = [slot for slot in moved if not poses.needs_resolve(slot)]
+    if near:
+        operations.update_roots(replay.correspondences, near, poses.skinning, poses.bones)
+    for slot in moved:
+        if slot in near:
+            replay.correct_root(slot, poses.root_correction(slot))
+        else:
+            resolve_correspondences(replay, poses, slot)
+    return moved

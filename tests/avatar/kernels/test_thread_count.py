@@ -46,7 +46,7 @@ def results_of(learnt) -> dict[str, list[torch.Tensor]]:
         LossSettings(0.01, 0.1, 0.1, 1e-5),
     )  # fmt: skip
     moved = cells._replace(roots=cells.roots.clone())
-    operations.update_roots(moved, 0, poses.skinning, poses.bones[0])
+    operations.update_roots(moved, [0], poses.skinning, poses.bones)
     volume = trainer.learner.shading._normals
     normals = operations.mean_normals(raw, samples, 0.01, batch.rays.slots, cells, volume)
     stepped = [grad_table.clone(), *(torch.ones_like(grad_table) for _ in range(3))]

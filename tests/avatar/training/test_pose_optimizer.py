@@ -129,7 +129,7 @@ def test_compiled_following_agrees_with_its_meaning(rig, table, bent_pose):
     moved = rig.body_from_canonical(bent_pose + 0.03)[:, :3].reshape(24, 12)
     bones = torch.from_numpy(moved.astype(np.float32))
     ours, theirs = copied(cells), copied(cells)
-    operations.update_roots(ours, 0, table.skinning, bones)
+    operations.update_roots(ours, [0], table.skinning, bones[None])
     torch_correspondence.update_roots(theirs, 0, table.skinning, bones)
     off = (ours.roots - theirs.roots)[0, 1:].abs().amax(dim=1)
     assert float((off < 1e-2).float().mean()) > 0.99
@@ -147,7 +147,7 @@ def test_cells_that_follow_a_pose_are_those_that_would_have_been_solved(rig, tab
     )
     before = residual(rig, table, cells, tables.roots[0], bones)
     for _ in range(2):
-        operations.update_roots(tables, 0, table.skinning, bones)
+        operations.update_roots(tables, [0], table.skinning, bones[None])
     after = residual(rig, table, cells, tables.roots[0], bones)
     assert np.median(before) > 3e-3
     assert np.quantile(after, 0.95) < 5e-4
