@@ -225,21 +225,15 @@ def _adam_block(g, m, v, p, rates):
 
 
 @compile_kernel(**FAST_MATH)
-def adam_step(thread, threads, grad, mean, square, parameter, rates):
-    """Adam's step on flat arrays; the gradient is zeroed in the same pass over the memory.
+def adam_step(thread, threads, parameters):
+    """Adam's step on flat arrays; the gradients are zeroed in the same pass over the memory.
 
-    Blocks are slices, because LLVM vectorises only loops that begin at 0. `rates` are the learning
-    rate, the shares of the new gradient and of its square in their means, the scale of the squares'
-    root, and epsilon.
+    Blocks are slices, because LLVM vectorises only loops that begin at 0. A parameter has its
+    gradient, mean, mean square and numbers, and its rates: the learning rate, the shares of the new
+    gradient and of its square in their means, the scale of the squares' root, and epsilon.
     """
-    blocks = (parameter.shape[0] + ENTRIES_PER_BLOCK - 1) // ENTRIES_PER_BLOCK
-    for block in range(thread, blocks, threads):
-        part = slice(block * ENTRIES_PER_BLOCK, (block + 1) * ENTRIES_PER_BLOCK)
-        _adam_block(grad[part], mean[part], square[part], parameter[part], rates)
-
-
-@compile_kernel(**FAST_MATH)
-def adam_steps_of_blocks(parameters, rates):
-    """`adam_step` on parameters of a block each, for which threads are not worth waking."""
-    for grad, mean, square, parameter in parameters:
-        _adam_block(grad, mean, square, parameter, rates)
+    for (grad, mean, square, numbers), rates in parameters:
+        blocks = (numbers.shape[0] + ENTRIES_PER_BLOCK - 1) // ENTRIES_PER_BLOCK
+        for block in range(thread, blocks, threads):
+            part = slice(block * ENTRIES_PER_BLOCK, (block + 1) * ENTRIES_PER_BLOCK)
+            _adam_block(grad[part], mean[part], square[part], numbers[part], rates)

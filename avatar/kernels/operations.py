@@ -214,23 +214,18 @@ def _level_arrays(
     return levels.low, levels.cells_per_m, levels.vertex_counts, levels.is_dense, levels.offsets
 
 
-def adam_step(how: AdamSettings, parameters: list[tuple[Tensor, Tensor, Tensor, Tensor]]) -> None:
+def adam_step(parameters: list[tuple[AdamSettings, Tensor, Tensor, Tensor, Tensor]]) -> None:
     """Takes Adam's step on contiguous tensors, in place, and zeroes the gradients.
 
     Each parameter has its gradient, the running means of the gradient and of its square, and the
     numbers themselves.
     """
-    (first, second), (rate, scale) = how.betas, how.scales
-    rates = tuple(map(np.float32, (rate, 1.0 - first, 1.0 - second, scale, how.eps)))
-    small = []
-    for parts in parameters:
-        arrays = tuple(part.detach().view(-1).numpy() for part in parts)
-        if len(arrays[0]) > numba_hash_grid.ENTRIES_PER_BLOCK:
-            run_threads(numba_hash_grid.adam_step, *arrays, rates)
-        else:
-            small.append(arrays)
-    if small:
-        numba_hash_grid.adam_steps_of_blocks(tuple(small), rates)
+    flat = []
+    for how, *parts in parameters:
+        (first, second), (rate, scale) = how.betas, how.scales
+        rates = tuple(map(np.float32, (rate, 1.0 - first, 1.0 - second, scale, how.eps)))
+        flat.append((tuple(part.detach().numpy().reshape(-1) for part in parts), rates))
+    run_threads(numba_hash_grid.adam_step, tuple(flat))
 
 
 def solve_correspondences(

@@ -79,20 +79,19 @@ def step_optimizer(optimizer: UncompiledAdam) -> None:
 
     The state is that of `torch.optim.Adam`, whose own kernel takes 1.5 times as long.
     """
+    parameters = []
     for group in optimizer.param_groups:
-        parameters, steps = [], 0
-        for parameter in group["params"]:
+        steps = optimizer.state[group["params"][0]].get("step", torch.zeros(())) + 1
+        how = AdamSettings(group["lr"], group["betas"], group["eps"], int(steps))
+        for parameter in group["params"]:  # they have made as many steps
             state = optimizer.state[parameter]
             if not state:
-                state["step"] = torch.zeros(())
                 state["exp_avg"] = torch.zeros_like(parameter)
                 state["exp_avg_sq"] = torch.zeros_like(parameter)
-            state["step"] += 1
-            steps = int(state["step"])  # a group's parameters have made as many
+            state["step"] = steps
             means = state["exp_avg"], state["exp_avg_sq"]
-            parameters.append((parameter.grad, *means, parameter))
-        how = AdamSettings(group["lr"], group["betas"], group["eps"], steps)
-        operations.adam_step(how, parameters)
+            parameters.append((how, parameter.grad, *means, parameter))
+    operations.adam_step(parameters)
 
 
 NETWORK_RATE_FACTOR = 0.3

@@ -50,7 +50,7 @@ def results_of(learnt) -> dict[str, list[torch.Tensor]]:
     volume = trainer.learner.shading._normals
     normals = operations.mean_normals(raw, samples, 0.01, batch.rays.slots, cells, volume)
     stepped = [grad_table.clone(), *(torch.ones_like(grad_table) for _ in range(3))]
-    operations.adam_step(AdamSettings(0.01, (0.9, 0.99), 1e-15, 1), [tuple(stepped)])
+    operations.adam_step([(AdamSettings(0.01, (0.9, 0.99), 1e-15, 1), *stepped)])
     return {
         "mean_normals": [normals],
         "adam_step": stepped[1:],
