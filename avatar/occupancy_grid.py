@@ -37,6 +37,8 @@ OFF_SKIN_M = 0.03
 """Distance from the skin within which clothes are spared, metres."""
 MIN_COMPONENT_SHARE = 0.003
 """Size, relative to the largest component, below which a component is a floater."""
+CALLS_PER_DRAW = 16
+"""Calls whose random points are drawn at once; the empty cells change every sixteen steps."""
 FLOATER_INTERVAL = 8
 """Updates of the occupancy between searches for floaters."""
 
@@ -70,6 +72,7 @@ class OccupancyGrid:
         self._near_skin = rig.skin_distance <= NEAR_SKIN_M
         self._cached_empty_cells: tuple[int, Tensor] | None = None
         self._floaters, self._updates = torch.zeros_like(self._in_band), 0
+        self._ahead = dict[str, tuple[Tensor, int, list[Tensor]]]()
 
     def shape_face(self, before: Int64[Tensor, "before"], under: Int64[Tensor, "under"]) -> None:
         """Keeps cells before a face empty, and adds those under its skin to the head's interior.
@@ -96,27 +99,27 @@ class OccupancyGrid:
         """Probes a share of the band, once per cell at a random place, and updates the occupancy.
 
         Args:
+            share: Share of the cells; every second, third, ... cell, and the next ones in the next
+                update.
             decay: Factor of a probed cell's cached density.
             min_density: Density below which a cell is empty whatever the step, 1/m.
             drop_floaters: Drops small components, and those off the skin. (The paper's code keeps
                 the largest component only, but a foot may be one of its own.)
         """
-        count = int(len(self.band_cells) * share)
-        chosen, points = self._draw_points(self.band_cells, count, generator)
-        log_density = log_density_at(points)
-        density = torch.exp(log_density.clamp(max=MAX_LOG_DENSITY))
+        every = round(1.0 / share)
+        chosen = self.band_cells[self._updates % every :: every].contiguous()
+        points = self._random_places(chosen, generator)
+        density = torch.exp(log_density_at(points).clamp(max=MAX_LOG_DENSITY))
         flat = self.density_grid.density.view(-1)
         flat[chosen] = torch.maximum(flat[chosen] * decay, density)
-        dense = (
-            self.density_grid.density > max(self._density_threshold(sample_step_m), min_density)
-        ).to(torch.uint8)
-        occupied = dilate(dense) & self._in_band
+        least = max(self._density_threshold(sample_step_m), min_density)
+        occupied = dilate((self.density_grid.density > least).view(torch.uint8)) & self._in_band
         if drop_floaters:
             if self._updates % FLOATER_INTERVAL == 0:
                 solid = self.density_grid.density > SOLID_DENSITY
                 self._floaters = find_floaters(solid, self._near_skin)
             occupied &= 1 - self._floaters
-            self._updates += 1
+        self._updates += 1
         self.density_grid.occupied.copy_(occupied)
 
     def for_rendering(self, sample_step_m: float) -> DensityGrid:
@@ -142,20 +145,21 @@ class OccupancyGrid:
 
     def sample_empty(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
         """Random points in unoccupied cells of the band, at most `count`."""
-        return self._draw_points(self._empty_cells(), count, generator)[1]
+        return self._draw("empty", self._empty_cells(), count, generator)
 
     def sample_off_skin(
         self, count: int, generator: torch.Generator
     ) -> Float32[Tensor, "points 3"]:
         """Random points of the band that lie off the skin, at most `count`."""
-        return self._draw_points(self._off_skin_cells, count, generator)[1]
+        return self._draw("off skin", self._off_skin_cells, count, generator)
 
     def sample_interior(
         self, count: int, generator: torch.Generator, *, of_head: bool = False
     ) -> Float32[Tensor, "points 3"]:
         """Random points deep under the skin, or under the head's, at most `count`."""
-        cells = self._head_cells if of_head else self._interior_cells
-        return self._draw_points(cells, count, generator)[1]
+        if of_head:
+            return self._draw("head", self._head_cells, count, generator)
+        return self._draw("interior", self._interior_cells, count, generator)
 
     def _empty_cells(self) -> Int64[Tensor, "cells"]:
         """Unoccupied cells of the band, cached until the occupancy changes."""
@@ -165,18 +169,32 @@ class OccupancyGrid:
             self._cached_empty_cells = version, cells
         return self._cached_empty_cells[1]
 
-    def _draw_points(
-        self, cells: Int64[Tensor, "cells"], count: int, generator: torch.Generator
-    ) -> tuple[Int64[Tensor, "drawn"], Float32[Tensor, "drawn 3"]]:
-        """Cells drawn at random, at most `count`, and a random point in each."""
-        count, grid = count if len(cells) else 0, self.density_grid
-        chances, points = torch.rand(count, 4, generator=generator), torch.empty(count, 3)
-        drawn = torch.empty(count, dtype=torch.int64)
+    def _draw(
+        self, kind: str, cells: Int64[Tensor, "cells"], count: int, generator: torch.Generator
+    ) -> Float32[Tensor, "drawn 3"]:
+        """Random points in cells, at most `count`, of those that are drawn for many calls at once.
+
+        They are drawn again when the cells of this `kind`, or `count`, are others.
+        """
+        of, each, ahead = self._ahead.get(kind, (None, 0, []))
+        if of is not cells or each != count or not ahead:
+            size = (count * CALLS_PER_DRAW if len(cells) else 0,)
+            drawn = torch.randint(max(len(cells), 1), size, generator=generator)
+            ahead = list(self._random_places(cells[drawn], generator).chunk(CALLS_PER_DRAW))
+            self._ahead[kind] = cells, count, ahead
+        return ahead.pop()
+
+    def _random_places(
+        self, cells: Int64[Tensor, "cells"], generator: torch.Generator
+    ) -> Float32[Tensor, "cells 3"]:
+        """A random point in each cell."""
+        grid, within = self.density_grid, torch.rand(len(cells), 3, generator=generator)
+        points = torch.empty(len(cells), 3)
         numba_priors.points_in_cells(
-            chances.numpy(), cells.numpy(), tuple(grid.occupied.shape), grid.low.numpy(),
-            grid.cells_per_m.numpy(), drawn.numpy(), points.numpy(),
+            cells.numpy(), within.numpy(), tuple(grid.occupied.shape), grid.low.numpy(),
+            grid.cells_per_m.numpy(), points.numpy(),
         )  # fmt: skip
-        return drawn, points
+        return points
 
 
 def in_occupied_cells(

@@ -179,16 +179,14 @@ def toward_sources(raw, weights, weight, grad):
 
 
 @compile_kernel(**FAST_MATH)
-def points_in_cells(chances, cells, shape, low, cells_per_m, drawn, points):
-    """Draws a cell, and a point in it, for each row of `chances` (points, 4)."""
+def points_in_cells(cells, within, shape, low, cells_per_m, points):
+    """Points in flat `cells` of a grid, at the places `within` them in [0, 1) (cells, 3)."""
     _, ny, nz = shape
-    for i in range(chances.shape[0]):
-        number = np.int64(np.float64(chances[i, 0]) * cells.shape[0])
-        cell = cells[min(number, cells.shape[0] - 1)]
-        drawn[i] = cell
-        points[i, 0] = (F32(cell // (ny * nz)) + chances[i, 1]) / cells_per_m[0] + low[0]
-        points[i, 1] = (F32(cell // nz % ny) + chances[i, 2]) / cells_per_m[1] + low[1]
-        points[i, 2] = (F32(cell % nz) + chances[i, 3]) / cells_per_m[2] + low[2]
+    for i in range(cells.shape[0]):
+        cell = cells[i]
+        points[i, 0] = (F32(cell // (ny * nz)) + within[i, 0]) / cells_per_m[0] + low[0]
+        points[i, 1] = (F32(cell // nz % ny) + within[i, 1]) / cells_per_m[1] + low[1]
+        points[i, 2] = (F32(cell % nz) + within[i, 2]) / cells_per_m[2] + low[2]
 
 
 @compile_kernel(**FAST_MATH)
