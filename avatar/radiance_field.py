@@ -100,7 +100,7 @@ class RadianceField:
             return
         for parameter, grad in zip(self.layers, learnt.network, strict=True):
             assert parameter.grad is not None, "a gradient is overwritten, never taken away"
-            parameter.grad.copy_(grad)
+            parameter.grad.numpy()[...] = grad
         operations.add_table_gradient(learnt.points, learnt.features, self.levels, self.table_grad)
 
     @torch.no_grad()

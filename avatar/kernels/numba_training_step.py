@@ -171,8 +171,9 @@ def learn(
             world normals, wrenches (rays, 24, 6); written. No wrenches are computed for zero rays.
         backward: Points that have a gradient, the gradients of their features, and the first place
             and number of those of each block (blocks, 2); written.
-        sums: Sums of the network's gradients as in `numba_field.backward`, zero before; sum of the
-            gradients' strengths of each block.
+        sums: Each thread's sums of the network's gradients, one after the other as in
+            `numba_field.backward_passes` (threads, width + 6, hidden), zero before, no rows to
+            leave them out; sum of the gradients' strengths of each block.
     """
     points, sample_offsets, sample_counts, root_rows = samples
     slots, target, world_from_body, roots = rays
@@ -183,7 +184,7 @@ def learn(
     skinning, skinning_shape, skinning_low, nodes_per_m, bones = pose
     raw, grad_raw, rendered, loss, normals, wrenches = outputs
     rows, grad_features, runs = backward
-    weight_sums, output_sums, bias_sums, strengths = sums
+    own_sums, strengths = sums[0][thread], sums[1]
     sample_step_m, alpha_weight, hard_weight, faint, seed, needs_normals = settings
 
     ray_count, kind_count = slots.shape[0], weights.shape[0]
@@ -193,7 +194,8 @@ def learn(
     for block in range(kind_count + ray_blocks):
         start, stop, _ = _block_range(block, kind_count, ends, sample_offsets, sample_count)
         longest = max(longest, stop - start)
-    features = np.empty((longest + 4, table.shape[1] * cells_per_m.shape[0]), F32)
+    width = table.shape[1] * cells_per_m.shape[0]
+    features = np.empty((longest + 4, width), F32)
     drawn = np.empty((longest, 4), F32)
     neutral = np.empty((ray_count, 4), F32)
     grad_points = np.empty((sample_count if wrenches.shape[0] > 0 else 0, 3), F32)
@@ -229,7 +231,7 @@ def learn(
         row_part, feature_part = row_part[:kept], feature_part[:kept]
         backward_passes(
             0, 1, features, row_part, drawn[:kept], first, bias, second, transposed,
-            feature_part, weight_sums[thread], output_sums[thread], bias_sums[thread],
+            feature_part, own_sums[:width], own_sums[width : width + 4], own_sums[width + 4 :],
         )  # fmt: skip
         if ray >= 0 and wrenches.shape[0] > 0:
             _clear(grad_points[start:stop])

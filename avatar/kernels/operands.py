@@ -97,7 +97,14 @@ NetworkLayers = tuple[
     Float32[Tensor, "hidden 4"],
     Float32[Tensor, "4"],
 ]
-"""Weights and biases of the network's two layers, or their gradients."""
+"""Weights and biases of the network's two layers."""
+NetworkGradients = tuple[
+    Float32[np.ndarray, "width hidden"],
+    Float32[np.ndarray, "hidden"],
+    Float32[np.ndarray, "hidden 4"],
+    Float32[np.ndarray, "4"],
+]
+"""Gradients of these."""
 RawOutputs = Float32[Tensor, "samples 4"]
 """The network's outputs: color logits and log density (log 1/m)."""
 PremultipliedPixels = Float32[Tensor, "rays 4"]
@@ -291,6 +298,6 @@ class LearntRays(NamedTuple):
     loss: Float32[Tensor, "rays"]
     normals: Float32[Tensor, "rays 3"]
     wrenches: Float32[Tensor, "wrenched 24 6"]
-    network: NetworkLayers | None
+    network: NetworkGradients | None
     features: FeatureGradients
     strength: float

@@ -35,6 +35,7 @@ from avatar.kernels.operands import (
     LitSkin,
     LossSettings,
     MarchSettings,
+    NetworkGradients,
     NetworkLayers,
     NormalVolume,
     Points,
@@ -107,7 +108,8 @@ def learn(
     wrenches = np.empty((count if poses else 0, 24, 6), np.float32)
     rows, grad_features = np.empty(total, np.int64), np.empty((total, width), np.float32)
     runs, strengths = np.empty((blocks, 2), np.int64), np.empty(blocks, np.float32)
-    sums = _network_sums(threads, width, is_frozen=is_frozen)
+    # each thread's sums of the gradients of W₁, W₂ᵀ and both biases; no rows if frozen
+    sums = np.zeros((threads, 0 if is_frozen else width + 6, HIDDEN_WIDTH), dtype=np.float32)
     run_threads(
         numba_training_step.learn,
         (
@@ -131,7 +133,7 @@ def learn(
         _pose_arrays(poses),
         (raw, grad_raw, rendered, loss, normals, wrenches),
         (rows, grad_features, runs),
-        (*sums, strengths),
+        (sums, strengths),
     )  # fmt: skip
     return LearntRays(
         points=points,
@@ -140,7 +142,7 @@ def learn(
         loss=torch.from_numpy(loss),
         normals=torch.from_numpy(normals),
         wrenches=torch.from_numpy(wrenches),
-        network=None if is_frozen else _network_gradients(sums),
+        network=None if is_frozen else _network_gradients(sums, width),
         features=FeatureGradients(rows, grad_features, runs),
         strength=float(strengths.sum()) / max(total, 1),
     )
@@ -188,18 +190,12 @@ def _network_arrays(
     return first, bias[None], np.ascontiguousarray(second.T), second_bias, transposed
 
 
-def _network_sums(
-    threads: int, width: int, *, is_frozen: bool
-) -> list[Float32[np.ndarray, "threads rows hidden"]]:
-    """Each thread's sums of the gradients of W₁, W₂ᵀ and both biases; no rows if frozen."""
-    sizes = (0, 0, 0) if is_frozen else (width, 4, 2)
-    return [np.zeros((threads, size, HIDDEN_WIDTH), dtype=np.float32) for size in sizes]
-
-
-def _network_gradients(sums: list[Float32[np.ndarray, "threads rows hidden"]]) -> NetworkLayers:
+def _network_gradients(
+    sums: Float32[np.ndarray, "threads rows hidden"], width: int
+) -> NetworkGradients:
     """The gradients of both layers, added up in the order of the threads."""
-    grad_first, grad_second, grad_biases = (torch.from_numpy(part.sum(axis=0)) for part in sums)
-    return grad_first, grad_biases[0], grad_second.T, grad_biases[1, :4]
+    total = sums.sum(axis=0)
+    return total[:width], total[width + 4], total[width : width + 4].T, total[width + 5, :4]
 
 
 def _level_arrays(
@@ -224,7 +220,7 @@ def adam_step(parameters: list[tuple[AdamSettings, Tensor, Tensor, Tensor, Tenso
     for how, *parts in parameters:
         (first, second), (rate, scale) = how.betas, how.scales
         rates = tuple(map(np.float32, (rate, 1.0 - first, 1.0 - second, scale, how.eps)))
-        flat.append((tuple(part.detach().numpy().reshape(-1) for part in parts), rates))
+        flat.append((tuple(part.numpy().reshape(-1) for part in parts), rates))
     run_threads(numba_hash_grid.adam_step, tuple(flat))
 
 
@@ -246,13 +242,21 @@ def march(
     rays: RayBatch, cells: CorrespondenceTables, grid: DensityGrid, how: MarchSettings
 ) -> RaySamples:
     """Canonical samples along rays."""
-    return march_resumable(rays, cells, grid, how)[0]
+    return _march(rays, cells, grid, how)[0]
 
 
 def march_resumable(
     rays: RayBatch, cells: CorrespondenceTables, grid: DensityGrid, how: MarchSettings
 ) -> tuple[RaySamples, Float32[Tensor, "rays"]]:
     """Marches, and returns the jitter at which rays with `max_samples` samples continue."""
+    samples, reached = _march(rays, cells, grid, how)
+    return samples, rays.jitter + reached
+
+
+def _march(
+    rays: RayBatch, cells: CorrespondenceTables, grid: DensityGrid, how: MarchSettings
+) -> tuple[RaySamples, Int32[Tensor, "rays"]]:
+    """Samples, and the step of the lattice at which each ray continues."""
     padded, padded_rows = _scratch_samples(len(rays.slots) * how.max_samples)
     count, reached = torch.empty(2, len(rays.slots), dtype=torch.int32)
     first = torch.empty(len(rays.slots), dtype=torch.int64)
@@ -268,7 +272,7 @@ def march_resumable(
     numba_rendering.pack_samples(
         padded, padded_rows, how.max_samples, count.numpy(), points.numpy(), rows.numpy()
     )
-    return RaySamples(points, first, count, rows), rays.jitter + reached
+    return RaySamples(points, first, count, rows), reached
 
 
 def _scratch_samples(

@@ -87,13 +87,11 @@ class FrameExposures:
 
     def observe(self, batch: TrainingBatch, rendered: PremultipliedPixels) -> None:
         """Updates the gains by rays with their pixels as filmed, and their neutral rendering."""
-        held = len(self._frames)
-        gains = np.zeros((held, 3), dtype=np.float32)
         _update_gains(
             batch.rays.slots.numpy(), batch.target.numpy(), rendered.numpy(),
-            self._avatar_frozen, self._pixels, self._rendered, gains,
+            self._avatar_frozen, self._pixels, self._rendered,
+            self.gains.numpy()[: len(self._frames)],
         )  # fmt: skip
-        self.gains[:held] = torch.from_numpy(gains)
 
 
 @compile_kernel(**FAST_MATH)

@@ -81,16 +81,17 @@ def step_optimizer(optimizer: UncompiledAdam) -> None:
     """
     parameters = []
     for group in optimizer.param_groups:
-        steps = optimizer.state[group["params"][0]].get("step", torch.zeros(())) + 1
-        how = AdamSettings(group["lr"], group["betas"], group["eps"], int(steps))
-        for parameter in group["params"]:  # they have made as many steps
+        for parameter in group["params"]:
             state = optimizer.state[parameter]
             if not state:
+                state["step"] = torch.zeros(())
                 state["exp_avg"] = torch.zeros_like(parameter)
                 state["exp_avg_sq"] = torch.zeros_like(parameter)
-            state["step"] = steps
+            steps = state["step"].numpy()
+            steps += 1
+            how = AdamSettings(group["lr"], group["betas"], group["eps"], int(steps))
             means = state["exp_avg"], state["exp_avg_sq"]
-            parameters.append((how, parameter.grad, *means, parameter))
+            parameters.append((how, parameter.grad, *means, parameter.detach()))
     operations.adam_step(parameters)
 
 

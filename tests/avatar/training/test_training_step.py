@@ -91,6 +91,7 @@ def one_step(trainer):
     field, occupancy = trainer.avatar.field, trainer.avatar.occupancy
     batch = trainer.replay.sample_rays(CONFIG.rays, torch.Generator().manual_seed(3))
     generator = torch.Generator().manual_seed(4)
+    occupancy._ahead.clear()
     field.table_grad.zero_()
     compute_gradients(
         trainer.avatar, OccupancySampler(occupancy, CONFIG),
@@ -98,6 +99,7 @@ def one_step(trainer):
         hard_surface_share=1.0, surface_share=FIRM_SHARE, generator=generator,
     )  # fmt: skip
     generator = torch.Generator().manual_seed(4)
+    occupancy._ahead.clear()  # the same points are drawn once more
     how = MarchSettings(CONFIG.sample_step_m, CONFIG.opaque_margin_m, CONFIG.max_samples)
     cells = trainer.replay.correspondences
     samples = operations.march(batch.rays, cells, occupancy.density_grid, how)
