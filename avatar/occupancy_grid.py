@@ -230,10 +230,11 @@ def find_floaters(
         return torch.zeros_like(solid, dtype=torch.uint8)
     sizes = np.bincount(pieces[near_skin], minlength=count + 1)
     sizes[0] = 0
-    kept = sizes >= MIN_COMPONENT_SHARE * sizes.max()
-    kept[0] = False
+    kept = (sizes >= MIN_COMPONENT_SHARE * sizes.max()).astype(np.uint8)
+    gone = 1 - kept
+    kept[0] = gone[0] = 0
 
-    def about(cells: Bool[np.ndarray, "x y z"]) -> UInt8[Tensor, "x y z"]:
-        return dilate(dilate(torch.from_numpy(cells.astype(np.uint8))))
+    def about(chosen: UInt8[np.ndarray, "pieces"]) -> UInt8[Tensor, "x y z"]:
+        return dilate(dilate(torch.from_numpy(chosen[pieces])))
 
-    return about((pieces > 0) & ~kept[pieces]) & (1 - about(kept[pieces]))
+    return about(gone) & (1 - about(kept))

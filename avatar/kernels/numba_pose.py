@@ -199,12 +199,14 @@ def update_roots(
     place, inverse Jacobians and second-order terms stay. `bones` are the new poses' matrices
     (slots, 24, 12).
     """
+    passed = 0
     for slot in slots:
-        for i in range(thread, cells[slot, 0], threads):
+        for i in range((thread - passed) % threads, cells[slot, 0], threads):
             _update_slab(
                 i, packed_cells[slot], cells[slot], grid_low[slot], cell_m, roots[slot], weights,
                 shape, low, nodes_per_m, bones[slot],
             )  # fmt: skip
+        passed += cells[slot, 0]
 
 
 @compile_kernel(**FAST_MATH)

@@ -171,9 +171,8 @@ def learn(
             world normals, wrenches (rays, 24, 6); written. No wrenches are computed for zero rays.
         backward: Points that have a gradient, the gradients of their features, and the first place
             and number of those of each block (blocks, 2); written.
-        sums: Each thread's sums of the network's gradients, one after the other as in
-            `numba_field.backward_passes` (threads, width + 6, hidden), zero before, no rows to
-            leave them out; sum of the gradients' strengths of each block.
+        sums: Each thread's sums of the gradients of W₁, W₂ᵀ, b₁ and b₂, zero before (threads,
+            width + 6, hidden; or no rows); sum of the gradients' strengths of each block.
     """
     points, sample_offsets, sample_counts, root_rows = samples
     slots, target, world_from_body, roots = rays
@@ -194,8 +193,7 @@ def learn(
     for block in range(kind_count + ray_blocks):
         start, stop, _ = _block_range(block, kind_count, ends, sample_offsets, sample_count)
         longest = max(longest, stop - start)
-    width = table.shape[1] * cells_per_m.shape[0]
-    features = np.empty((longest + 4, width), F32)
+    features = np.empty((longest + 4, grad_features.shape[1]), F32)
     drawn = np.empty((longest, 4), F32)
     neutral = np.empty((ray_count, 4), F32)
     grad_points = np.empty((sample_count if wrenches.shape[0] > 0 else 0, 3), F32)
@@ -231,7 +229,7 @@ def learn(
         row_part, feature_part = row_part[:kept], feature_part[:kept]
         backward_passes(
             0, 1, features, row_part, drawn[:kept], first, bias, second, transposed,
-            feature_part, own_sums[:width], own_sums[width : width + 4], own_sums[width + 4 :],
+            feature_part, own_sums[:-6], own_sums[-6:-2], own_sums[-2:],
         )  # fmt: skip
         if ray >= 0 and wrenches.shape[0] > 0:
             _clear(grad_points[start:stop])

@@ -204,11 +204,11 @@ class PoseOptimizer:
         """
         age = step - self._added_at_step
         self._can_freeze = age >= MIN_STEPS_BEFORE_FREEZE
-        told = self._evidence_sum / self._estimate_count.clip(min=1)
-        exact = (self._estimate_count >= MIN_ESTIMATES_BEFORE_FREEZE) & (
-            0.5 * (told + self._evidence) < MAX_EXACT_EVIDENCE
-        )
         if self.poses_may_be_exact:
+            evidence = self._evidence_sum / self._estimate_count.clip(min=1)
+            exact = (self._estimate_count >= MIN_ESTIMATES_BEFORE_FREEZE) & (
+                0.5 * (evidence + self._evidence) < MAX_EXACT_EVIDENCE
+            )
             self._is_frozen |= exact | (age >= FREEZE_AFTER_STEPS)
         open_now = self._is_held & ~self._is_frozen & (age >= FIRST_CORRECTION_STEPS)
         self._is_correctable = open_now

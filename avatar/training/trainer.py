@@ -257,8 +257,10 @@ class Trainer:
         """The configuration with the samples' distance of this step; baselines keep theirs."""
         if not isinstance(self.sampler, OccupancySampler):
             return self.config
-        self.sampler.sample_step_m = self.config.sample_step_at(detail_share)
-        return replace(self.config, sample_step_m=self.sampler.sample_step_m)
+        step_m = self.sampler.sample_step_m = self.config.sample_step_at(detail_share)
+        if step_m == self.config.sample_step_m:
+            return self.config
+        return replace(self.config, sample_step_m=step_m)
 
     def _discard_old_corrections(self) -> None:
         """Drops corrections of frames that replay no longer holds, to bound the memory."""

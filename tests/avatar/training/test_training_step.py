@@ -158,6 +158,7 @@ def test_half_of_the_samples_give_nearly_the_steps_whole_gradient(trainer):
         poses = PoseOptimizer(trainer.avatar.rig, trainer.replay.capacity)
         for slot in range(4):
             poses.set_pose(slot, trainer.poses.pose(slot))
+        trainer.avatar.occupancy._ahead.clear()
         trainer.field.table_grad.zero_()
         compute_gradients(
             trainer.learner, trainer.sampler, trainer.replay.correspondences,
