@@ -116,7 +116,7 @@ def calculate_many_cores(capture: Path) -> tuple[float, float]:
 def waking_seconds() -> float:
     """Seconds that a kernel without work takes on two threads."""
     times = []
-    numba.set_num_threads(min(2, numba.config.NUMBA_NUM_THREADS))
+    numba.set_num_threads(min(2, numba.get_num_threads()))
     for _ in range(200):
         began = time.perf_counter()
         run_threads(lambda thread, threads: None)
