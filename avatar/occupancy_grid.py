@@ -235,6 +235,6 @@ def find_floaters(
     kept[0] = gone[0] = 0
 
     def about(chosen: UInt8[np.ndarray, "pieces"]) -> UInt8[Tensor, "x y z"]:
-        return dilate(dilate(torch.from_numpy(np.take(chosen, pieces))))
+        return dilate(dilate(torch.from_numpy(chosen[np.asarray(pieces, dtype=np.int32)])))
 
     return about(gone) & (1 - about(kept))
