@@ -156,9 +156,15 @@ def capture(film, tmp_path) -> Path:
 
 
 @pytest.fixture
-def call_ingest(capsys, monkeypatch) -> Command:
-    """Runs ia-ingest, for a few steps unless the test says otherwise."""
+def on_one_core(monkeypatch) -> None:
+    """Fits in this process: another one takes two seconds, of which tests of start-up see."""
+    monkeypatch.setattr(ingest, "usable_cores", lambda: 1)
     monkeypatch.setattr(train, "warm_up", lambda trainer: 0.0)
+
+
+@pytest.fixture
+def call_ingest(capsys, on_one_core) -> Command:
+    """Runs ia-ingest, for a few steps unless the test says otherwise."""
 
     def call(*arguments: object, steps: int = FEW_STEPS) -> Outcome:
         words = [str(argument) for argument in arguments]

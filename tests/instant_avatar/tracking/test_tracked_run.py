@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from avatar.training import train
 from capture.source_opening import open_source
 from capture.video_writer import H264, write_video
 from instant_avatar import ingest
@@ -23,9 +22,8 @@ from tests.instant_avatar.conftest import Outcome
 
 
 @pytest.fixture
-def ingest_video(video, tmp_path, capsys, monkeypatch):
+def ingest_video(video, tmp_path, capsys, on_one_core):
     """Runs ia-ingest on the video; returns how it ended and the run's folder."""
-    monkeypatch.setattr(train, "warm_up", lambda trainer: 0.0)
 
     def call(*words, steps=10):
         out = tmp_path / "run"
@@ -40,6 +38,7 @@ def ingest_video(video, tmp_path, capsys, monkeypatch):
 @pytest.mark.usefixtures("without_baking")
 def test_a_video_alone_is_tracked_and_learnt(ingest_video, monkeypatch):
     monkeypatch.setattr(run_capture, "preflight_check", None)  # mistakes of files are not sought
+    monkeypatch.setattr(ingest, "usable_cores", lambda: 2)  # another process fits, as for a user
     done, out = ingest_video()
     assert done.code == 0, done.err
     report = json.loads((out / "report.json").read_text())
