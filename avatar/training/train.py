@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
+from avatar.avatar_model import OBSERVATION_INTERVAL
 from avatar.evaluation.held_out import (
     FRAMES_PER_EVALUATION,
     HeldOutFrame,
@@ -367,6 +368,7 @@ def warm_up(trainer: Trainer) -> float:
     stand_in.steps = FIRST_CORRECTION_STEPS
     for _ in range(stand_in.config.occupancy_interval):
         stand_in.step(rate=1.0, hard_surface_share=1.0)
+    stand_in.poses.needs_resolve(0)  # a first run ends with this kernel
     return time.perf_counter() - began
 
 
@@ -375,7 +377,8 @@ def warm_up_rays(trainer: Trainer) -> Trainer:
     stand_in = _small_trainer(trainer)
     rig = stand_in.avatar.rig
     camera = _front_camera(rig)
-    render(stand_in.avatar, BodyPose.rest(), camera)
+    stand_in.avatar.shading.restore(torch.tensor([1.0, 0.1, 0.0, 0.0]))
+    render(stand_in.avatar, BodyPose.rest(), camera, shaded=True)
     stand_in.add_frame(_dummy_frame(rig, camera))
     poses = stand_in.poses  # an exact pose does not move, and nothing would have followed it
     operations.update_roots(stand_in.replay.correspondences, [0], poses.skinning, poses.bones)
@@ -383,7 +386,8 @@ def warm_up_rays(trainer: Trainer) -> Trainer:
     stand_in.exposures.neutralize(batch)
     count = stand_in.config.rays
     stand_in.exposures.observe(batch, torch.zeros(count, 4))
-    stand_in.learner.shading.observe(torch.zeros(count, 3), batch.target, torch.zeros(count, 4))
+    for _ in range(OBSERVATION_INTERVAL):
+        stand_in.learner.shading.observe(torch.zeros(count, 3), batch.target, torch.zeros(count, 4))
     poses.accumulate(batch.rays.slots.long(), torch.zeros(count, 24, 6), torch.zeros(count))
     return stand_in
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from avatar import avatar_model
 from avatar.config import NOMINAL_STEPS_PER_S, TrainConfig
 from avatar.evaluation.held_out import HeldOutFrame
 from avatar.events import (
@@ -21,10 +22,11 @@ from avatar.events import (
     Stepped,
     WaitingForFrame,
 )
-from avatar.kernels import numba_training_step
+from avatar.kernels import numba_shading, numba_training_step
 from avatar.kernels.numba_pose import add_rays
 from avatar.kernels.numba_rendering import march
 from avatar.kernels.numba_shading import add_light
+from avatar.training import pose_optimizer
 from avatar.training import train as train_module
 from avatar.training.frame_stream import prepare_frame, prepare_stream
 from avatar.training.train import train
@@ -407,7 +409,17 @@ def test_the_rate_falls_with_the_steps_that_are_left(rig, ready):
 
 
 def test_two_processes_that_compile_halves_compile_what_a_step_calls(rig, monkeypatch):
+    """Also what neither an exact pose nor a light that is not known yet would call."""
     monkeypatch.setattr(train_module, "WARM_THREADS", set())
+    called: list[str] = []
+    for module, name in (
+        (pose_optimizer, "largest_distance"),
+        (avatar_model, "light_factors"),
+        (numba_shading, "mean_normals"),
+    ):
+        kernel = getattr(module, name)
+        spy = lambda *a, kernel=kernel, name=name: (called.append(name), kernel(*a))[1]  # noqa: E731
+        monkeypatch.setattr(module, name, spy)
     trainer = Trainer(rig, TrainConfig())
     train_module.warm_up_learning(trainer)
     train_module.warm_up_rays(trainer)
@@ -416,3 +428,5 @@ def test_two_processes_that_compile_halves_compile_what_a_step_calls(rig, monkey
     train_module.warm_up(trainer)
     assert [set(kernel.overloads) for kernel in halves] == compiled
     assert set() not in compiled
+    assert set(called) == {"largest_distance", "light_factors", "mean_normals"}
+    assert called[-1] == "largest_distance"  # the mark of a whole first run
