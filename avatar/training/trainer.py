@@ -300,6 +300,7 @@ def correct_poses(
 
     Returns the slots that move, of the `most` with the most rays: none if no pose has enough.
     """
+    # no slot comes twice: its rays are counted from 0 again
     tried = [poses.correct_next(rate=rate) for _ in range(most)]
     moved = [slot for slot in tried if slot is not None]
     near = [slot for slot in moved if not poses.needs_resolve(slot)]

@@ -157,7 +157,7 @@ def capture(film, tmp_path) -> Path:
 
 @pytest.fixture
 def on_one_core(monkeypatch) -> None:
-    """Fits in this process: another one takes two seconds, of which tests of start-up see."""
+    """Fits in this process; another one takes two seconds, and tests of start-up show it."""
     monkeypatch.setattr(ingest, "usable_cores", lambda: 1)
     monkeypatch.setattr(train, "warm_up", lambda trainer: 0.0)
 
