@@ -237,3 +237,18 @@ def adam_step(thread, threads, parameters):
         for block in range(thread, blocks, threads):
             part = slice(block * ENTRIES_PER_BLOCK, (block + 1) * ENTRIES_PER_BLOCK)
             _adam_block(grad[part], mean[part], square[part], numbers[part], rates)
+
+
+@compile_kernel(**FAST_MATH)
+def move_toward(thread, threads, pairs, share):
+    """Moves means (numbers) by a share of the way to values, for each pair of both."""
+    for mean, value in pairs:
+        count = mean.shape[0]
+        part = slice(count * thread // threads, count * (thread + 1) // threads)
+        _move_block(mean[part], value[part], share)
+
+
+@compile_kernel(**INLINED)
+def _move_block(mean, value, share):
+    for i in range(mean.shape[0]):
+        mean[i] += share * (value[i] - mean[i])

@@ -212,6 +212,15 @@ class AdamSettings(NamedTuple):
         return self.rate / (1.0 - first**self.steps), (1.0 - second**self.steps) ** -0.5
 
 
+class AdamArrays(NamedTuple):
+    """A parameter's gradient, the means of it and of its square, and the numbers themselves."""
+
+    gradient: Float32[np.ndarray, "numbers"]
+    mean: Float32[np.ndarray, "numbers"]
+    square: Float32[np.ndarray, "numbers"]
+    numbers: Float32[np.ndarray, "numbers"]
+
+
 class PriorPoints(NamedTuple):
     """Points at which priors hold, in lists of one kind each, and the weights of their terms.
 

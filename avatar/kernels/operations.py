@@ -6,6 +6,7 @@ graphics card would be a second module of these functions. `baselines.torch_refe
 """
 
 import threading
+from collections.abc import Sequence
 
 import numba
 import numpy as np
@@ -24,6 +25,7 @@ from avatar.kernels import (
 )
 from avatar.kernels.operands import (
     HIDDEN_WIDTH,
+    AdamArrays,
     AdamSettings,
     CorrespondenceTables,
     DensityGrid,
@@ -210,18 +212,23 @@ def _level_arrays(
     return levels.low, levels.cells_per_m, levels.vertex_counts, levels.is_dense, levels.offsets
 
 
-def adam_step(parameters: list[tuple[AdamSettings, Tensor, Tensor, Tensor, Tensor]]) -> None:
-    """Takes Adam's step on contiguous tensors, in place, and zeroes the gradients.
-
-    Each parameter has its gradient, the running means of the gradient and of its square, and the
-    numbers themselves.
-    """
+def adam_step(parameters: list[tuple[AdamSettings, AdamArrays]]) -> None:
+    """Takes Adam's step on parameters, in place, and zeroes their gradients."""
     flat = []
-    for how, *parts in parameters:
+    for how, arrays in parameters:
         (first, second), (rate, scale) = how.betas, how.scales
         rates = tuple(map(np.float32, (rate, 1.0 - first, 1.0 - second, scale, how.eps)))
-        flat.append((tuple(part.numpy().reshape(-1) for part in parts), rates))
+        flat.append((tuple(arrays), rates))
     run_threads(numba_hash_grid.adam_step, tuple(flat))
+
+
+def move_toward(means: Sequence[Tensor], values: Sequence[Tensor], share: float) -> None:
+    """Moves contiguous tensors by a share of the way to others of their shapes, in place."""
+    pairs = tuple(
+        (mean.detach().numpy().reshape(-1), value.detach().numpy().reshape(-1))
+        for mean, value in zip(means, values, strict=True)
+    )
+    run_threads(numba_hash_grid.move_toward, pairs, np.float32(share))
 
 
 def solve_correspondences(

@@ -11,17 +11,18 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float32
+from torch import Tensor
 
 from avatar.avatar_model import Avatar, OrientationShading
 from avatar.config import COARSEST_M, NOMINAL_STEPS_PER_S, TrainConfig
 from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.kernels import operations
-from avatar.kernels.operands import AdamSettings, HashLevels
+from avatar.kernels.operands import AdamArrays, AdamSettings, HashLevels
 from avatar.occupancy_grid import INITIAL_OCCUPANCY_DECAY, OCCUPANCY_DECAY, OccupancyGrid
 from avatar.radiance_field import RadianceField
 from avatar.rig import Rig
@@ -50,14 +51,20 @@ def cosine_decay(progress: float) -> float:
     return max(0.05, 0.5 * (1.0 + math.cos(math.pi * min(max(progress, 0.0), 1.0))))
 
 
-@torch.no_grad()
 def update_ema(average: RadianceField, field: RadianceField, steps: int) -> None:
     """Updates the exponential mean of a field, in place, every `EMA_INTERVAL` steps."""
     if steps % EMA_INTERVAL and steps > EMA_INTERVAL:
         return
     share = min(1.0, EMA_INTERVAL / min(EMA_HORIZON_STEPS, max(steps * MAX_HORIZON_SHARE, 1.0)))
-    for shown, learnt in zip(average.parameters(), field.parameters(), strict=True):
-        shown.lerp_(learnt, share)
+    operations.move_toward(average.parameters(), field.parameters(), share)
+
+
+class ParameterMemory(NamedTuple):
+    """A parameter's gradient, steps and arrays of numbers, as Adam's state holds them."""
+
+    gradient: Tensor
+    steps: Float32[np.ndarray, ""]
+    arrays: AdamArrays
 
 
 @final
@@ -65,34 +72,53 @@ class UncompiledAdam(torch.optim.Adam):
     """`torch.optim.Adam` that does not load `torch._dynamo` (0.7 to 1 s) at its first use.
 
     torch wraps these methods to exclude them from compilation, and loads the compiler to do so.
-    Nothing is compiled here, and the unwrapped methods are used.
+    Nothing is compiled here, and the unwrapped methods are used. `memory` is `step_optimizer`'s.
     """
 
     add_param_group = inspect.unwrap(torch.optim.Adam.add_param_group)
     state_dict = inspect.unwrap(torch.optim.Adam.state_dict)
-    load_state_dict = inspect.unwrap(torch.optim.Adam.load_state_dict)
     step = torch.no_grad()(inspect.unwrap(torch.optim.Adam.step))
+
+    def __init__(self, params: Any, **options: Any) -> None:
+        """Starts with the arguments of `torch.optim.Adam`."""
+        super().__init__(params, **options)
+        self.memory = dict[torch.nn.Parameter, ParameterMemory]()
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Continues from a saved state."""
+        inspect.unwrap(torch.optim.Adam.load_state_dict)(self, state_dict)
+        self.memory.clear()
 
 
 def step_optimizer(optimizer: UncompiledAdam) -> None:
     """Takes the optimizer's step by our kernel, and zeroes the gradients.
 
-    The state is that of `torch.optim.Adam`, whose own kernel takes 1.5 times as long.
+    The state is that of `torch.optim.Adam`, whose own kernel takes 1.5 times as long. Its memory is
+    looked up once, since that takes longer than a step of the small parameters.
     """
-    parameters = []
+    stepped = []
     for group in optimizer.param_groups:
         for parameter in group["params"]:
-            state = optimizer.state[parameter]
-            if not state:
-                state["step"] = torch.zeros(())
-                state["exp_avg"] = torch.zeros_like(parameter)
-                state["exp_avg_sq"] = torch.zeros_like(parameter)
-            steps = state["step"].numpy()
+            of, steps, arrays = optimizer.memory.get(parameter, (None, None, None))
+            if steps is None or arrays is None or of is not parameter.grad:
+                of, steps, arrays = optimizer.memory[parameter] = _memory_of(optimizer, parameter)
             steps += 1
             how = AdamSettings(group["lr"], group["betas"], group["eps"], int(steps))
-            means = state["exp_avg"], state["exp_avg_sq"]
-            parameters.append((how, parameter.grad, *means, parameter.detach()))
-    operations.adam_step(parameters)
+            stepped.append((how, arrays))
+    operations.adam_step(stepped)
+
+
+def _memory_of(optimizer: UncompiledAdam, parameter: torch.nn.Parameter) -> ParameterMemory:
+    """Gradient, steps and arrays of a parameter, whose state begins if there is none."""
+    state, grad = optimizer.state[parameter], parameter.grad
+    if not state:
+        state["step"] = torch.zeros(())
+        state["exp_avg"] = torch.zeros_like(parameter)
+        state["exp_avg_sq"] = torch.zeros_like(parameter)
+    assert grad is not None, "a gradient is zeroed, never taken away"
+    parts = grad, state["exp_avg"], state["exp_avg_sq"], parameter.detach()
+    arrays = AdamArrays(*(part.numpy().reshape(-1) for part in parts))
+    return ParameterMemory(grad, state["step"].numpy(), arrays)
 
 
 NETWORK_RATE_FACTOR = 0.3

@@ -7,6 +7,7 @@ import torch
 
 from avatar.kernels import operations
 from avatar.kernels.operands import (
+    AdamArrays,
     AdamSettings,
     FeatureGradients,
     LossSettings,
@@ -50,7 +51,8 @@ def results_of(learnt) -> dict[str, list[torch.Tensor]]:
     volume = trainer.learner.shading._normals
     normals = operations.mean_normals(raw, samples, 0.01, batch.rays.slots, cells, volume)
     stepped = [grad_table.clone(), *(torch.ones_like(grad_table) for _ in range(3))]
-    operations.adam_step([(AdamSettings(0.01, (0.9, 0.99), 1e-15, 1), *stepped)])
+    arrays = AdamArrays(*(part.numpy().reshape(-1) for part in stepped))
+    operations.adam_step([(AdamSettings(0.01, (0.9, 0.99), 1e-15, 1), arrays)])
     return {
         "mean_normals": [normals],
         "adam_step": stepped[1:],
