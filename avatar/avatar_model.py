@@ -53,6 +53,8 @@ MIN_FACTOR, MAX_FACTOR = 0.3, 3.0
 """Bounds of the factor."""
 OBSERVATION_INTERVAL = 4
 """Steps between observations of the light."""
+SOLUTION_INTERVAL = 16
+"""Steps between its solutions, which take as long as all observations of these steps."""
 
 
 @final
@@ -129,7 +131,7 @@ class OrientationShading:
             MIN_ALPHA, MIN_NORMAL_LENGTH, (MIN_FACTOR, MAX_FACTOR), MEMORY_RAYS, self._sums,
         )  # fmt: skip
         self._rays = math.exp(-rays / MEMORY_RAYS) * self._rays + rays
-        if self._rays > MIN_RAYS:
+        if self._rays > MIN_RAYS and self._steps % SOLUTION_INTERVAL == 1:
             self.restore(torch.from_numpy(self._solve()))
 
     def _solve(self) -> Float32[np.ndarray, "harmonics"]:

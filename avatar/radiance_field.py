@@ -7,6 +7,7 @@ import copy
 import math
 from typing import final
 
+import numpy as np
 import torch
 from jaxtyping import Float32
 from torch import Tensor
@@ -120,27 +121,27 @@ SMOOTHNESS_PAIR_SIGMA_CELLS = 0.5
 
 
 def sample_tv_pairs(
-    points: Float32[Tensor, "samples 3"], config: TrainConfig, generator: torch.Generator
+    points: Float32[Tensor, "samples 3"], config: TrainConfig, seed: int
 ) -> Float32[Tensor, "points 3"]:
-    """Random samples followed by one neighbor of each; empty if neither pair prior is on."""
+    """Random samples followed by one neighbor of each; empty if neither pair prior is on.
+
+    The seed, below 2³², decides the draw.
+    """
     count = config.density_tv_pairs if config.density_tv_weight or config.double_well_weight else 0
-    return _sample_pairs(points, count, TV_PAIR_SIGMA_M, generator)
+    return _sample_pairs(points, count, TV_PAIR_SIGMA_M, seed)
 
 
 def sample_smoothness_pairs(
-    points: Float32[Tensor, "samples 3"], config: TrainConfig, generator: torch.Generator
+    points: Float32[Tensor, "samples 3"], config: TrainConfig, seed: int
 ) -> Float32[Tensor, "points 3"]:
     """Pairs about a finest cell apart, as `sample_tv_pairs`; empty if both weights are zero."""
     count = config.smoothness_pairs if config.density_slope_weight or config.color_tv_weight else 0
-    return _sample_pairs(points, count, SMOOTHNESS_PAIR_SIGMA_CELLS * config.finest_m, generator)
+    return _sample_pairs(points, count, SMOOTHNESS_PAIR_SIGMA_CELLS * config.finest_m, seed)
 
 
 def _sample_pairs(
-    points: Float32[Tensor, "samples 3"], count: int, sigma_m: float, generator: torch.Generator
+    points: Float32[Tensor, "samples 3"], count: int, sigma_m: float, seed: int
 ) -> Float32[Tensor, "points 3"]:
-    count = count if len(points) else 0
-    chances = torch.rand(count, generator=generator)
-    apart = sigma_m * torch.randn(count, 3, generator=generator)
-    pairs = torch.empty(2 * count, 3)
-    numba_priors.draw_pairs(chances.numpy(), apart.numpy(), points.numpy(), pairs.numpy())
+    pairs = torch.empty(2 * count if len(points) else 0, 3)
+    numba_priors.draw_pairs(np.uint32(seed), np.float32(sigma_m), points.numpy(), pairs.numpy())
     return pairs

@@ -77,7 +77,7 @@ def step_marks(seen: LoadedTrainer) -> list[Measurement]:
     samples = operations.march(batch.rays, replay.correspondences, grid, how)
     chance = _seeded()
     empty = avatar.occupancy.sample_empty(config.empty_space_points, chance)
-    near = sample_tv_pairs(samples.points, config, chance)
+    near = sample_tv_pairs(samples.points, config, 1)
     plain = AutogradField(field)
 
     def ours(config: TrainConfig = config) -> None:

@@ -440,3 +440,39 @@ def pose_joints(
                 for c in range(3):
                     moved += turn[joint, a, c] * rest_from_canonical[joint, c, b]
                 bones[joint, 4 * a + b] = moved
+
+
+@compile_kernel(**FAST_MATH)
+def move_pose(
+    correction, change, most, most_m, given, rest, parents, rest_from_canonical, turns, places,
+    bones, root_turn,
+):  # fmt: skip
+    """Moves a pose by a change of its correction, or by the part that the frame's roots can follow.
+
+    Args:
+        correction: Axis-angle corrections and the root's shift (25, 3), in [-most, most]; written.
+        change: What it is to change by; written: what it has changed by.
+        most_m: Largest motion of a joint, metres.
+        given, rest, parents, rest_from_canonical, turns, places, bones, root_turn: As in
+            `pose_joints`; `places` are those before.
+    """
+    before, joints = correction.copy(), places.copy()
+    for joint in range(25):
+        for a in range(3):
+            moved = before[joint, a] + change[joint, a]
+            correction[joint, a] = min(max(moved, -most), most)
+    pose_joints(
+        given, correction, rest, parents, rest_from_canonical, turns, places, bones, root_turn
+    )
+    distance = largest_distance(places, joints)
+    if distance > most_m:
+        for joint in range(25):
+            for a in range(3):
+                moved = correction[joint, a] - before[joint, a]
+                correction[joint, a] = before[joint, a] + most_m / distance * moved
+        pose_joints(
+            given, correction, rest, parents, rest_from_canonical, turns, places, bones, root_turn
+        )
+    for joint in range(25):
+        for a in range(3):
+            change[joint, a] = correction[joint, a] - before[joint, a]

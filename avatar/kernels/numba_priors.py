@@ -7,6 +7,8 @@ over points, times a weight, with respect to the raw outputs. Pairs are stored a
 then all second ones.
 """
 
+import math
+
 import numpy as np
 
 from avatar.kernels.kernel_compiler import (
@@ -16,7 +18,7 @@ from avatar.kernels.kernel_compiler import (
 )
 from avatar.kernels.operands import MAX_LOG_DENSITY
 
-F32 = np.float32
+F32, U32 = np.float32, np.uint32
 OPACITY_LENGTH_M = 0.01
 """Length over which opacity is measured, metres."""
 MIN_OPACITY = 1e-6
@@ -189,12 +191,33 @@ def points_in_cells(cells, within, shape, low, cells_per_m, points):
         points[i, 2] = (F32(cell % nz) + within[i, 2]) / cells_per_m[2] + low[2]
 
 
+@compile_kernel(**INLINED)
+def chance(seed, number):
+    """A random number in [0, 1): a hash of its number (Wellons' lowbias32) that depends on a seed.
+
+    It does not depend on the number of threads, and no array of random numbers is filled before.
+    """
+    x = U32(U32(number) ^ U32(seed))
+    x = U32(U32(x ^ (x >> U32(16))) * U32(0x7FEB352D))
+    x = U32(U32(x ^ (x >> U32(15))) * U32(0x846CA68B))
+    return F32(U32(x ^ (x >> U32(16))) >> U32(8)) * F32(2.0**-24)
+
+
 @compile_kernel(**FAST_MATH)
-def draw_pairs(chances, apart, points, pairs):
-    """Random points, then a neighbor of each at the offsets `apart` (pairs, 3)."""
-    count = apart.shape[0]
+def draw_pairs(seed, sigma, points, pairs):
+    """Random points, then a neighbor of each at a normal offset of `sigma` along each axis.
+
+    Normal numbers are Box and Muller's (1958), from a radius and a direction each.
+    """
+    count, offset = pairs.shape[0] // 2, np.empty(4, F32)
     for i in range(count):
-        drawn = min(np.int64(np.float64(chances[i]) * points.shape[0]), points.shape[0] - 1)
+        place = chance(seed, 5 * i) * F32(points.shape[0])
+        drawn = min(np.int64(place), points.shape[0] - 1)
+        for half in range(2):
+            far, turn = chance(seed, 5 * i + 1 + half), chance(seed, 5 * i + 3 + half)
+            radius = sigma * np.sqrt(F32(-2) * np.log(F32(1) - far))
+            angle = F32(2.0 * math.pi) * turn
+            offset[2 * half], offset[2 * half + 1] = radius * np.cos(angle), radius * np.sin(angle)
         for axis in range(3):
             pairs[i, axis] = points[drawn, axis]
-            pairs[count + i, axis] = points[drawn, axis] + apart[i, axis]
+            pairs[count + i, axis] = points[drawn, axis] + offset[axis]

@@ -13,10 +13,11 @@ rounding from those with another.
 import numpy as np
 
 from avatar.kernels import numba_priors
-from avatar.kernels.kernel_compiler import FAST_MATH, INLINED, compile_kernel
+from avatar.kernels.kernel_compiler import FAST_MATH, compile_kernel
 from avatar.kernels.numba_field import backward_passes, forward_block
 from avatar.kernels.numba_hash_grid import POINTS_PER_BLOCK, encode_points_backward
 from avatar.kernels.numba_pose import write_wrenches
+from avatar.kernels.numba_priors import chance
 from avatar.kernels.numba_rendering import composite_ray_loss
 from avatar.kernels.numba_shading import light_factor, mean_normal
 from avatar.kernels.operands import (
@@ -29,7 +30,7 @@ from avatar.kernels.operands import (
     TV_PAIRS,
 )
 
-F32, U32 = np.float32, np.uint32
+F32 = np.float32
 RAYS_PER_BLOCK = 32
 """Rays that pass through the step together: about 200 samples, whose features fit a core's cache
 beside the network."""
@@ -57,18 +58,6 @@ def _add_prior_gradients(kind, raw, points, pair_weights, weights, max_slope_per
         numba_priors.toward_sources(raw, pair_weights, weight, grad)
 
 
-@compile_kernel(**INLINED)
-def _chance(seed, number):
-    """A random number in [0, 1): a hash of its number (Wellons' lowbias32) that depends on a seed.
-
-    It does not depend on the number of threads, and no array of random numbers is filled before.
-    """
-    x = U32(U32(number) ^ U32(seed))
-    x = U32(U32(x ^ (x >> U32(16))) * U32(0x7FEB352D))
-    x = U32(U32(x ^ (x >> U32(15))) * U32(0x846CA68B))
-    return F32(U32(x ^ (x >> U32(16))) >> U32(8)) * F32(2.0**-24)
-
-
 @compile_kernel(**FAST_MATH)
 def _draw_strong(grads, seed, first, faint, rows, drawn):
     """Draws points by the strength of their gradients; returns their number, and all strength.
@@ -81,7 +70,7 @@ def _draw_strong(grads, seed, first, faint, rows, drawn):
     for n in range(grads.shape[0]):
         strength = abs(grads[n, 0]) + abs(grads[n, 1]) + abs(grads[n, 2]) + abs(grads[n, 3])
         total += strength
-        if _chance(seed, first + n) * faint < strength:
+        if chance(seed, first + n) * faint < strength:
             rows[count] = n
             for q in range(4):
                 drawn[count, q] = grads[n, q] * max(faint / strength, F32(1))

@@ -72,7 +72,7 @@ class HashLevels:
 
     def count_from(self, cell_m: float) -> int:
         """Number of the levels whose cells are at least `cell_m` metres wide; at least one."""
-        return max(int((self.cells_per_m * cell_m <= 1.0).sum()), 1)
+        return max(sum(cells * cell_m <= 1.0 for cells in self.cells_per_m.tolist()), 1)
 
     @property
     def entries(self) -> int:

@@ -5,6 +5,7 @@ graphics card would be a second module of these functions. `baselines.torch_refe
 `baselines.torch_correspondence` say the same in plain torch, and a test compares both.
 """
 
+import itertools
 import threading
 from collections.abc import Sequence
 
@@ -100,8 +101,9 @@ def learn(
         seed: Of the draw of the gradients that are propagated, below 2³².
         is_frozen: Leaves the gradients of the network out.
     """
-    points = torch.cat([samples.points, *priors.lists])
-    ends = np.cumsum([len(part) for part in (samples.points, *priors.lists)])
+    lists = samples.points, *priors.lists
+    points = torch.cat(lists)
+    ends = np.array(list(itertools.accumulate(part.shape[0] for part in lists)))
     count, total, width, threads = len(rays.slots), len(points), levels.feature_width, _threads()
     blocks = len(priors.lists) - (-count // numba_training_step.RAYS_PER_BLOCK)
     raw, grad_raw = np.empty((2, total, 4), dtype=np.float32)

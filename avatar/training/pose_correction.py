@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from typing import NamedTuple, final
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int64
+from jaxtyping import Bool, Float, Float32, Int32, Int64
 
 from avatar.kernels import numba_pose
 from avatar.kernels.kernel_compiler import FAST_MATH, compile_kernel
@@ -172,7 +172,7 @@ class RaySums:
 
     def add(
         self,
-        slots: Int64[np.ndarray, "rays"],
+        slots: Int32[np.ndarray, "rays"],
         wrenches: Float32[np.ndarray, "rays 24 6"],
         loss: Float32[np.ndarray, "rays"],
         room: Int64[np.ndarray, "slots"],

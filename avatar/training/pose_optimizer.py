@@ -14,11 +14,11 @@ from typing import NamedTuple, final
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int64
+from jaxtyping import Float, Float32, Int32
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from avatar.kernels.numba_pose import largest_distance, pose_joints
+from avatar.kernels.numba_pose import largest_distance, move_pose, pose_joints
 from avatar.kernels.operands import SkinningVolume
 from avatar.rig import Rig
 from avatar.training.pose_correction import (
@@ -217,7 +217,7 @@ class PoseOptimizer:
 
     def accumulate(
         self,
-        slots: Int64[Tensor, "rays"],
+        slots: Int32[Tensor, "rays"],
         wrenches: Float32[Tensor, "rays 24 6"],
         loss: Float32[Tensor, "rays"],
     ) -> None:
@@ -249,15 +249,17 @@ class PoseOptimizer:
         if self._can_freeze[slot]:
             self._estimate_count[slot] += 1.0
             self._evidence_sum[slot] += step.evidence
-        moves = bool(step.change.any())
+        change = step.change
+        moves = bool(change.any())
         self._moved_share += (1.0 - EVIDENCE_EMA_DECAY) * (moves - self._moved_share)
-        change, before = rate * step.change, self.corrections[slot].copy()
+        change *= rate
         if moves and self.poses_may_be_exact:
             mean = self.corrections[self._is_held].mean(axis=0)
-            change = STEP_DAMPING * change - MEAN_CORRECTION_DECAY * mean
+            change *= STEP_DAMPING
+            change -= MEAN_CORRECTION_DECAY * mean
         if moves:
-            self._apply_correction(slot, np.clip(before + change, -MAX_CORRECTION, MAX_CORRECTION))
-        self._rays.fade(slot, self.corrections[slot] - before, self._equation_decay)
+            self._move_pose(slot, change)
+        self._rays.fade(slot, change, self._equation_decay)
         return slot if moves else None
 
     def correction_interval(self, rate: float) -> int:
@@ -282,15 +284,15 @@ class PoseOptimizer:
         turn, shift = self._joints.root_turns[slot], self.corrections[slot, 24]
         return RootCorrection(rotation=turn, shift=shift, pivot=self.rig.rest_joints[0])
 
-    def _apply_correction(self, slot: int, correction: Float[np.ndarray, "25 3"]) -> None:
-        """Applies a correction, or the part of it that the frame's roots can follow."""
-        before, places = self.corrections[slot].copy(), self._joints.places[slot].copy()
-        self.corrections[slot] = correction
-        self._update_bones(slot)
-        moved = largest_distance(self._joints.places[slot], places)
-        if moved > MAX_JOINT_STEP_M:
-            self.corrections[slot] = before + MAX_JOINT_STEP_M / moved * (correction - before)
-            self._update_bones(slot)
+    def _move_pose(self, slot: int, change: Float[np.ndarray, "25 3"]) -> None:
+        """Changes a correction as far as the frame's roots can follow; writes how far it did."""
+        turns, places, root_turns = self._joints
+        move_pose(
+            self.corrections[slot], change, MAX_CORRECTION, MAX_JOINT_STEP_M,
+            self._given_turns[slot], self.rig.rest_joints, self._parents,
+            self._rest_from_canonical, turns[slot], places[slot], self.bones.numpy()[slot],
+            root_turns[slot],
+        )  # fmt: skip
 
     def _update_bones(self, slot: int) -> None:
         turns, places, root_turns = self._joints

@@ -17,7 +17,7 @@ from jaxtyping import Float32, UInt8
 from torch import Tensor
 
 from avatar.correspondence_grid import CORRESPONDENCE_CELL_M, CorrespondenceGrid
-from avatar.kernels.kernel_compiler import INLINED, compile_kernel, prefetch
+from avatar.kernels.kernel_compiler import FAST_MATH, INLINED, compile_kernel, prefetch
 from avatar.kernels.operands import CorrespondenceTables, RayBatch
 from avatar.kernels.threads import run_threads
 from avatar.training.frame_stream import TrainingFrame, view_descriptor
@@ -157,12 +157,10 @@ class ReplayBuffer:
 
     def correct_root(self, slot: int, correction: RootCorrection) -> None:
         """Lets a slot's rays follow its corrected root."""
-        turn = correction.rotation.T
-        origin = correction.pivot + turn @ (
-            self._given_origins[slot] - correction.pivot - correction.shift
-        )
-        self._origins[slot] = origin
-        self._turns[slot] = turn @ self._body_from_camera[slot]
+        _follow_root(
+            *correction, self._given_origins[slot], self._body_from_camera[slot],
+            self._origins[slot], self._turns[slot],
+        )  # fmt: skip
 
     def sample_rays(self, count: int, generator: torch.Generator) -> TrainingBatch:
         """Draws rays from the kept frames."""
@@ -233,6 +231,21 @@ def _sights_on_a_grid(camera: Camera) -> Float32[np.ndarray, "nodes 2"]:
     pixels = np.stack(np.meshgrid(*nodes), axis=-1).reshape(-1, 2) + 0.5
     sights = replace(camera, camera_from_world=np.eye(4)).ray_directions(pixels)
     return (sights[:, :2] / sights[:, 2:]).astype(np.float32)
+
+
+@compile_kernel(**FAST_MATH)
+def _follow_root(rotation, shift, pivot, given_origin, body_from_camera, origin, turns):
+    """Writes a frame's origin of rays and its rotation by `RootCorrection`'s numbers."""
+    for i in range(3):
+        place = pivot[i]
+        for k in range(3):
+            place += rotation[k, i] * (given_origin[k] - pivot[k] - shift[k])
+        origin[i] = place
+        for j in range(3):
+            turned = 0.0
+            for k in range(3):
+                turned += rotation[k, i] * body_from_camera[k, j]
+            turns[i, j] = turned
 
 
 @compile_kernel(**INLINED)

@@ -388,7 +388,7 @@ def warm_up_rays(trainer: Trainer) -> Trainer:
     stand_in.exposures.observe(batch, torch.zeros(count, 4))
     for _ in range(OBSERVATION_INTERVAL):
         stand_in.learner.shading.observe(torch.zeros(count, 3), batch.target, torch.zeros(count, 4))
-    poses.accumulate(batch.rays.slots.long(), torch.zeros(count, 24, 6), torch.zeros(count))
+    poses.accumulate(batch.rays.slots, torch.zeros(count, 24, 6), torch.zeros(count))
     return stand_in
 
 

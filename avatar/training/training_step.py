@@ -33,6 +33,9 @@ from avatar.training.pose_optimizer import PoseOptimizer
 from avatar.training.replay_buffer import TrainingBatch
 from avatar.training.unseen_skin import SourcePairs, UnseenSkin
 
+TV_SEED, SMOOTHNESS_SEED = 0x5BD1E995, 0x9E3779B9
+"""Bits by which the seeds of a step's pairs differ from that of its draw of gradients."""
+
 
 @runtime_checkable
 class RaySampler(Protocol):
@@ -129,12 +132,12 @@ def compute_gradients(
         poses: Accumulates the samples' wrenches, if poses are refined.
     """
     field = learner.field
+    seed = int(torch.randint(1 << 32, (), generator=generator))
     samples = sampler.sample_rays(batch.rays, correspondences)
     priors = _prior_points(
-        sampler, learner.occupancy, samples.points, config, surface_share, generator
+        sampler, learner.occupancy, samples.points, config, surface_share, seed, generator
     )
     count, bones = len(samples.points), None
-    seed = int(torch.randint(1 << 32, (), generator=generator))
     if poses is not None and count:
         levels = field.levels.count_from(poses.min_gradient_cell_m)
         bones = PosedBones(poses.skinning, poses.bones, levels)
@@ -151,7 +154,7 @@ def compute_gradients(
     field.add_gradients(learnt)
     field.gradient_strength = learnt.strength
     if poses is not None and bones is not None:
-        poses.accumulate(batch.rays.slots.long(), learnt.wrenches, learnt.loss)
+        poses.accumulate(batch.rays.slots, learnt.wrenches, learnt.loss)
     if caches_density:
         operations.scatter_max_density(
             samples.points, learnt.log_density.contiguous(), learner.occupancy.density_grid
@@ -165,6 +168,7 @@ def _prior_points(
     points: Float32[Tensor, "samples 3"],
     config: TrainConfig,
     surface_share: float,
+    seed: int,
     generator: torch.Generator,
 ) -> PriorPoints:
     """Draws the points at which priors hold, and weighs the priors' terms."""
@@ -174,11 +178,11 @@ def _prior_points(
         sampler.sample_empty(config.empty_space_points, generator)
         if config.empty_space_weight
         else none,
-        radiance_field.sample_tv_pairs(points, config, generator),
+        radiance_field.sample_tv_pairs(points, config, seed ^ TV_SEED),
         occupancy.sample_interior(config.interior_points, generator)
         if config.interior_weight
         else none,
-        radiance_field.sample_smoothness_pairs(points, config, generator),
+        radiance_field.sample_smoothness_pairs(points, config, seed ^ SMOOTHNESS_SEED),
         occupancy.sample_off_skin(config.off_skin_points, generator)
         if config.off_skin_weight
         else none,

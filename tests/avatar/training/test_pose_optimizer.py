@@ -172,7 +172,7 @@ def test_the_poses_gradient_is_what_the_roots_do_when_the_pose_moves(rig, table,
     )
     slots = torch.ones(1, dtype=torch.int32)
     wrenches = wrenches_of(samples, pull, slots, cells, table.skinning, table.bones)
-    table.accumulate(slots.long(), wrenches, torch.ones(1))
+    table.accumulate(slots, wrenches, torch.ones(1))
     gradient = pose_gradient(table, 1)
     given = (
         torch_correspondence.skin_points(samples.points, *table.skinning, table.bones[1])
@@ -212,7 +212,7 @@ def test_sums_over_rays_are_those_of_their_own_gradients(rig, table, generator):
     felt[:24] = descendant_matrix(rig.parents)[:, None, :, None] * carried[:, :, None]
     felt[24, :, :, :3] = -np.eye(3)[:, None]
     wrenches, loss = torch.randn(40, 24, 6, generator=generator), torch.rand(40)
-    table.accumulate(torch.ones(40, dtype=torch.int64), wrenches, loss)
+    table.accumulate(torch.ones(40, dtype=torch.int32), wrenches, loss)
     scaled = np.einsum("jabq,rbq->rja", felt, wrenches.numpy()) * SIGMA_OF_ROW[:, None]
     scaled = scaled.reshape(40, 75)
     curved = scaled / (2.0 * (loss.numpy() + MIN_RAY_LOSS))[:, None]
@@ -336,7 +336,7 @@ def test_a_pose_that_was_refined_for_long_enough_stays(rig, bent_pose, generator
     table, pose = PoseOptimizer(rig, 2), pose_of(bent_pose)
     table.set_pose(0, pose, step=0)
     table.set_pose(1, pose, step=1000)
-    slots = torch.arange(2).repeat_interleave(300)
+    slots = torch.arange(2, dtype=torch.int32).repeat_interleave(300)
     wrenches, loss = torch.randn(600, 24, 6, generator=generator), torch.full((600,), 0.1)
 
     def corrected(step):
@@ -357,7 +357,7 @@ def test_a_frame_that_has_just_come_is_not_corrected_yet(rig, bent_pose, generat
 
     def corrected(step):
         open_now = table.freeze_converged(step)
-        table.accumulate(torch.zeros(300, dtype=torch.int64), wrenches, loss)
+        table.accumulate(torch.zeros(300, dtype=torch.int32), wrenches, loss)
         slot = table.correct_next(rate=1.0)
         assert open_now == (slot is not None)
         return slot
@@ -376,7 +376,7 @@ def test_a_pose_whose_rays_do_not_agree_is_exact_and_stays(rig, bent_pose, gener
     def pulled(step, slot, bias):
         table.freeze_converged(step)
         wrenches = torch.randn(300, 24, 6, generator=generator) + bias
-        table.accumulate(torch.full((300,), slot), wrenches, loss)
+        table.accumulate(torch.full((300,), slot, dtype=torch.int32), wrenches, loss)
         return table.correct_next(rate=1.0) is not None
 
     for step in range(60, 120):  # too early to judge; so long it takes until all together agree
@@ -396,7 +396,7 @@ def test_estimated_poses_follow_their_rays_even_where_these_hardly_agree(rig, be
         for step in range(FREEZE_AFTER_STEPS - 20, FREEZE_AFTER_STEPS):
             table.freeze_converged(step)
             wrenches = torch.randn(300, 24, 6, generator=generator)
-            table.accumulate(torch.zeros(300, dtype=torch.int64), wrenches, loss)
+            table.accumulate(torch.zeros(300, dtype=torch.int32), wrenches, loss)
             table.correct_next(rate=1.0)
     assert not tables[0].corrections.any()
     assert np.abs(tables[1].corrections[0]).max() > 1e-3
@@ -414,7 +414,7 @@ def test_a_held_out_pose_follows_more_rays_and_its_given_pose_less(rig, bent_pos
             rig, 1, poses_may_be_exact=False, rays_per_frame=1000, prior_precision=precision
         )
         table.set_pose(0, pose_of(bent_pose))
-        table.accumulate(torch.zeros(rays, dtype=torch.int64), wrenches[:rays], loss[:rays])
+        table.accumulate(torch.zeros(rays, dtype=torch.int32), wrenches[:rays], loss[:rays])
         table.correct_next(rate=1.0)
         return np.linalg.norm(table.corrections[0])
 
@@ -433,7 +433,7 @@ def test_an_estimated_pose_remembers_its_rays_until_it_is_replaced(rig, bent_pos
                 table.set_pose(0, pose_of(bent_pose))
             table.corrections[0] = 0.0
             table._update_bones(0)
-            table.accumulate(torch.zeros(300, dtype=torch.int64), wrenches[row], loss)
+            table.accumulate(torch.zeros(300, dtype=torch.int32), wrenches[row], loss)
             table.correct_next(rate=1.0)
         return table.corrections[0]
 

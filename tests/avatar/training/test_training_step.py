@@ -16,6 +16,8 @@ from avatar.training.frame_stream import prepare_frame
 from avatar.training.pose_optimizer import PoseOptimizer
 from avatar.training.trainer import Trainer, cosine_decay
 from avatar.training.training_step import (
+    SMOOTHNESS_SEED,
+    TV_SEED,
     OccupancySampler,
     compute_gradients,
 )
@@ -100,13 +102,14 @@ def one_step(trainer):
     )  # fmt: skip
     generator = torch.Generator().manual_seed(4)
     occupancy._ahead.clear()  # the same points are drawn once more
+    seed = int(torch.randint(1 << 32, (), generator=generator))
     how = MarchSettings(CONFIG.sample_step_m, CONFIG.opaque_margin_m, CONFIG.max_samples)
     cells = trainer.replay.correspondences
     samples = operations.march(batch.rays, cells, occupancy.density_grid, how)
     empty = occupancy.sample_empty(CONFIG.empty_space_points, generator)
-    pairs = radiance_field.sample_tv_pairs(samples.points, CONFIG, generator)
+    pairs = radiance_field.sample_tv_pairs(samples.points, CONFIG, seed ^ TV_SEED)
     solid = occupancy.sample_interior(CONFIG.interior_points, generator)
-    close = radiance_field.sample_smoothness_pairs(samples.points, CONFIG, generator)
+    close = radiance_field.sample_smoothness_pairs(samples.points, CONFIG, seed ^ SMOOTHNESS_SEED)
     gaps = occupancy.sample_off_skin(CONFIG.off_skin_points, generator)
     grads = [parameter.grad.clone() for parameter in field.parameters()]
     return grads, (samples, empty, pairs, solid, close, gaps, batch)
