@@ -39,12 +39,9 @@ def seen(rig):
     origins = low + size * torch.rand(4000, 3, generator=generator)
     origins[:, 2] = low[2] - 0.1
     count = len(origins)
-    rays = RayBatch(
-        origins,
-        torch.tensor([0.0, 0.0, 1.0]).expand(count, 3).contiguous(),
-        torch.zeros(count, dtype=torch.int32),
-        torch.full((count,), 0.5),
-    )
+    along, half = torch.tensor([0.0, 0.0, 1.0]), torch.full((count,), 0.5)
+    slots = torch.zeros(count, dtype=torch.int32)
+    rays = RayBatch(origins, along.expand(count, 3).contiguous(), slots, half)
     samples, _ = operations.march_resumable(
         rays, correspondence_tables(cells), grid, MarchSettings(0.01, math.inf, 400)
     )

@@ -69,19 +69,6 @@ def test_points_come_back_from_a_bent_pose(rig, rng, bent_pose):
     assert np.mean(error > 1e-2) < 2e-3
 
 
-def test_roots_at_cell_centers_agree_with_broyden_per_sample(rig, bent_pose):
-    cells = CorrespondenceGrid.solve(rig, bent_pose)
-    place = np.argwhere((cells.packed_cells & 3) == 1)[::37]
-    centers = torch.from_numpy((cells.low + (place + 0.5) * cells.cell_m).astype(np.float32))
-    roots = torch.from_numpy(cells.roots[cells.packed_cells[tuple(place.T)] >> 3])
-    found, rested = torch_correspondence.broyden_roots(
-        centers, roots[:, :3] + 0.004, *skinning(rig, bent_pose)
-    )
-    assert rested.float().mean() > 0.95
-    off = (found - roots[:, :3]).norm(dim=1)[rested]
-    assert float(off.quantile(0.95)) < 1e-3
-
-
 def test_the_inverse_jacobian_undoes_a_small_step(rig, bent_pose, rng):
     cells = CorrespondenceGrid.solve(rig, bent_pose)
     roots = solved_roots(cells)[::29]
@@ -102,22 +89,11 @@ def test_no_cell_is_far_from_the_body(rig, bent_pose):
 
 def test_wild_poses_are_solved_without_harm(rig, rng):
     """Far from anything a body does: roots may be lost, but all that is kept is finite."""
-    for _ in range(20):
+    for _ in range(8):
         cells = CorrespondenceGrid.solve(rig, rng.normal(size=(23, 3)) * 2.0)
         assert np.isfinite(cells.roots[1:]).all()
         place = (solved_roots(cells)[:, :3] - rig.box_low) / (rig.box_high - rig.box_low)
         assert ((place >= 0.0) & (place <= 1.0)).all()
-
-
-def test_only_nodes_near_the_skin_are_blended(rig):
-    near = rig.skinning_nodes_within(0.11)
-    assert len(near.node_indices) < 0.4 * rig.weights[..., 0].size
-    weights = np.zeros((len(near.node_indices), 24), dtype=np.float32)
-    weights[np.repeat(np.arange(len(near.node_indices)), np.diff(near.offsets)), near.joints] = (
-        near.weights
-    )
-    np.testing.assert_array_equal(weights, rig.weights.reshape(-1, 24)[near.node_indices])
-    assert len(rig.skinning_nodes_within(0.2).node_indices) > len(near.node_indices)
 
 
 def test_nothing_is_read_from_a_node_that_is_not_blended(rig, bent_pose, monkeypatch):
@@ -165,10 +141,7 @@ def test_the_compiled_build_agrees_with_its_meaning(rig, rng, bent_pose):
 
 
 def test_a_pose_is_solved_the_same_way_every_time(rig, bent_pose):
-    first, second = (
-        CorrespondenceGrid.solve(rig, bent_pose),
-        CorrespondenceGrid.solve(rig, bent_pose),
-    )
+    first, second = (CorrespondenceGrid.solve(rig, bent_pose) for _ in range(2))
     np.testing.assert_array_equal(first.packed_cells, second.packed_cells)
     np.testing.assert_array_equal(first.roots, second.roots)
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.ndimage import binary_fill_holes
 from scipy.spatial import KDTree
-from scipy.spatial.transform import Rotation
 
 from avatar.rig import (
     DISTANCE_CELL_M,
@@ -75,17 +74,6 @@ def test_skin_that_follows_one_bone_lands_where_the_body_has_it(rig, shaped, ski
     np.testing.assert_allclose(carried(bones, skin[stiff]), expected, atol=1e-7)
 
 
-def test_the_root_turns_about_the_pelvis(rig, rng):
-    turn, shift = rng.normal(size=(2, 3))
-    pose = BodyPose(root_rotation=turn, root_translation=shift, joint_rotations=np.zeros((23, 3)))
-    world_from_body = rig.world_from_body(pose)
-    pelvis = rig.rest_joints[0]
-    landed = world_from_body[:3, :3] @ pelvis + world_from_body[:3, 3]
-    np.testing.assert_allclose(landed, pelvis + shift, atol=1e-12)
-    expected = Rotation.from_rotvec(turn).as_matrix()
-    np.testing.assert_allclose(world_from_body[:3, :3], expected, atol=1e-12)
-
-
 def test_the_box_is_the_canonical_body_and_its_margin(rig, skin):
     np.testing.assert_allclose(rig.box_low, skin.min(axis=0) - 0.17, atol=1e-6)
     np.testing.assert_allclose(rig.box_high, skin.max(axis=0) + 0.17, atol=1e-6)
@@ -132,7 +120,7 @@ def test_far_from_creases_the_weights_are_those_of_the_nearest_vertex(rig, shape
 
 def test_the_distance_is_that_to_the_nearest_vertex(rig, skin, rng):
     shape = np.array(rig.skin_distance.shape)
-    cell = (rng.random((500, 3)) * shape).astype(int)
+    cell = (rng.random((150, 3)) * shape).astype(int)
     centers = rig.box_low + (cell + 0.5) / shape * (rig.box_high - rig.box_low)
     expected = np.sqrt(((centers[:, None] - skin[None]) ** 2).sum(axis=-1)).min(axis=1)
     found = rig.skin_distance[tuple(cell.T)]
@@ -195,7 +183,7 @@ def winding_number(points, vertices, faces) -> np.ndarray:
 def test_what_is_inside_is_where_the_skin_winds_about_it(rig, skin, shaped, rng):
     shape = np.array(rig.skin_distance.shape)
     off_skin = np.argwhere((rig.skin_distance > 0.015) & (rig.skin_distance < 0.1))
-    cell = off_skin[rng.integers(len(off_skin), size=200)]
+    cell = off_skin[rng.integers(len(off_skin), size=60)]
     centers = rig.box_low + (cell + 0.5) / shape * (rig.box_high - rig.box_low)
     inside = winding_number(centers, skin, shaped.body.faces) > 0.5
     assert 0.05 < inside.mean() < 0.5

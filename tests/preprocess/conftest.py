@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from capture.camera import Camera
 from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import PARENTS
-from preprocess.body.parametric_body import ShapedBody, load_body_model
+from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.fitting.keypoint_rows import KEYPOINT_JOINTS, KeypointModel
 from preprocess.tracking.keypoints import KeypointTrack
@@ -71,6 +71,22 @@ def joints_of(shaped) -> Callable[..., np.ndarray]:
     return joints_of
 
 
+@pytest.fixture(scope="session", autouse=True)
+def one_proportion_space_per_body():
+    """The same space for equal bodies, which takes a quarter of a second."""
+    make_space, spaces = ProportionSpace.around, {}
+
+    def space_around(shaped: ShapedBody) -> ProportionSpace:
+        key = tuple(a.tobytes() for a in (shaped.vertices, shaped.joints, shaped.body.weights))
+        if key not in spaces:
+            spaces[key] = make_space(shaped)
+        return spaces[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ProportionSpace, "around", space_around)
+        yield
+
+
 @pytest.fixture
 def joblib_bytes(monkeypatch) -> Callable[..., bytes]:
     """What joblib 1.x writes: arrays lie between the opcodes, aligned to 16 bytes."""
@@ -118,24 +134,16 @@ def joblib_bytes(monkeypatch) -> Callable[..., bytes]:
     return dump
 
 
-@pytest.fixture
-def mean_body() -> ShapedBody:
-    """The embedded body's mean shape."""
-    return load_body_model().with_shape()
-
-
-@pytest.fixture
+@pytest.fixture(scope="session")
 def keypoint_camera() -> Camera:
     """A phone's camera at the origin."""
     return Camera(
-        focal_px=(204.0, 204.0),
-        center_px=(67.5, 120.0),
-        size_px=(135, 240),
+        focal_px=(204.0, 204.0), center_px=(67.5, 120.0), size_px=(135, 240),
         camera_from_world=np.eye(4),
-    )
+    )  # fmt: skip
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def turning_person() -> Callable[[int], Motion]:
     """Makes a person who turns round before the camera, with bent arms and knees; 10° a frame."""
 
@@ -152,18 +160,15 @@ def turning_person() -> Callable[[int], Motion]:
     return turning_person
 
 
-@pytest.fixture
-def track_motion(mean_body, keypoint_camera) -> Callable[[Motion], KeypointTrack]:
+@pytest.fixture(scope="session")
+def track_motion(shaped, keypoint_camera) -> Callable[[Motion], KeypointTrack]:
     """Makes the key points that a perfect tracker would find of a motion."""
 
     def track_motion(motion: Motion) -> KeypointTrack:
-        points = []
+        points, offsets_m = [], KeypointModel(ProportionSpace.around(shaped)).offsets_m
+        rest = shaped.joints[KEYPOINT_JOINTS] + offsets_m
         for row in range(len(motion)):
-            carried = mean_body.with_pose(motion[row]).world_from_rest()[KEYPOINT_JOINTS]
-            rest = (
-                mean_body.joints[KEYPOINT_JOINTS]
-                + KeypointModel(ProportionSpace.around(mean_body)).offsets_m
-            )
+            carried = shaped.with_pose(motion[row]).world_from_rest()[KEYPOINT_JOINTS]
             points.append(np.einsum("pab,pb->pa", carried[:, :3, :3], rest) + carried[:, :3, 3])
         world = np.stack(points)
         pixels = keypoint_camera.project(world.reshape(-1, 3)).reshape(-1, 33, 2)

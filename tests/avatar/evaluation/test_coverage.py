@@ -10,7 +10,6 @@ from avatar.evaluation.coverage import (
     VisibilityStage,
     pose_patches,
 )
-from preprocess.body.body_surface import visible_points
 
 L_SHOULDER, R_SHOULDER = 15, 16
 
@@ -122,21 +121,6 @@ def test_what_the_mask_leaves_out_is_not_seen(observed, coverage):
         VisibilityStage.SELF_OCCLUDED,
         VisibilityStage.OUTSIDE_MASK,
     }
-
-
-def test_a_near_plane_hides_a_far_one_and_never_itself():
-    x, y = np.meshgrid(np.linspace(0.0, 1.0, 60), np.linspace(0.0, 1.0, 60))
-    flat = np.stack([x.ravel(), y.ravel()], axis=1)
-    for degrees in (0.0, 40.0, 70.0):
-        cosine = np.cos(np.radians(degrees))
-        depth = 3.0 + flat[:, 0] * np.tan(np.radians(degrees))
-        plane = np.concatenate([flat, flat])
-        depths = np.concatenate([depth, depth + 0.5])
-        free = visible_points(
-            plane, depths, np.full(len(plane), cosine), cell_m=0.03, tolerance_m=0.03
-        )
-        assert free[: len(flat)].all()
-        assert not free[len(flat) :].any()
 
 
 def test_what_was_seen_survives_a_checkpoint(shaped, observed, coverage):

@@ -40,14 +40,10 @@ def coverage(shaped) -> Coverage:
     return Coverage(shaped)
 
 
-def test_a_person_facing_the_camera_is_advised_to_turn(observed, coverage):
-    coverage.add(observed())
-    assert coverage_advice(coverage) == "Turn until your back has been seen."
-
-
 @pytest.mark.parametrize(
     ("turned", "sentence"),
     [
+        (0.0, "Turn until your back has been seen."),
         (np.pi, "Face the camera: your front was never seen."),
         (-np.pi / 2, "Turn until your right side has been seen."),
         (np.pi / 2, "Turn until your left side has been seen."),
@@ -75,15 +71,12 @@ def test_feet_below_the_picture_ask_for_a_step_back(observed, coverage):
     [
         (arm("left"), "under", "Raise your left arm: the underside was never seen."),
         (arm("right"), "back", "Turn until the back of your right arm has been seen."),
-        (
-            ("left thigh", "left shin"),
-            "right",
-            "Stand with your legs apart: the inner side was never seen.",
-        ),
+        (("left thigh", "left shin"), "right",
+         "Stand with your legs apart: the inner side was never seen."),
         (("head",), "back", "Turn until the back of your head has been seen."),
         (("head",), "front", "Look at the camera: your face was never seen."),
     ],
-)
+)  # fmt: skip
 def test_a_piece_on_one_limb_is_named_by_limb_and_side(coverage, parts, side, sentence):
     assert coverage_advice(without(coverage, here(coverage, *parts, side=side))) == sentence
 

@@ -18,7 +18,13 @@ from avatar.evaluation.held_out import (
     subsample_evenly,
 )
 from avatar.evaluation.image_metrics import composite_on_white, ground_truth_on_white, psnr, ssim
-from avatar.training.frame_stream import TrainingFrame, is_held_out, prepare_stream
+from avatar.training.frame_stream import (
+    TrainingFrame,
+    is_held_out,
+    prepare_items,
+    prepare_stream,
+    separate_held_out,
+)
 from avatar.training.trainer import Trainer
 from capture.camera import Camera
 from capture.source import Frame
@@ -40,34 +46,22 @@ def held(rig, clip) -> HeldOutFrame:
 
 @given(st.integers(20, 500))
 def test_every_tenth_frame_is_held_out_from_the_ninth_on(total):
+    """Also of a stream of unknown length; with a stride of zero none is."""
     assert held_of(total) == list(range(9, total, 10))
-
-
-@given(st.integers(2, 19))
-def test_of_a_short_clip_it_is_the_last_quarter_and_at_least_one(total):
-    assert held_of(total) == list(range(total - max(1, total // 4), total))
-
-
-def test_a_single_frame_is_trained_on():
-    assert held_of(1) == held_of(0) == []
-
-
-@given(st.integers(0, 10_000))
-def test_a_stream_of_unknown_length_is_held_out_like_a_long_one(position):
-    assert is_held_out(position, stride=10, total=None) == (position % 10 == 9)
-
-
-@given(st.integers(1, 500))
-def test_a_stride_of_zero_holds_nothing_out(total):
+    unknown = [p for p in range(total) if is_held_out(p, stride=10, total=None)]
+    assert unknown == held_of(total)
     assert held_of(total, every=0) == []
 
 
+@pytest.mark.parametrize("total", range(20))
+def test_of_a_short_clip_it_is_the_last_quarter_and_at_least_one_but_of_a_single_frame(total):
+    quarter = max(1, total // 4) if total > 1 else 0
+    assert held_of(total) == list(range(total - quarter, total))
+
+
 def test_frames_are_prepared_in_order_and_those_left_out_pass_through(rig, clip):
-    items = [
-        *clip.observations[:5],
-        DroppedFrame(index=5, reason="empty mask"),
-        clip.observations[6],
-    ]
+    dropped = DroppedFrame(index=5, reason="empty mask")
+    items = [*clip.observations[:5], dropped, clip.observations[6]]
     ready = list(prepare_stream(iter(items), rig, stride=3, total=None))
     assert [type(item) for item in ready] == [
         TrainingFrame, TrainingFrame, HeldOutFrame, TrainingFrame, TrainingFrame, DroppedFrame,
@@ -77,6 +71,14 @@ def test_frames_are_prepared_in_order_and_those_left_out_pass_through(rig, clip)
     assert ready[2].observation.frame is items[2].frame
     indices = [item.index for item in ready if isinstance(item, TrainingFrame)]
     assert indices == [0, 1, 3, 4, 6]
+
+
+def test_an_item_that_is_dropped_in_between_moves_no_held_out_frame(rig, clip):
+    split = separate_held_out(clip.observations[:6], stride=3, total=None)
+    items = list(prepare_items((item for k, item in enumerate(split) if k != 1), rig))
+    held = [item.observation.frame.index for item in items if isinstance(item, HeldOutFrame)]
+    assert held == [2, 5]
+    assert [item.index for item in items if isinstance(item, TrainingFrame)] == [0, 3, 4]
 
 
 def observed(rgb, alpha) -> Observation:

@@ -18,14 +18,9 @@ from avatar.training.trainer import Trainer
 from capture.input_error import InputError
 
 CONFIG = TrainConfig(
-    rays=128,
-    sample_step_m=0.03,
-    finest_m=0.05,
-    levels=3,
-    table_size=1 << 12,
-    empty_space_points=32,
-    seed=7,
-)
+    rays=128, sample_step_m=0.03, finest_m=0.05, levels=3, table_size=1 << 12,
+    empty_space_points=32, seed=7,
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")

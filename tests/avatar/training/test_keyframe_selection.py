@@ -52,10 +52,8 @@ def test_distance_is_the_angle_of_the_view_and_a_share_of_the_joints():
 
 @pytest.mark.parametrize("what", ["angle", "bend"])
 def test_of_a_slow_motion_the_frames_are_taken_that_are_far_enough_apart(rig, clip, what):
-    distinct, step = (
-        KeyframeSelector(rig),
-        0.3 * MIN_KEYFRAME_DISTANCE / (1.0 if what == "angle" else JOINT_ANGLE_WEIGHT),
-    )
+    distinct, weight = KeyframeSelector(rig), 1.0 if what == "angle" else JOINT_ANGLE_WEIGHT
+    step = 0.3 * MIN_KEYFRAME_DISTANCE / weight
     stream = [turned(clip.observations[0], i, **{what: i * step}) for i in range(13)]
     taken = [i for i, observation in enumerate(stream) if distinct.accepts(observation)]
     assert taken == [0, 4, 8, 12]
@@ -80,13 +78,7 @@ def test_who_stands_still_is_looked_at_now_and_then(rig, clip):
 
 
 def test_frames_that_are_passed_over_go_by_in_their_order(rig, clip):
-    angles = [
-        0.0,
-        0.2 * MIN_KEYFRAME_DISTANCE,
-        0.4 * MIN_KEYFRAME_DISTANCE,
-        2.0 * MIN_KEYFRAME_DISTANCE,
-        2.1 * MIN_KEYFRAME_DISTANCE,
-    ]
+    angles = MIN_KEYFRAME_DISTANCE * np.array([0.0, 0.2, 0.4, 2.0, 2.1])
     stream = [turned(clip.observations[0], i, angle=a) for i, a in enumerate(angles)]
     kinds = [type(item) for item in prepare_stream(iter(stream), rig, stride=3, total=None)]
     assert kinds == [TrainingFrame, RedundantFrame, HeldOutFrame, TrainingFrame, RedundantFrame]

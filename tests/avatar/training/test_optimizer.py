@@ -91,23 +91,6 @@ print("torch._dynamo" in sys.modules)
 """
 
 
-def test_its_steps_are_those_of_torch():
-    generator = torch.Generator().manual_seed(0)
-    start = torch.randn(50, 4, generator=generator)
-    ours, theirs = (torch.nn.Parameter(start.clone()) for _ in range(2))
-    pair = [
-        (numbers, kind([{"params": [numbers], "lr": 0.01}], betas=(0.9, 0.99), fused=True))
-        for numbers, kind in ((ours, UncompiledAdam), (theirs, torch.optim.Adam))
-    ]
-    for _ in range(5):
-        grad = torch.randn(50, 4, generator=generator)
-        for numbers, adam in pair:
-            numbers.grad = grad.clone()
-            adam.step()
-    assert torch.equal(ours, theirs)
-    assert not torch.equal(ours, start)
-
-
 def test_compiled_steps_are_those_of_torch_and_spend_the_gradient():
     """Rates and eps of two groups, blocks that are not full, entries without a gradient so far."""
     generator = torch.Generator().manual_seed(0)

@@ -54,10 +54,6 @@ def table(rig, bent_pose) -> PoseOptimizer:
     return table
 
 
-def copied(cells: CorrespondenceTables) -> CorrespondenceTables:
-    return cells._replace(roots=cells.roots.clone())
-
-
 def samples_near_the_skin(rig, count, generator):
     """Canonical samples of one ray of slot 1, each warped with a root of its own."""
     chosen = torch.randint(len(rig.seeds), (count,), generator=generator)
@@ -122,18 +118,6 @@ def test_compiled_wrenches_agree_with_their_meaning(rig, table, generator):
     results = wrenches_of(*operands), torch_correspondence.bone_wrenches(*operands)
     assert float(results[0][1].abs().max()) == 0.0
     torch.testing.assert_close(*results, atol=2e-2, rtol=1e-3)
-
-
-def test_compiled_following_agrees_with_its_meaning(rig, table, bent_pose):
-    cells = correspondence_tables(CorrespondenceGrid.solve(rig, bent_pose))
-    moved = rig.body_from_canonical(bent_pose + 0.03)[:, :3].reshape(24, 12)
-    bones = torch.from_numpy(moved.astype(np.float32))
-    ours, theirs = copied(cells), copied(cells)
-    operations.update_roots(ours, [0], table.skinning, bones[None])
-    torch_correspondence.update_roots(theirs, 0, table.skinning, bones)
-    off = (ours.roots - theirs.roots)[0, 1:].abs().amax(dim=1)
-    assert float((off < 1e-2).float().mean()) > 0.99
-    assert not torch.equal(ours.roots, cells.roots)
 
 
 def test_cells_that_follow_a_pose_are_those_that_would_have_been_solved(rig, table, bent_pose):
@@ -323,7 +307,7 @@ def test_fine_levels_pull_held_out_poses_in_the_second_half_alone(learnt, clip, 
 
 
 def test_no_frame_scores_worse_in_a_fitted_pose(learnt, clip):
-    held = [HeldOutFrame(observation=observation) for observation in clip.observations[9:12]]
+    held = [HeldOutFrame(observation=observation) for observation in clip.observations[10:12]]
     given, fitted = (
         [score_frame(learnt.trainer.avatar, frame).psnr for frame in frames]
         for frames in (held, fit_test_poses(learnt.trainer, held))

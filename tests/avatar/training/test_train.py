@@ -12,7 +12,6 @@ import torch
 
 from avatar import avatar_model
 from avatar.config import NOMINAL_STEPS_PER_S, TrainConfig
-from avatar.evaluation.held_out import HeldOutFrame
 from avatar.events import (
     Evaluated,
     Finished,
@@ -28,7 +27,7 @@ from avatar.kernels.numba_rendering import march
 from avatar.kernels.numba_shading import add_light
 from avatar.training import pose_optimizer
 from avatar.training import train as train_module
-from avatar.training.frame_stream import prepare_frame, prepare_stream
+from avatar.training.frame_stream import TrainingFrame, prepare_stream
 from avatar.training.train import train
 from avatar.training.trainer import Trainer
 from capture.inbox import Inbox
@@ -40,7 +39,7 @@ QUICK = TrainConfig(
 )  # fmt: skip
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def ready(rig, clip):
     """Prepared frames 0 … 7, where 2 and 5 are held out and 4 is left out."""
     observations = [*clip.observations[:4], DroppedFrame(index=4, reason="empty mask")]
@@ -54,6 +53,23 @@ def taught(rig, ready, config):
     return trainer, held, list(train(trainer, Inbox(ready), held))
 
 
+@pytest.fixture(scope="module")
+def frames(ready):
+    """Those of them that are trained on."""
+    return [item for item in ready if isinstance(item, TrainingFrame)]
+
+
+@pytest.fixture(scope="module")
+def short(rig, ready):
+    """Training of 25 steps: trainer, held-out frames, events, and the rate at each step."""
+    trainer, held, events, rates = Trainer(rig, dataclasses.replace(QUICK, steps=25)), [], [], []
+    for event in train(trainer, Inbox(ready), held):
+        events.append(event)
+        if isinstance(event, Stepped):
+            rates.append(trainer.optimizer.param_groups[0]["lr"])
+    return trainer, held, events, rates
+
+
 @pytest.fixture
 def ticking(monkeypatch):
     """A clock that goes on by 5 ms each time it is read: time that no other program can take."""
@@ -64,15 +80,12 @@ def ticking(monkeypatch):
 # --- what it reaches --------------------------------------------------------------------------
 
 
-def test_frames_it_has_never_seen_are_rendered_well(learnt):
+def test_frames_and_a_pose_it_has_never_seen_are_rendered_well(learnt):
     last = [score.psnr for score in learnt.marks[-1][:-1]]
     assert np.mean(last) > 32.0
     assert min(last) > 31.0
     assert np.mean([score.ssim for score in learnt.marks[-1][:-1]]) > 0.98
-
-
-def test_a_pose_that_was_never_filmed_is_rendered_well(learnt):
-    assert learnt.marks[-1][-1].psnr > 28.0
+    assert learnt.marks[-1][-1].psnr > 28.0  # the pose
 
 
 def test_no_frame_ever_falls_back(learnt):
@@ -87,43 +100,11 @@ def test_rays_need_few_samples(learnt):
     assert learnt.trainer.samples / learnt.trainer.rays < 12.0
 
 
-# --- that it can be repeated ------------------------------------------------------------------
-
-
-def after_three_steps(rig, ready, config):
-    trainer = Trainer(rig, config)
-    for item in ready:
-        if not isinstance(item, HeldOutFrame | DroppedFrame):
-            trainer.add_frame(item)
-    losses = [trainer.step(rate=1.0, hard_surface_share=0.5).loss for _ in range(3)]
-    grid = trainer.avatar.occupancy.density_grid
-    return [*losses, *trainer.avatar.field.parameters(), grid.density, grid.occupied]
-
-
-@pytest.fixture
-def one_thread():
-    threads = numba.get_num_threads(), torch.get_num_threads()
-    numba.set_num_threads(1)
-    torch.set_num_threads(1)
-    yield
-    numba.set_num_threads(threads[0])
-    torch.set_num_threads(threads[1])
-
-
-@pytest.mark.usefixtures("one_thread")
-def test_one_seed_and_one_thread_give_one_avatar(rig, ready):
-    first, again = (after_three_steps(rig, ready, QUICK) for _ in range(2))
-    other = after_three_steps(rig, ready, dataclasses.replace(QUICK, seed=1))
-    for a, b in zip(first, again, strict=True):
-        assert torch.equal(a, b)
-    assert not torch.equal(first[0], other[0])
-
-
 # --- what the generator does and says ---------------------------------------------------------
 
 
-def test_every_usable_frame_is_taken_in_and_the_others_are_kept_out(rig, ready):
-    trainer, held, events = taught(rig, ready, dataclasses.replace(QUICK, steps=60))
+def test_every_usable_frame_is_taken_in_and_the_others_are_kept_out(short):
+    trainer, held, events, _ = short
     assert trainer.frames_seen == 5
     assert trainer.replay.frame_indices == [0, 1, 3, 6, 7]
     assert [frame.observation.frame.index for frame in held] == [2, 5]
@@ -135,8 +116,8 @@ def test_every_usable_frame_is_taken_in_and_the_others_are_kept_out(rig, ready):
     assert left_out == [FrameLeftOut(index=4, reason="empty mask")]
 
 
-def test_events_come_in_order_and_end_with_the_last_step(rig, ready):
-    trainer, _, events = taught(rig, ready, dataclasses.replace(QUICK, steps=25))
+def test_events_come_in_order_and_end_with_the_last_step(short):
+    trainer, _, events, _ = short
     steps = [event for event in events if isinstance(event, Stepped)]
     finished = events[-1]
     assert isinstance(finished, Finished)
@@ -163,10 +144,9 @@ def test_it_stops_when_the_time_is_up(rig, ready, ticking):
 
 
 def test_held_out_frames_that_have_arrived_are_scored_at_the_marks(rig, ready, monkeypatch):
-    monkeypatch.setattr(
-        train_module, "EVALUATION_TIMES_S", (1 / 50, 10 / 50, 60.0)
-    )  # after 1 and 10 steps
-    _, _, events = taught(rig, ready, dataclasses.replace(QUICK, steps=20))
+    marks_s = 1 / 50, 10 / 50, 60.0  # after 1 and 10 steps
+    monkeypatch.setattr(train_module, "EVALUATION_TIMES_S", marks_s)
+    _, _, events = taught(rig, ready, dataclasses.replace(QUICK, steps=12))
     marks = [event for event in events if isinstance(event, Evaluated)]
     assert [mark.frames_seen for mark in marks] == [2, 5]
     assert [[score.frame for score in mark.scores] for mark in marks] == [[], [2, 5]]
@@ -184,8 +164,7 @@ def test_scoring_at_a_mark_stops_when_its_time_is_spent(rig, ready, monkeypatch,
     assert len(mark.scores) == 1
 
 
-def test_the_rate_is_constant_until_the_last_frame_and_falls_after(rig, clip, ticking):
-    frames = [prepare_frame(observation, rig) for observation in clip.observations[:3]]
+def test_the_rate_is_constant_until_the_last_frame_and_falls_after(rig, frames, ticking):
     gate = threading.Event()
 
     def arriving():
@@ -193,7 +172,7 @@ def test_the_rate_is_constant_until_the_last_frame_and_falls_after(rig, clip, ti
         gate.wait(10.0)
         yield frames[2]
 
-    config = dataclasses.replace(QUICK, seconds=1.2)
+    config = dataclasses.replace(QUICK, seconds=0.8)
     trainer, rates = Trainer(rig, config), {1: [], 2: [], 3: []}
     for event in train(trainer, Inbox(arriving()), []):
         if isinstance(event, Stepped):
@@ -238,20 +217,17 @@ def test_a_resumed_trainer_goes_on_counting(rig, ready):
 # --- frames that come at times of their own ----------------------------------------------------
 
 
-def arriving_at(rig, clip, *, gate):
-    """One frame at once, and two more when the gate opens."""
-    frames = [prepare_frame(observation, rig) for observation in clip.observations[:3]]
-    yield frames[0]
-    gate.wait(10.0)
-    yield from frames[1:]
-
-
-def rates_by_frames(rig, clip, *, paced, seconds, opens_after_s, all_came=False):
-    """The learning rates of the steps after each number of frames."""
+def rates_by_frames(rig, frames, *, seconds, opens_after_s, all_came=False):
+    """The learning rates of the steps after each number of frames: the second comes late."""
     gate = threading.Event()
+
+    def arriving():
+        yield frames[0]
+        gate.wait(10.0)
+        yield from frames[1:3]
+
     trainer = Trainer(rig, dataclasses.replace(QUICK, seconds=seconds))
-    frames = arriving_at(rig, clip, gate=gate)
-    inbox = Inbox(frames, paced=paced, all_came=lambda: all_came)
+    inbox = Inbox(arriving(), paced=True, all_came=lambda: all_came)
     rates = {1: [], 2: [], 3: []}
     for event in train(trainer, inbox, []):
         if isinstance(event, Stepped):
@@ -262,12 +238,12 @@ def rates_by_frames(rig, clip, *, paced, seconds, opens_after_s, all_came=False)
 
 
 def test_after_the_last_frame_of_a_film_that_comes_rates_fall_for_a_while(
-    rig, clip, ticking, monkeypatch
+    rig, frames, ticking, monkeypatch
 ):
     """Read as fast as possible, reading would come first after half of the time."""
     monkeypatch.setattr(train_module, "LEAST_STEPS", 60)
     monkeypatch.setattr(train_module, "CLOSING_S", 0.1)
-    rates, trainer = rates_by_frames(rig, clip, paced=True, seconds=0.4, opens_after_s=0.8)
+    rates, trainer = rates_by_frames(rig, frames, seconds=0.4, opens_after_s=0.8)
     assert set(rates[1] + rates[2]) == {train_module.STREAMING_RATE_FACTOR * QUICK.learning_rate}
     assert (np.diff(rates[3]) <= 0.0).all()
     assert rates[3][-1] < 0.1 * QUICK.learning_rate
@@ -277,13 +253,13 @@ def test_after_the_last_frame_of_a_film_that_comes_rates_fall_for_a_while(
 
 
 def test_rates_fall_from_the_end_of_the_film_on_while_its_frames_still_come(
-    rig, clip, ticking, monkeypatch
+    rig, frames, ticking, monkeypatch
 ):
     """The last frame comes late: it is learnt for a while, too."""
     monkeypatch.setattr(train_module, "LEAST_STEPS", 0)
     monkeypatch.setattr(train_module, "CLOSING_S", 0.1)
     monkeypatch.setattr(train_module, "LATE_FRAMES_S", 0.3)
-    rates, _ = rates_by_frames(rig, clip, paced=True, seconds=0.4, opens_after_s=0.8, all_came=True)
+    rates, _ = rates_by_frames(rig, frames, seconds=0.4, opens_after_s=0.8, all_came=True)
     before = np.array(rates[1] + rates[2])
     assert 0.0 < before[-1] < 0.9 * before[0]
     assert (np.diff(before) <= 0.0).all()
@@ -291,21 +267,24 @@ def test_rates_fall_from_the_end_of_the_film_on_while_its_frames_still_come(
     assert len(rates[3]) >= train_module.MIN_STEPS_AFTER_LAST_FRAME
 
 
-def test_seconds_left_after_the_last_frame_are_the_cosines(rig, clip, ticking):
-    rates, trainer = rates_by_frames(rig, clip, paced=True, seconds=1.5, opens_after_s=0.0)
+def test_seconds_left_after_the_last_frame_are_the_cosines(rig, frames, ticking, monkeypatch):
+    monkeypatch.setattr(train_module, "LEAST_STEPS", 0)
+    monkeypatch.setattr(train_module, "CLOSING_S", 0.1)
+    rates, trainer = rates_by_frames(rig, frames, seconds=1.0, opens_after_s=0.0)
     assert set(rates[1] + rates[2]) == {train_module.STREAMING_RATE_FACTOR * QUICK.learning_rate}
     falling = np.array(rates[3][1:])
     assert (np.diff(falling) <= 0.0).all()
     assert falling[-1] < 0.1 * QUICK.learning_rate
-    assert trainer.wall_seconds >= 1.5
+    assert trainer.wall_seconds >= 1.0
 
 
-def test_a_live_source_is_left_when_the_time_is_up(rig, clip, ticking):
-    frames = [prepare_frame(observation, rig) for observation in clip.observations[:2]]
+def test_a_live_source_is_left_when_the_time_is_up(rig, frames, ticking, monkeypatch):
+    monkeypatch.setattr(train_module, "LEAST_STEPS", 0)
+    monkeypatch.setattr(train_module, "CLOSING_S", 0.1)
     closed = threading.Event()
 
     def never_ending():
-        yield from frames
+        yield from frames[:2]
         closed.wait(30.0)
 
     trainer = Trainer(rig, dataclasses.replace(QUICK, seconds=0.4))
@@ -318,12 +297,14 @@ def test_a_live_source_is_left_when_the_time_is_up(rig, clip, ticking):
     assert trainer.steps >= train_module.MIN_STEPS_AFTER_LAST_FRAME
 
 
-def test_training_ends_with_the_last_image_of_a_folder_that_grows(rig, clip, ticking, monkeypatch):
+def test_training_ends_with_the_last_image_of_a_folder_that_grows(
+    rig, frames, ticking, monkeypatch
+):
     monkeypatch.setattr(train_module, "LEAST_STEPS", 0)
-    monkeypatch.setattr(train_module, "EVALUATION_TIMES_S", (0.5, 60.0))
-    frames = [prepare_frame(observation, rig) for observation in clip.observations[:2]]
+    monkeypatch.setattr(train_module, "CLOSING_S", 0.6)
+    monkeypatch.setattr(train_module, "EVALUATION_TIMES_S", (0.3, 60.0))
     trainer = Trainer(rig, dataclasses.replace(QUICK, seconds=3600.0))
-    inbox = Inbox(frames, paced=True, ends_run=True)
+    inbox = Inbox(frames[:2], paced=True, ends_run=True)
     inbox._thread.join()  # all frames are there before the mark
     events = list(train(trainer, inbox, []))
     assert not any(isinstance(event, Evaluated) for event in events)  # a user waits
@@ -335,7 +316,7 @@ def test_training_ends_with_the_last_image_of_a_folder_that_grows(rig, clip, tic
     assert before > 0
     assert after > 0
     assert isinstance(events[-1], Finished)
-    assert events[-1].wall_seconds > 0.5
+    assert events[-1].wall_seconds > 0.3
     assert trainer.steps >= train_module.MIN_STEPS_AFTER_LAST_FRAME
 
 
@@ -353,18 +334,27 @@ def test_while_nothing_has_come_the_listener_is_heard(rig):
     inbox.close()
 
 
-def test_corrections_of_frames_that_are_gone_are_forgotten(rig, clip):
+def test_corrections_of_frames_that_are_gone_are_forgotten(rig, frames):
     config = dataclasses.replace(QUICK, replay_capacity=3)
     trainer = Trainer(rig, config)
-    frame = prepare_frame(clip.observations[0], rig)
     for index in range(40):
-        trainer.add_frame(dataclasses.replace(frame, index=index))
+        trainer.add_frame(dataclasses.replace(frames[0], index=index))
         trainer.pose_corrections[index] = np.full((25, 3), float(index))
     assert len(trainer.pose_corrections) <= 2 * config.replay_capacity + 1
     assert set(trainer.replay.frame_indices) <= set(trainer.pose_corrections)
 
 
 # --- steps instead of seconds -----------------------------------------------------------------
+
+
+@pytest.fixture
+def one_thread():
+    threads = numba.get_num_threads(), torch.get_num_threads()
+    numba.set_num_threads(1)
+    torch.set_num_threads(1)
+    yield
+    numba.set_num_threads(threads[0])
+    torch.set_num_threads(threads[1])
 
 
 def taught_at_a_pace(rig, ready, config, *, pause_s):
@@ -378,16 +368,19 @@ def taught_at_a_pace(rig, ready, config, *, pause_s):
     trainer = Trainer(rig, config)
     events = train(trainer, Inbox(arriving()), [])
     frames_seen = [event.frames_seen for event in events if isinstance(event, Stepped)]
-    return frames_seen, trainer.avatar.field.parameters()
+    grid = trainer.avatar.occupancy.density_grid
+    return frames_seen, [*trainer.avatar.field.parameters(), grid.density, grid.occupied]
 
 
 @pytest.mark.usefixtures("one_thread")
-def test_counted_steps_give_one_avatar_however_fast_frames_come(rig, ready):
+def test_counted_steps_and_one_seed_give_one_avatar_however_fast_frames_come(rig, ready):
     config = dataclasses.replace(QUICK, steps=12)
+    other = taught_at_a_pace(rig, ready, dataclasses.replace(config, seed=1), pause_s=0.0)
     at_once, slowly = (taught_at_a_pace(rig, ready, config, pause_s=s) for s in (0.0, 0.03))
     assert at_once[0] == slowly[0] == [1, 2, 3, 4] + [5] * 8
     for a, b in zip(at_once[1], slowly[1], strict=True):
         assert torch.equal(a, b)
+    assert not torch.equal(at_once[1][0], other[1][0])
 
 
 def test_each_frame_is_learnt_from_even_if_there_are_fewer_steps(rig, ready):
@@ -396,13 +389,9 @@ def test_each_frame_is_learnt_from_even_if_there_are_fewer_steps(rig, ready):
     assert isinstance(events[-1], Finished)
 
 
-def test_the_rate_falls_with_the_steps_that_are_left(rig, ready):
-    config = dataclasses.replace(QUICK, steps=25)
+def test_the_rate_falls_with_the_steps_that_are_left(short):
+    config, rates = short[0].config, short[3]
     assert config.seconds == 25 / NOMINAL_STEPS_PER_S
-    trainer = Trainer(rig, config)
-    events = train(trainer, Inbox(ready), [])
-    group = trainer.optimizer.param_groups[0]
-    rates = [group["lr"] for event in events if isinstance(event, Stepped)]
     assert rates[:5] == [config.learning_rate] * 5
     assert (np.diff(rates[5:]) <= 0.0).all()
     assert rates[-1] < 0.1 * config.learning_rate

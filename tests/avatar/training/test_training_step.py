@@ -36,8 +36,9 @@ CONFIG = TrainConfig(
 )  # fmt: skip
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def trainer(rig, clip):
+    """After 40 steps; tests leave it as it is."""
     trainer = Trainer(rig, CONFIG)
     for observation in clip.observations[:4]:
         trainer.add_frame(prepare_frame(observation, rig))
@@ -179,8 +180,11 @@ def test_half_of_the_samples_give_nearly_the_steps_whole_gradient(trainer):
 
 def test_a_step_without_samples_learns_nothing_from_its_rays(trainer):
     """Rays that miss everything: no crash, and no gradient but those of the priors."""
-    trainer.avatar.occupancy.density_grid.occupied.zero_()
+    occupied = trainer.avatar.occupancy.density_grid.occupied
+    before = occupied.clone()
+    occupied.zero_()
     (_, first, *_), drawn = one_step(trainer)
+    occupied.copy_(before)
     samples, empty, pairs, _, close, _, batch = drawn
     assert isinstance(samples, RaySamples)
     assert len(samples.points) == 0

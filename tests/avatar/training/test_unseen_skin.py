@@ -23,11 +23,6 @@ from preprocess.body.kinematics import HEAD_JOINT
 LEFT_THIGH, LEFT_FOREARM, RIGHT_FOREARM = 1, 10, 11
 
 
-@pytest.fixture(scope="module")
-def generator_seed():
-    return 3
-
-
 @pytest.fixture
 def frame(observed, rig):
     """A frame of the body, turned by an angle about the vertical."""
@@ -116,12 +111,17 @@ def test_a_face_seen_from_one_side_lies_near_the_bodys(rig, frame, of_front):
     assert not len(of_front.face_cells(0.0).under)
 
 
-def test_the_back_is_drawn_to_the_front_and_the_front_to_nothing(rig, of_front):
+def test_the_back_is_drawn_to_what_of_the_front_was_seen_squarely_and_the_front_to_nothing(
+    rig, of_front
+):
+    """The outline, which lies nearest to the unseen side, is stained by the backdrop."""
     sources = of_front.sources
     back, front = facing(rig, TORSO, -1.0), facing(rig, TORSO, 1.0)
     assert sources.weight[back].mean() > 0.8
     assert sources.weight[front].mean() < 0.05
     assert (of_front.evidence.seen[sources.patch[back]] > 0.5).all()
+    drawn = back & (sources.weight > 0.5)
+    assert np.median(of_front.evidence.cosines[sources.patch[drawn]]) > 0.8
     apart = rig.seeds[back] - rig.seeds[sources.patch[back]]
     assert np.abs(apart[:, 1]).mean() < 0.03  # stripes go round
 
@@ -141,12 +141,6 @@ def test_the_nape_is_drawn_to_below_the_neckline(rig, of_front):
     assert np.abs(drop[hips]).max() < 0.001
 
 
-def test_the_back_is_drawn_to_what_was_seen_squarely(rig, of_front):
-    """The outline, which lies nearest to the unseen side, is stained by the backdrop."""
-    back = facing(rig, TORSO, -1.0) & (of_front.sources.weight > 0.5)
-    assert np.median(of_front.evidence.cosines[of_front.sources.patch[back]]) > 0.8
-
-
 def test_a_print_stays_in_front_and_a_stripe_goes_round(rig, frame):
     """A shirt with a print on its chest, and one with a stripe at the same height."""
     torso, height = rig.seed_parts == TORSO, rig.seeds[:, 1]
@@ -159,14 +153,8 @@ def test_a_print_stays_in_front_and_a_stripe_goes_round(rig, frame):
         unseen.evidence.color_sums[is_white, :3] = unseen.evidence.color_sums[is_white, 3:]
         assert (unseen.evidence.colors[is_white & chest] == 1.0).all()
         unseen.update()
-        patch, around, share = (
-            numbers[stripe & facing(rig, TORSO, -1.0)]
-            for numbers in (
-                unseen.sources.patch,
-                unseen.sources.around,
-                unseen.sources.around_share,
-            )
-        )
+        found, back = unseen.sources, stripe & facing(rig, TORSO, -1.0)
+        patch, around, share = (n[back] for n in (found.patch, found.around, found.around_share))
         white_backs.append((is_white[patch] * (1.0 - share) + is_white[around] * share).mean())
     assert white_backs[0] < 0.05
     assert white_backs[1] > 0.8
@@ -176,11 +164,11 @@ def test_the_back_of_a_head_is_drawn_to_hair_and_never_to_a_face(rig, of_front, 
     head = rig.seeds[rig.seed_parts == HEAD]
     low, top = head[:, 1].min(), head[:, 1].max()
     middle = 0.5 * (head[:, 2].min() + head[:, 2].max())
-    pairs = of_front.sample(40_000, generator).points.numpy()
+    pairs = of_front.sample(12_000, generator).points.numpy()
     points, sources = np.split(pairs, 2)
     heights = (points[:, 1] - low) / (top - low)
     behind = (heights > 0.5) & (heights < 1.0) & (points[:, 2] < middle - 0.03)
-    assert behind.sum() > 300
+    assert behind.sum() > 90
     of_face = (sources[:, 2] > middle) & (sources[:, 1] < low + 0.7 * (top - low))
     assert of_face[behind].mean() < 0.04
     assert (sources[behind, 1] > points[behind, 1]).mean() > 0.6  # it falls

@@ -20,7 +20,7 @@ class MasksOfFive(MaskSource):
         return np.full(size_px[::-1], float(index < 5), np.float32)
 
 
-def test_sampled_masks_are_of_frames_with_key_points(mean_body):
+def test_sampled_masks_are_of_frames_with_key_points(shaped):
     source = FrameSource(Path("film.mp4"), FrameSelection())
     source.size_px, source.frame_count = (40, 60), 600  # as its header claims
     camera = Camera(
@@ -32,7 +32,7 @@ def test_sampled_masks_are_of_frames_with_key_points(mean_body):
         visibility=np.ones((5, 33)), presence=np.ones(5), size_px=(40, 60),
     )  # fmt: skip
     sampled = sample_masks(
-        source, MasksOfFive(), CameraTrack(cameras=(camera,), source=""), SkinPoints.of(mean_body),
+        source, MasksOfFive(), CameraTrack(cameras=(camera,), source=""), SkinPoints.of(shaped),
         count=60, track=track,
     )  # fmt: skip
     assert [each.index for each in sampled.samples] == [0, 1, 2, 3, 4]

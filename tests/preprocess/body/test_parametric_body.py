@@ -266,8 +266,8 @@ THICKER = 1.5
 
 
 @pytest.fixture
-def space(mean_body):
-    return ProportionSpace.around(mean_body)
+def space(shaped):
+    return ProportionSpace.around(shaped)
 
 
 def moved_by(space, group):

@@ -136,11 +136,11 @@ def test_the_jacobian_of_the_proportions_is_that_of_projected_skin(model):
 
 
 @pytest.fixture
-def problem(turning_person, mean_body, keypoint_camera, track_motion):
+def problem(turning_person, shaped, keypoint_camera, track_motion):
     """A function of step, proportions and focal length: the residuals, whose weights stay."""
-    motion, space = turning_person(3), ProportionSpace.around(mean_body)
+    motion, space = turning_person(3), ProportionSpace.around(shaped)
     cameras = [keypoint_camera] * 3
-    found = ClipKeypoints.of(track_motion(motion), [0, 1, 2], cameras, mean_body.joints)
+    found = ClipKeypoints.of(track_motion(motion), [0, 1, 2], cameras, shaped.joints)
     model, start = KeypointModel(space), ClipPoses.of(motion, [0, 1, 2])
     seen = ClipCameras.of(cameras)
 
@@ -179,13 +179,13 @@ def test_the_jacobians_of_proportions_and_focal_length(problem):
 
 
 def test_what_is_hidden_or_lost_does_not_count(
-    turning_person, mean_body, keypoint_camera, track_motion
+    turning_person, shaped, keypoint_camera, track_motion
 ):
     track = track_motion(turning_person(3))
     track = replace(track, presence=np.array([1.0, 0.2, 1.0]))
     track.visibility[2, 15] = 0.1
     cameras = [keypoint_camera] * 4
-    found = ClipKeypoints.of(track, [0, 1, 2, 7], cameras, mean_body.joints)
+    found = ClipKeypoints.of(track, [0, 1, 2, 7], cameras, shaped.joints)
     assert found.confidence[0].min() == 1.0
     assert found.confidence[[1, 3]].max() == 0.0
     assert found.confidence[2, 15] == pytest.approx(0.1)

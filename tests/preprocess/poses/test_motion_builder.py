@@ -59,10 +59,10 @@ def test_poses_of_a_camera_that_moves_land_in_its_world(truth, shaped, joints_of
     tracked = replace(truth, space="camera")
     there = place_in_camera_world(tracked, shaped, track_of(*cameras), cameras_given=True)
     assert there.space == "world"
-    for row, (seen, joints) in enumerate(zip(cameras, joints_of(there), strict=True)):
+    for seen, joints, true in zip(cameras, joints_of(there), joints_of(truth), strict=True):
         transform = seen.camera_from_world
         back = joints @ transform[:3, :3].T + transform[:3, 3]
-        np.testing.assert_allclose(back, joints_of(truth)[row], atol=1e-9)
+        np.testing.assert_allclose(back, true, atol=1e-9)
 
 
 def test_rows_find_their_camera_by_frame_number(truth, shaped, rng):
@@ -109,20 +109,14 @@ def test_a_virtual_focal_length_is_solved_for_the_true_one(truth, shaped, joints
 
 
 def test_without_a_camera_a_plausible_lens_counts_and_another_does_not(truth):
-    assert (
-        assume_static_camera(replace(truth, assumed_focal=RelativeFocalLength(ratio=1.2)), SIZE)
-        .cameras[0]
-        .focal_px[0]
-        == 1536
-    )
-    diagonal = assume_static_camera(
-        replace(truth, assumed_focal=RelativeFocalLength(ratio=1.0, reference="diagonal")),
-        (300, 400),
-    )
+    def assumed(size=SIZE, **lens):
+        told = replace(truth, assumed_focal=RelativeFocalLength(**lens))
+        return assume_static_camera(told, size)
+
+    assert assumed(ratio=1.2).cameras[0].focal_px[0] == 1536
+    diagonal = assumed((300, 400), ratio=1.0, reference="diagonal")
     assert diagonal.cameras[0].focal_px == (500.0, 500.0)
-    phone = assume_static_camera(
-        replace(truth, assumed_focal=RelativeFocalLength(ratio=5000.0 / 256.0)), SIZE
-    )
+    phone = assumed(ratio=5000.0 / 256.0)
     assert phone.cameras[0].focal_px[0] == pytest.approx(0.85 * 1280)
     assert "19.5" in phone.note
 
@@ -131,7 +125,5 @@ def test_a_matrix_of_smaller_pictures_is_scaled(truth):
     small = replace(truth, intrinsic=np.array([[450.0, 0, 180], [0, 450, 320], [0, 0, 1]]))
     assert assume_static_camera(small, SIZE).cameras[0].focal_px == (900.0, 900.0)
     near = np.array([[900.0, 0, 350], [0, 900, 650], [0, 0, 1]])
-    assert assume_static_camera(replace(truth, intrinsic=near), SIZE).cameras[0].center_px == (
-        350,
-        650,
-    )
+    found = assume_static_camera(replace(truth, intrinsic=near), SIZE)
+    assert found.cameras[0].center_px == (350, 650)

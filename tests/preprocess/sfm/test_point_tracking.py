@@ -97,12 +97,13 @@ def test_a_camera_that_walks_or_trembles_is_no_tripod(room, walked):
         assert not measure_background_motion(shown(room, cameras)) <= MAX_STATIC_MOTION
 
 
-@pytest.fixture
-def film(room, walked, tmp_path):
+@pytest.fixture(scope="module")
+def film(room, walked, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("film")
     cameras = walked(31, degrees=30, size_px=(320, 240), focal_px=260.0)
     for index, camera in enumerate(cameras):
-        cv2.imwrite(str(tmp_path / f"{index:04d}.png"), room.seen(camera)[..., ::-1])
-    return cameras, open_source(tmp_path)
+        cv2.imwrite(str(folder / f"{index:04d}.png"), room.seen(camera)[..., ::-1])
+    return cameras, open_source(folder)
 
 
 def keyed(film, cameras, room_points, exact_model, rows):

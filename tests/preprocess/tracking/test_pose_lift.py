@@ -115,9 +115,9 @@ def relative_joints(shaped, motion):
     return joints - joints[:, :1]
 
 
-def test_bent_limbs_and_the_roots_turn_come_back(walker, mean_body, keypoint_camera, track_motion):
-    lifted = lift_keypoints(track_motion(walker), mean_body, keypoint_camera)
-    off = relative_joints(mean_body, lifted) - relative_joints(mean_body, walker)
+def test_bent_limbs_and_the_roots_turn_come_back(walker, shaped, keypoint_camera, track_motion):
+    lifted = lift_keypoints(track_motion(walker), shaped, keypoint_camera)
+    off = relative_joints(shaped, lifted) - relative_joints(shaped, walker)
     assert np.linalg.norm(off, axis=2).mean() < 0.03
     turned = Rotation.from_rotvec(lifted.root_rotations).inv() * Rotation.from_rotvec(
         walker.root_rotations
@@ -129,10 +129,10 @@ def test_bent_limbs_and_the_roots_turn_come_back(walker, mean_body, keypoint_cam
 
 
 def test_a_bent_elbow_tells_the_twist_of_the_upper_arm(
-    walker, mean_body, keypoint_camera, track_motion
+    walker, shaped, keypoint_camera, track_motion
 ):
     """By hinges, not by the smallest swing: elbows and knees bend about their own axes alone."""
-    lifted = lift_keypoints(track_motion(walker), mean_body, keypoint_camera)
+    lifted = lift_keypoints(track_motion(walker), shaped, keypoint_camera)
     bends = lifted.joint_rotations[:, [17, 18, 3, 4]]
     assert (bends[:, 0, 1] < -0.3).all()
     assert (bends[:, 1, 1] > 0.3).all()
@@ -141,7 +141,7 @@ def test_a_bent_elbow_tells_the_twist_of_the_upper_arm(
 
 
 def test_short_gaps_are_bridged_and_long_ones_stay(
-    turning_person, mean_body, keypoint_camera, track_motion
+    turning_person, shaped, keypoint_camera, track_motion
 ):
     track = track_motion(turning_person(60))
     seen = ~np.isin(np.arange(60), [5, 6, 7, *range(20, 50)])
@@ -149,6 +149,6 @@ def test_short_gaps_are_bridged_and_long_ones_stay(
     fields = ("frames", "image_px", "world_m", "visibility", "presence", "times_s")
     partial = replace(track, **{name: getattr(track, name)[rows] for name in fields})
     partial.presence[10] = 0.1
-    lifted = lift_keypoints(partial, mean_body, keypoint_camera)
+    lifted = lift_keypoints(partial, shaped, keypoint_camera)
     assert lifted.frames.tolist() == [*range(20), *range(50, 60)]
     assert lifted.valid.all()
