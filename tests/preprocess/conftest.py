@@ -6,12 +6,14 @@ import sys
 import types
 import zlib
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from capture.camera import Camera
+from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import PARENTS
 from preprocess.body.parametric_body import ShapedBody
@@ -35,6 +37,14 @@ def smpl_arrays(rng) -> dict[str, np.ndarray]:
         "kintree_table": np.array([PARENTS, range(24)]).astype(np.uint32),
         "f": rng.integers(0, 40, (70, 3)).astype(np.uint32),
     }
+
+
+@pytest.fixture(scope="session")
+def small_capture(tmp_path_factory) -> Path:
+    """A capture of twelve frames, 64 px high."""
+    folder = tmp_path_factory.mktemp("small") / "capture"
+    film_capture(folder, ShootConfig(frames=12, size=64))
+    return folder
 
 
 @pytest.fixture

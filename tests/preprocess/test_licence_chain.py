@@ -6,8 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from instant_avatar.studio.shoot import film_capture
-from instant_avatar.studio.shoot_config import ShootConfig
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.licence_chain import LICENCES, licence_chain, made_with
 from preprocess.open_capture import open_capture
@@ -16,10 +14,8 @@ from preprocess.poses.pose_format_registry import TRACKERS
 
 
 @pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("licence") / "capture"
-    film_capture(folder, ShootConfig(frames=4, size=48))
-    return open_capture(CaptureInputs(video=folder, masks=Path("segmenter:blazepose")))
+def capture(small_capture):
+    return open_capture(CaptureInputs(video=small_capture, masks=Path("segmenter:blazepose")))
 
 
 def by_program(capture, program):

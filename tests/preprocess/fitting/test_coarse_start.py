@@ -25,7 +25,7 @@ from preprocess.open_capture import open_capture
 from preprocess.poses.pose_file import write_motion
 from tests.motions import make_motion
 
-SIZE, FRAMES = (96, 128), 8
+SIZE, FRAMES = (96, 128), 5
 CAMERA = Camera(focal_px=(190.0, 190.0), center_px=(48.0, 64.0), size_px=SIZE,
                 camera_from_world=np.eye(4))  # fmt: skip
 SHIFTED_M = np.array([0.0, 0.06, 0.0])

@@ -24,7 +24,7 @@ from preprocess.poses.body_joints import (
 from preprocess.poses.pose_file import write_motion
 from preprocess.poses.pose_format_registry import read_poses
 
-FRAMES = 6
+FRAMES = 5
 PARENTS = np.array(TREE)
 MHR_COUNT, KEY_POINT_COUNT = 127, 70
 FOCAL_PX, CENTER_PX = 900.0, np.array([640.0, 360.0])

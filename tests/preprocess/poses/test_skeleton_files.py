@@ -60,7 +60,7 @@ NUMBERS = {point: known[BODIES.index("MHR")] for point, known in MIDDLE_JOINTS.i
     for place, side in enumerate(("left", "right"))
 }  # fmt: skip
 """MHR's numbers of SMPL's joints."""
-FRAMES = 12
+FRAMES = 8
 DEGREES = 180.0 / np.pi
 
 

@@ -17,7 +17,7 @@ from preprocess.sfm.colmap_mapping import select_keyframes
 from preprocess.sfm.point_tracking import resect_intermediate_frames
 
 SIZE = (320, 240)
-FRAMES, KEYS = 20, 10
+FRAMES, KEYS = 14, 8
 
 
 def no_person(frame, size_px):
@@ -35,7 +35,7 @@ def filmed(folder, pictures):
 def walk(room, walked, tmp_path_factory):
     """True cameras, their film, its solution, and the progress that was reported."""
     folder = tmp_path_factory.mktemp("walk")
-    cameras = walked(FRAMES, degrees=80, size_px=SIZE, focal_px=260.0)
+    cameras = walked(FRAMES, degrees=64, size_px=SIZE, focal_px=260.0)
     source = filmed(folder / "film", [room.seen(camera) for camera in cameras])
     shares = []
     settings = SolverSettings(max_keyframes=KEYS)
