@@ -102,12 +102,6 @@ def test_closing_stops_a_producer_that_would_never_end(capacity):
     inbox.close()  # again, without harm
 
 
-def test_the_source_runs_on_a_thread_of_its_own():
-    threads = taken(Inbox(threading.current_thread() for _ in range(1)))
-    assert threads != [threading.current_thread()]
-    assert threads[0].daemon  # it cannot keep the process alive
-
-
 def test_a_live_producer_never_waits_and_the_latest_is_kept():
     inbox = Inbox(range(1000), capacity=4, live=True)
     wait_until(lambda: inbox._ended.is_set())

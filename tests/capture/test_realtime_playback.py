@@ -61,18 +61,12 @@ def played(source, clock):
     return RealtimePlayback(source, PacingClock(clock=clock, wait=clock.wait))
 
 
-def test_each_frame_comes_at_its_own_time_and_the_first_at_once(clock):
-    came = [(frame.index, clock()) for frame in played(Recorded(), clock).frames()]
-    assert [index for index, _ in came] == [0, 1, 2, 3, 4, 5]
-    moments = np.array([moment for _, moment in came])
-    np.testing.assert_allclose(moments - moments[0], np.array(UNEVEN_S) - 5.0, atol=1e-9)
-
-
-def test_frames_say_when_they_were_due_and_keep_their_timestamps(clock):
-    frames = list(played(Recorded(), clock).frames())
+def test_each_frame_comes_at_its_own_time_which_it_says_and_the_first_at_once(clock):
+    frames, moments = zip(*((f, clock()) for f in played(Recorded(), clock).frames()), strict=True)
+    assert [frame.index for frame in frames] == [0, 1, 2, 3, 4, 5]
     assert [frame.time_s for frame in frames] == UNEVEN_S
-    due = np.array([frame.due_s for frame in frames])
-    np.testing.assert_allclose(due, 100.0 + np.array(UNEVEN_S) - 5.0)
+    np.testing.assert_allclose(moments, 100.0 + np.array(UNEVEN_S) - 5.0, atol=1e-9)
+    np.testing.assert_allclose([frame.due_s for frame in frames], moments)
 
 
 def test_who_takes_frames_late_loses_none_and_catches_up(clock):

@@ -272,7 +272,7 @@ def test_a_live_folder_takes_the_focal_length_of_a_camera_file(standing, tmp_pat
         opened = open_tracked_stream(named, Tracker(standing), lambda size: plain, tmp_path / "p")
         return abs(np.log(opened.capture.cameras[0].focal_px[0] / stated.focal_px[0]))
 
-    assert off(None) == off(str(tmp_path / "named.npz")) < 0.5 * off("static")
+    assert max(off(None), off(str(tmp_path / "named.npz"))) < 0.5 * off("static")
 
 
 def test_a_camera_has_no_files_beside_it(tmp_path, monkeypatch):

@@ -29,15 +29,6 @@ def test_patches_hold_the_whole_skin_but_soles_and_mouth(shaped, coverage):
     assert np.allclose(patches.weights.sum(axis=1), 1.0, atol=1e-5)
 
 
-def test_normals_look_outward(shaped, coverage):
-    # the divergence theorem: the sum of area x normal over a closed surface is nothing, and that
-    # of (point . normal) / 3 is the volume, some 60-90 litres of a person
-    patches = coverage.patches
-    weighted = patches.areas[:, None] * patches.normals
-    assert np.linalg.norm(weighted.sum(axis=0)) < 0.05 * patches.areas.sum()
-    assert 0.05 < float((weighted * patches.points).sum()) / 3.0 < 0.1
-
-
 def test_the_left_side_is_the_persons_left(coverage):
     patches = coverage.patches
     for side, axis, sign in (("left", 0, 1), ("right", 0, -1), ("front", 2, 1), ("back", 2, -1)):
@@ -45,14 +36,6 @@ def test_the_left_side_is_the_persons_left(coverage):
         assert np.all(sign * patches.normals[here, axis] > 0.0)
     left_hand = patches.parts == PART_NAMES.index("left hand")
     assert patches.points[left_hand, 0].min() > 0.0
-
-
-def test_posed_patches_lie_on_the_posed_skin(shaped, observed, coverage):
-    body = shaped.with_pose(observed(turned=1.0).pose)
-    points, normals = pose_patches(coverage.patches, body.world_from_rest())
-    spacing = np.linalg.norm(body.vertices()[None] - points[::50, None], axis=2).min(axis=1)
-    assert spacing.max() < 0.02
-    assert np.allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-5)
 
 
 def test_who_is_seen_from_the_front_has_an_unseen_back(shaped, observed, coverage):

@@ -162,32 +162,12 @@ def taught(clip: Filmed, steps: int, *, marks: int = 5) -> Taught:
     return Taught(avatar=trainer.avatar, held=clip.held, marks=scores)
 
 
-SMALL_STEPS, LARGE_STEPS = 250, 600
-
-
-@pytest.fixture(scope="module")
-def small() -> Taught:
-    return taught(filmed(256), SMALL_STEPS)
-
-
-@pytest.fixture(scope="module")
-def large() -> Taught:
-    return taught(filmed(540), LARGE_STEPS)
-
-
 @pytest.mark.slow
-def test_silhouettes_of_frames_it_has_not_seen_are_the_persons_at_256_px(small):
-    assert min(small.overlaps()) >= 0.97
-
-
-@pytest.mark.slow
-def test_silhouettes_of_frames_it_has_not_seen_are_the_persons_at_540_px(large):
-    assert min(large.overlaps()) >= 0.98
-
-
-@pytest.mark.slow
-def test_no_frame_falls_back_between_marks(small, large):
-    for learner in (small, large):
-        scores = np.array(learner.marks)
-        assert len(scores) == 5
-        assert (np.maximum.accumulate(scores, axis=0) - scores).max() < 1.0
+@pytest.mark.parametrize(("size", "steps", "overlap"), [(256, 250, 0.97), (540, 600, 0.98)])
+def test_silhouettes_are_the_persons_and_no_frame_falls_back_between_marks(size, steps, overlap):
+    """Of frames that it has not seen."""
+    learner = taught(filmed(size), steps)
+    assert min(learner.overlaps()) >= overlap
+    scores = np.array(learner.marks)
+    assert len(scores) == 5
+    assert (np.maximum.accumulate(scores, axis=0) - scores).max() < 1.0

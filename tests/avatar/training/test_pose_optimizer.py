@@ -39,11 +39,8 @@ from tests.avatar_fixtures import pose_gradient
 
 
 def pose_of(rotations, root=(0.1, 0.7, -0.2), place=(0.2, 0.1, -0.3)) -> BodyPose:
-    return BodyPose(
-        root_rotation=np.array(root),
-        root_translation=np.array(place),
-        joint_rotations=np.asarray(rotations),
-    )
+    root, place, rotations = np.array(root), np.array(place), np.asarray(rotations)
+    return BodyPose(root_rotation=root, root_translation=place, joint_rotations=rotations)
 
 
 @pytest.fixture
@@ -122,13 +119,9 @@ def test_compiled_wrenches_agree_with_their_meaning(rig, table, generator):
 
 def test_cells_that_follow_a_pose_are_those_that_would_have_been_solved(rig, table, bent_pose):
     cells = CorrespondenceGrid.solve(rig, bent_pose)
-    turned = (
-        Rotation.from_rotvec(bent_pose) * Rotation.from_rotvec(np.full((23, 3), 0.006))
-    ).as_rotvec()
-    tables = correspondence_tables(cells)
-    bones = torch.from_numpy(
-        rig.body_from_canonical(turned)[:, :3].reshape(24, 12).astype(np.float32)
-    )
+    turned = Rotation.from_rotvec(bent_pose) * Rotation.from_rotvec(np.full((23, 3), 0.006))
+    moved = rig.body_from_canonical(turned.as_rotvec())[:, :3].reshape(24, 12)
+    tables, bones = correspondence_tables(cells), torch.from_numpy(moved.astype(np.float32))
     before = residual(rig, table, cells, tables.roots[0], bones)
     for _ in range(2):
         operations.update_roots(tables, [0], table.skinning, bones[None])
@@ -158,11 +151,8 @@ def test_the_poses_gradient_is_what_the_roots_do_when_the_pose_moves(rig, table,
     wrenches = wrenches_of(samples, pull, slots, cells, table.skinning, table.bones)
     table.accumulate(slots, wrenches, torch.ones(1))
     gradient = pose_gradient(table, 1)
-    given = (
-        torch_correspondence.skin_points(samples.points, *table.skinning, table.bones[1])
-        .double()
-        .numpy()
-    )
+    skin = torch_correspondence.skin_points
+    given = skin(samples.points, *table.skinning, table.bones[1]).double().numpy()
 
     def pulled(joint: int, axis: int, size: float) -> float:
         table.corrections[1, joint, axis] = size
@@ -171,9 +161,7 @@ def test_the_poses_gradient_is_what_the_roots_do_when_the_pose_moves(rig, table,
         target = root.pivot + (given - root.pivot - root.shift) @ root.rotation
         x = samples.points.clone()
         for _ in range(8):
-            off = torch.from_numpy(target).float() - torch_correspondence.skin_points(
-                x, *table.skinning, table.bones[1]
-            )
+            off = torch.from_numpy(target).float() - skin(x, *table.skinning, table.bones[1])
             x = x + (roots[1, :, 3:].unflatten(1, (3, 3)) @ off[..., None])[..., 0]
         table.corrections[1, joint, axis] = 0.0
         table._update_bones(1)
@@ -202,14 +190,10 @@ def test_sums_over_rays_are_those_of_their_own_gradients(rig, table, generator):
     curved = scaled / (2.0 * (loss.numpy() + MIN_RAY_LOSS))[:, None]
     found = table._rays.equations(1)
     assert found.moments is not None
-    for ours, theirs in (
-        (found.gradient, scaled.sum(axis=0)),
-        (found.curvature, curved.T @ scaled),
-        (found.moments, scaled.T @ scaled),
-    ):
-        np.testing.assert_allclose(
-            ours[..., :75], theirs, rtol=1e-3, atol=1e-4 * np.abs(theirs).max()
-        )
+    expected = scaled.sum(axis=0), curved.T @ scaled, scaled.T @ scaled
+    sums = found.gradient, found.curvature, found.moments
+    for ours, theirs in zip(sums, expected, strict=True):
+        np.testing.assert_allclose(ours[..., :75], theirs, 1e-3, 1e-4 * np.abs(theirs).max())
         assert not ours[..., 75:].any()
     mean_ray = np.square(scaled).sum() / (curved * scaled).sum()
     assert found.ray_stiffness == pytest.approx(mean_ray, rel=1e-3)
@@ -235,13 +219,11 @@ def jittered(clip):
     rng = np.random.default_rng(0)
 
     def shaken(pose: BodyPose) -> BodyPose:
-        def noise(shape, size):
-            return rng.normal(size=shape) * size
-
+        root, place, joints = pose.root_rotation, pose.root_translation, pose.joint_rotations
         return BodyPose(
-            root_rotation=pose.root_rotation + noise(3, 0.03),
-            root_translation=pose.root_translation + noise(3, 0.02),
-            joint_rotations=pose.joint_rotations + noise((23, 3), 0.05),
+            root_rotation=root + 0.03 * rng.normal(size=3),
+            root_translation=place + 0.02 * rng.normal(size=3),
+            joint_rotations=joints + 0.05 * rng.normal(size=(23, 3)),
         )
 
     return [
@@ -299,9 +281,8 @@ def test_cells_that_tell_of_poses_are_small_enough_whatever_the_detail(footprint
 
 def test_fine_levels_pull_held_out_poses_in_the_second_half_alone(learnt, clip, monkeypatch):
     asked = list[float]()
-    monkeypatch.setattr(
-        HashLevels, "count_from", lambda levels, cell_m: (asked.append(cell_m), 1)[1]
-    )
+    count = lambda levels, cell_m: (asked.append(cell_m), 1)[1]  # noqa: E731
+    monkeypatch.setattr(HashLevels, "count_from", count)
     list(fit_test_poses(learnt.trainer, [HeldOutFrame(observation=clip.observations[11])]))
     assert asked == 6 * [MIN_POSE_GRADIENT_CELL_M] + 6 * [0.0]
 

@@ -1,6 +1,5 @@
 """Replay: the rays are those of the video, and the frames that stay are worth keeping."""
 
-import dataclasses
 from dataclasses import replace
 
 import cv2
@@ -42,15 +41,15 @@ def cut(frame, near, far):
     places, count = frame.pixels.flat_indices(), frame.pixels.near_count
     masks[0, places[:near]] = masks[1, places[count : count + far]] = True
     pixels = PixelRuns.of(*masks.reshape(2, height, width))
-    return dataclasses.replace(frame, pixels=pixels, colors=frame.colors[:near], head=None)
+    return replace(frame, pixels=pixels, colors=frame.colors[:near], head=None)
 
 
 def posed(frame, index, *, knee):
     """The frame under another index, with a knee bent by `knee` radians."""
     rotations = np.zeros((23, 3))
     rotations[3, 0] = knee
-    pose = dataclasses.replace(BodyPose.rest(), joint_rotations=rotations)
-    return dataclasses.replace(frame, index=index, pose=pose)
+    pose = replace(BodyPose.rest(), joint_rotations=rotations)
+    return replace(frame, index=index, pose=pose)
 
 
 def places(batch, frames):
@@ -106,18 +105,12 @@ def test_targets_are_the_videos_colors_along_exactly_those_rays(rig, clip, frame
 
 def test_a_video_whose_lens_changes_is_seen_through_each_frames_own(frames, generator):
     """One lens zooms, another bends."""
-    zoomed, bent = (
-        dataclasses.replace(frame.view.camera, **change)
-        for frame, change in zip(
-            frames[1:3],
-            ({"focal_px": (90.0, 91.0)}, {"distortion": (0.1, 0.0, 0.0, 0.0)}),
-            strict=True,
-        )
-    )
-    own = [
-        dataclasses.replace(frame, view=frame.view._replace(camera=camera), head=None)
-        for frame, camera in zip(frames, (frames[0].view.camera, zoomed, bent), strict=False)
-    ]
+    own = []
+    for frame, change in zip(
+        frames, ({}, {"focal_px": (90.0, 91.0)}, {"distortion": (0.1, 0.0, 0.0, 0.0)}), strict=False
+    ):
+        view = frame.view._replace(camera=replace(frame.view.camera, **change))
+        own.append(replace(frame, view=view, head=None))
     batch = store(own).sample_rays(600, generator)
     for slot, frame in enumerate(own):
         mine = batch.rays.directions.numpy()[(batch.rays.slots == slot).numpy()]
@@ -201,16 +194,8 @@ def test_when_full_the_more_replaceable_of_the_two_most_alike_goes(frames):
     assert sorted(replay.frame_indices) == [10, 13, 20, 21]
 
 
-def test_frames_seen_from_two_sides_are_not_alike(frames):
-    """The pose is the same; the view alone tells them apart."""
-    front, behind = posed(frames[0], 0, knee=0.0), posed(frames[2], 1, knee=0.0)
-    replay = store([front, behind, posed(frames[0], 2, knee=0.1)], capacity=3)
-    replay.add(posed(frames[1], 3, knee=0.0))
-    assert {1, 3} < set(replay.frame_indices)
-
-
 @given(capacity=st.integers(1, 6), arriving=st.integers(1, 12))
-@settings(deadline=None, max_examples=30)
+@settings(deadline=None, max_examples=12)
 def test_the_capacity_is_kept_and_the_newest_frame_is_in(frames, capacity, arriving):
     replay = ReplayBuffer(capacity)
     for index in range(arriving):
@@ -236,8 +221,8 @@ def test_cached_distances_are_those_computed_afresh(frames, rng):
     """What goes is chosen from distances that are updated one row at a time."""
     replay = ReplayBuffer(6)
     for index in range(40):
-        turned = dataclasses.replace(frames[0].pose, joint_rotations=rng.normal(size=(23, 3)))
-        replay.add(dataclasses.replace(frames[index % 4], index=index, pose=turned))
+        turned = replace(frames[0].pose, joint_rotations=rng.normal(size=(23, 3)))
+        replay.add(replace(frames[index % 4], index=index, pose=turned))
     likeness = replay._descriptors
     expected = np.linalg.norm(likeness[:, None] - likeness[None], axis=-1)
     np.fill_diagonal(expected, np.inf)

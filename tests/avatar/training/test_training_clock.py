@@ -36,32 +36,19 @@ def test_time_goes_on_from_where_an_earlier_run_stopped(trainer, spend):
     assert trainer.cpu_seconds == 5.0
 
 
-def test_a_pause_does_not_count(trainer, spend):
+def test_a_pause_does_not_count_before_the_clock_within_it_or_if_it_ends_badly(trainer, spend):
+    def pause(error: type[BaseException] | None = None) -> None:
+        with trainer.paused():
+            spend(60.0)
+            if error:
+                raise error
+
+    pause()
     clock = TrainingClock(trainer)
     spend(2.0)
-    with trainer.paused():
-        spend(60.0)
+    pause()
+    with pytest.raises(KeyboardInterrupt):
+        pause(KeyboardInterrupt)
     spend(1.0)
     assert clock.read() == 3.0
     assert trainer.cpu_seconds == 1.5
-
-
-def test_a_pause_before_the_clock_takes_nothing_from_it(trainer, spend):
-    with trainer.paused():
-        spend(60.0)
-    clock = TrainingClock(trainer)
-    spend(1.0)
-    assert clock.read() == 1.0
-
-
-def test_a_pause_that_ends_badly_does_not_count_either(trainer, spend):
-    clock = TrainingClock(trainer)
-
-    def stopped() -> None:
-        with trainer.paused():
-            spend(60.0)
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        stopped()
-    assert clock.read() == 0.0

@@ -213,16 +213,6 @@ def test_points_and_sources_are_as_far_from_the_skin(rig, of_front, generator):
     assert np.abs(distance(points) - distance(sources)).mean() < 0.015
 
 
-def test_the_more_was_seen_the_fewer_points_are_drawn(rig, frame, of_front, generator):
-    turned = UnseenSkin(rig)
-    for angle in np.linspace(0.0, 2.0 * np.pi, 8):
-        turned.add(frame(turned=angle))
-    turned.update()
-    assert len(turned.sample(1000, generator).points) < 0.4 * len(
-        of_front.sample(1000, generator).points
-    )
-
-
 def test_nothing_is_drawn_before_anything_was_seen(rig, generator):
     unseen = UnseenSkin(rig)
     assert not len(unseen.sample(100, generator).points)

@@ -28,13 +28,8 @@ def placed(seed: int) -> np.ndarray:
 @pytest.fixture
 def write(tmp_path):
     def write(**changes):
-        arrays = {
-            "intrinsic": INTRINSIC,
-            "extrinsic": placed(1),
-            "height": np.array(480),
-            "width": np.array(640),
-            **changes,
-        }
+        size = {"height": np.array(480), "width": np.array(640)}
+        arrays = {"intrinsic": INTRINSIC, "extrinsic": placed(1), **size, **changes}
         path = tmp_path / "cameras.npz"
         np.savez(path, **{key: value for key, value in arrays.items() if value is not None})
         return path

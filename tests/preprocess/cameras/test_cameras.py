@@ -30,14 +30,8 @@ def cameras(rng) -> list[Camera]:
         camera_from_world = np.eye(4)
         camera_from_world[:3, :3] = turn.as_matrix()
         camera_from_world[:3, 3] = [0.1, -0.2, 3.0 + 0.1 * step]
-        found.append(
-            Camera(
-                focal_px=(500.0, 505.0),
-                center_px=(318.5, 243.0),
-                size_px=SIZE,
-                camera_from_world=camera_from_world,
-            )
-        )
+        lens = {"focal_px": (500.0, 505.0), "center_px": (318.5, 243.0), "size_px": SIZE}
+        found.append(Camera(**lens, camera_from_world=camera_from_world))
     return found
 
 
@@ -71,9 +65,8 @@ def colmap(tmp_path, cameras):
         lens = pycolmap.Camera(model=kind, width=640, height=480, params=params, camera_id=1)
         model.add_camera_with_trivial_rig(lens)
         for number, camera in enumerate(cameras, 1):
-            image = pycolmap.Image(
-                name=f"frames/frame_{number:05d}.png", camera_id=1, image_id=number
-            )
+            name = f"frames/frame_{number:05d}.png"
+            image = pycolmap.Image(name=name, camera_id=1, image_id=number)
             pose = pycolmap.Rigid3d(camera.camera_from_world[:3])
             model.add_image_with_trivial_frame(image, pose)
         folder = tmp_path / "sparse" / "0"
@@ -146,14 +139,10 @@ def test_transforms_json_is_seen_as_opengl_sees_it(cameras, points, tmp_path):
             np.testing.assert_allclose(each.camera.project(points), wanted, atol=1e-6)
 
 
-def test_a_frame_may_have_a_lens_of_its_own_or_an_angle_of_view(cameras, tmp_path):
+def test_a_frame_may_have_a_lens_of_its_own(cameras, tmp_path):
     frame = {"file_path": "a_1.png", "transform_matrix": opengl_pose(cameras[0]).tolist()}
-    content = {"w": 640, "h": 480, "camera_angle_x": 2 * np.arctan(0.5), "frames": [frame]}
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
-    camera = read_named_cameras(tmp_path)[0].camera
-    assert camera.focal_px == pytest.approx((640.0, 640.0))
-    assert camera.center_px == (320.0, 240.0)
     frame |= {"fl_x": 300.0, "fl_y": 301.0, "cx": 1.0, "cy": 2.0}
+    content = {"w": 640, "h": 480, "camera_angle_x": 2 * np.arctan(0.5), "frames": [frame]}
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     assert read_named_cameras(tmp_path)[0].camera.focal_px == (300.0, 301.0)
 
@@ -266,15 +255,6 @@ def test_consecutive_numbers_of_a_few_frames_say_nothing_about_a_longer_video(
     with pytest.raises(InputError, match=r"5 cameras.*40 frames"):
         read_cameras(path, SIZE, video(40))
     assert len(read_cameras(path, SIZE, video(5)).cameras) == 5
-
-
-def test_cameras_of_larger_pictures_are_scaled_and_of_other_shapes_refused(cameras, tmp_path):
-    path = transforms(tmp_path / "transforms.json", cameras, [f"f{n}" for n in range(COUNT)])
-    small = read_cameras(path, (320, 240))
-    assert small[0].focal_px == (250.0, 250.0)
-    assert "scaled" in (small.note or "")
-    with pytest.raises(InputError, match="same shape"):
-        read_cameras(path, (480, 640))
 
 
 @pytest.mark.parametrize(

@@ -36,11 +36,8 @@ def test_the_fit_of_another_video_is_not_taken(fit, tmp_path):
     assert load_capture_fit(tmp_path / "fit.npz", "/a/video.mp4") is None
 
 
-def test_the_description_names_quantities_and_units(fit):
+def test_the_description_names_quantities_and_units_and_key_points_where_they_count(fit):
     assert "1.6 cm" in fit.describe()
     assert "5.7 degrees" in fit.describe()
-
-
-def test_the_weight_of_key_points_is_described_where_they_count(fit):
     assert "key points" not in fit.describe()
     assert "count by 60%" in replace(fit, keypoint_share=0.4).describe()

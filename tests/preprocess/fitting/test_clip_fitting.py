@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from capture.camera import Camera
-from preprocess.body.body_pose import BodyPose, Motion
+from preprocess.body.body_pose import Motion
 from preprocess.body.body_surface import SkinPoints, splat_silhouette
 from preprocess.body.parametric_body import load_body_model
 from preprocess.body.proportion_space import ProportionSpace
@@ -56,22 +56,16 @@ def space() -> ProportionSpace:
 
 def outlines(space: ProportionSpace, coefficients, motion: Motion) -> list[ClipFrame]:
     skin = SkinPoints.of(space.shape(coefficients), OUTLINE_SKIN_POINTS)
-    masks = [
-        splat_silhouette(skin.posed(pose), CAMERA).astype(np.float32)
-        for pose in motion_poses(motion)
-    ]
-    return [
-        ClipFrame(number=float(row), camera=CAMERA, mask=OutlineDistances.of(mask, CAMERA))
-        for row, mask in enumerate(masks)
-    ]
+    frames = []
+    for row in range(len(motion)):
+        mask = splat_silhouette(skin.posed(motion[row]), CAMERA).astype(np.float32)
+        outline = OutlineDistances.of(mask, CAMERA)
+        frames.append(ClipFrame(number=float(row), camera=CAMERA, mask=outline))
+    return frames
 
 
 def fitter_of(motion: Motion, space: ProportionSpace, frames: list[ClipFrame]) -> ClipFitter:
     return ClipFitter(ClipPoses.of(motion, range(len(frames))), space, frames)
-
-
-def motion_poses(motion: Motion) -> list[BodyPose]:
-    return [motion[row] for row in range(len(motion))]
 
 
 def joint_error_cm(fitter: ClipFitter, person, truth: Motion) -> float:
@@ -87,15 +81,12 @@ def joint_error_cm(fitter: ClipFitter, person, truth: Motion) -> float:
 
 def turn_error_deg(fitter: ClipFitter, truth: Motion) -> float:
     """Mean angle between the joints' rotations and the truth's: of hips and shoulders."""
-    some = [0, 1, 15, 16]
-    angles = [
-        (
-            Rotation.from_rotvec(fitter.poses[row].joint_rotations[some])
-            * Rotation.from_rotvec(truth[row].joint_rotations[some]).inv()
-        ).magnitude()
-        for row in range(len(truth))
-    ]
-    return float(np.degrees(np.mean(angles)))
+
+    def turns(poses) -> Rotation:
+        rows = [poses[row].joint_rotations[[0, 1, 15, 16]] for row in range(len(truth))]
+        return Rotation.from_rotvec(np.concatenate(rows))
+
+    return float(np.degrees((turns(fitter.poses) * turns(truth).inv()).magnitude().mean()))
 
 
 def test_poses_and_proportions_come_back(space):

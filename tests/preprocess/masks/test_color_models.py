@@ -63,23 +63,6 @@ def test_another_size_keeps_the_background() -> None:
     assert plate.within(np.s_[:20, :30]).known.all()
 
 
-def test_texture_in_plain_sight_is_no_person() -> None:
-    """Leaves and books are recognized where no person is before them; a plain wall never is."""
-    frame = _wall()
-    frame[:, 10:30, 20:40] = 120.0  # a person
-    plate = _plate(3)
-    plate.align(frame, frame[0] != 120.0)
-    shown = plate.within(ALL).in_sight(frame)
-    assert not shown[10:30, 20:40].any()
-    assert shown[:6].all()
-    assert shown[34:].all()
-    plain, wall = BackgroundPlate(), np.full((3, *SIZE), 120.0, np.float32)
-    for _ in range(3):
-        plain.align(wall, FREE)
-        plain.update(wall, FREE)
-    assert not plain.within(ALL).in_sight(wall).any()
-
-
 def test_a_black_background_is_learnt_and_a_black_frame_is_not() -> None:
     dark, black = BackgroundPlate(), np.zeros((3, *SIZE), np.float32)
     for _ in range(3):

@@ -113,15 +113,9 @@ def take_front_for_back(motion: Motion, rows: list[int]) -> Motion:
 
 @pytest.mark.parametrize(
     ("step_rad", "rows"),
-    [
-        (0.03, [20, 21, 22]),
-        (0.03, [5]),
-        (0.03, [34, 35, 36]),
-        (0.2, [1, 2]),
-        (0.2, [4, 5, 6]),
-        (0.2, [32, 33, 34]),
-    ],
-)
+    [(0.03, [20, 21, 22]), (0.03, [5]), (0.03, [34, 35, 36]), (0.2, [1, 2]), (0.2, [4, 5, 6]),
+     (0.2, [32, 33, 34])],
+)  # fmt: skip
 def test_front_taken_for_back_is_left_out_and_named(step_rad, rows):
     """Also near a side view, where the turn is 65 degrees, or has no jump at one end."""
     motion = take_front_for_back(turning(60, step_rad), rows)

@@ -16,13 +16,9 @@ def write(tmp_path, motion):
     """Writes the motion in InstantAvatar's keys, with changes; None leaves a key out."""
 
     def write(**changes):
-        arrays = {
-            "betas": motion.betas[None],
-            "global_orient": motion.root_rotations,
-            "body_pose": motion.joint_rotations.reshape(6, 69),
-            "transl": motion.root_translations,
-            **changes,
-        }
+        arrays = {"betas": motion.betas[None], "global_orient": motion.root_rotations}
+        arrays |= {"body_pose": motion.joint_rotations.reshape(6, 69)}
+        arrays |= {"transl": motion.root_translations, **changes}
         path = tmp_path / "poses.npz"
         np.savez(path, **{key: value for key, value in arrays.items() if value is not None})
         return path
@@ -31,11 +27,8 @@ def write(tmp_path, motion):
 
 
 def assert_same(a, b):
-    np.testing.assert_array_equal(a.root_rotations, b.root_rotations)
-    np.testing.assert_array_equal(a.root_translations, b.root_translations)
-    np.testing.assert_array_equal(a.joint_rotations, b.joint_rotations)
-    np.testing.assert_array_equal(a.valid, b.valid)
-    np.testing.assert_array_equal(a.betas, b.betas)
+    for name in ("root_rotations", "root_translations", "joint_rotations", "valid", "betas"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
     assert a.body_model == b.body_model
     for one, other in ((a.frames, b.frames), (a.times_s, b.times_s), (a.intrinsic, b.intrinsic)):
         assert (one is None) == (other is None)
@@ -45,13 +38,9 @@ def assert_same(a, b):
 
 def test_what_is_written_is_read(tmp_path, motion):
     rich = replace(
-        motion,
-        valid=np.arange(6) != 3,
-        frames=np.array([0, 2, 4, 7, 8, 9]),
-        times_s=np.arange(6) / 25,
-        intrinsic=np.diag([500.0, 510.0, 1.0]),
-        body_model="smpl",
-    )
+        motion, valid=np.arange(6) != 3, frames=np.array([0, 2, 4, 7, 8, 9]),
+        times_s=np.arange(6) / 25, intrinsic=np.diag([500.0, 510.0, 1.0]), body_model="smpl",
+    )  # fmt: skip
     for number, wanted in enumerate((motion, rich)):
         path = tmp_path / f"{number}.npz"
         write_motion(path, wanted)
@@ -62,14 +51,10 @@ def test_what_is_written_is_read(tmp_path, motion):
 def keypoints(rng):
     """Key points in four of seven frames."""
     return KeypointTrack(
-        frames=np.array([0, 1, 4, 6]),
-        image_px=rng.uniform(0.0, 500.0, (4, 33, 2)),
-        world_m=rng.normal(size=(4, 33, 3)),
-        visibility=rng.uniform(size=(4, 33)),
-        presence=rng.uniform(size=4),
-        size_px=(270, 480),
-        times_s=np.array([0.0, 0.5, 2.0, 3.0]),
-    )
+        frames=np.array([0, 1, 4, 6]), image_px=rng.uniform(0.0, 500.0, (4, 33, 2)),
+        world_m=rng.normal(size=(4, 33, 3)), visibility=rng.uniform(size=(4, 33)),
+        presence=rng.uniform(size=4), size_px=(270, 480), times_s=np.array([0.0, 0.5, 2.0, 3.0]),
+    )  # fmt: skip
 
 
 def test_proportions_and_key_points_are_read_by_every_reader(tmp_path, motion, keypoints):

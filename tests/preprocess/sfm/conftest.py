@@ -16,15 +16,11 @@ PIXELS_PER_M = 160
 
 
 def looking(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Camera-from-world of a camera that stands upright (world y up) and looks at a point."""
+    """Axes of a camera that stands upright (world y up) and looks at a point."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, [0.0, 1.0, 0.0])
     right /= np.linalg.norm(right)
-    rows = np.stack([right, np.cross(forward, right), forward])
-    camera_from_world = np.eye(4)
-    camera_from_world[:3, :3] = rows
-    camera_from_world[:3, 3] = -rows @ eye
-    return camera_from_world
+    return np.stack([right, np.cross(forward, right), forward])
 
 
 def arc(
@@ -37,14 +33,7 @@ def arc(
         eye = np.array([radius_m * np.sin(angle), 1.5, radius_m * np.cos(angle)])
         eye += 0.02 * rng.normal(size=3)
         target = np.array([0.0, 0.9, 0.0]) + 0.02 * rng.normal(size=3)
-        cameras.append(
-            Camera(
-                focal_px=(focal_px, focal_px),
-                center_px=(size_px[0] / 2, size_px[1] / 2),
-                size_px=size_px,
-                camera_from_world=looking(eye, target),
-            )
-        )
+        cameras.append(Camera.at(eye, looking(eye, target), focal_px, size_px))
     return cameras
 
 
@@ -125,17 +114,12 @@ def exactly(cameras: list[Camera], points: np.ndarray, noise_px: float = 0.0) ->
         pixels.append(there[inside] + noise_px * rng.normal(size=(inside.sum(), 2)))
     first = cameras[0]
     return SparseModel(
-        frames=np.arange(len(cameras)),
+        frames=np.arange(len(cameras)), points=points, pixels=np.concatenate(pixels),
         camera_from_world=np.stack([camera.camera_from_world for camera in cameras]),
-        focal_px=first.focal_px[0],
-        center_px=first.center_px,
-        radial_distortion=0.0,
-        size_px=first.size_px,
-        points=points,
-        observation_camera=np.concatenate(seen_by),
+        focal_px=first.focal_px[0], center_px=first.center_px, radial_distortion=0.0,
+        size_px=first.size_px, observation_camera=np.concatenate(seen_by),
         observation_point=np.concatenate(seen_point),
-        pixels=np.concatenate(pixels),
-    )
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="session")

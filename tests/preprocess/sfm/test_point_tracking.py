@@ -49,18 +49,6 @@ def test_points_that_contradict_each_other_place_nothing(cameras, room_points, r
     assert resect_camera(room_points[:10], cameras[0].project(room_points[:10]), cameras[0]) is None
 
 
-def test_points_are_followed_to_a_fraction_of_a_pixel(room, cameras):
-    picture = cv2.cvtColor(room.seen(cameras[0]), cv2.COLOR_RGB2GRAY)
-    shift = np.array([[1.0, 0.0, 3.25], [0.0, 1.0, -1.5]])
-    moved = cv2.warpAffine(picture, shift, picture.shape[::-1], flags=cv2.INTER_CUBIC)
-    pixels = detect_corners(picture, np.ones(picture.shape, dtype=bool), 200)
-    inner = ((pixels > 30.0) & (pixels < np.array(picture.shape[::-1]) - 30.0)).all(axis=1)
-    there, found = track_points(picture, moved, pixels[inner])
-    assert found.mean() > 0.9
-    off = there[found] - pixels[inner][found] - shift[:, 2]
-    assert np.median(np.abs(off)) < 0.05
-
-
 def test_points_that_are_covered_are_lost(room, cameras):
     picture = cv2.cvtColor(room.seen(cameras[0]), cv2.COLOR_RGB2GRAY)
     covered = picture.copy()

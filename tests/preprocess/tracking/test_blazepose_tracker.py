@@ -12,6 +12,7 @@ from preprocess.tracking.blazepose_networks import (
     BlazePoseDetector,
     PersonDetection,
     PersonSquare,
+    anchors,
     refine,
 )
 from preprocess.tracking.first_look import PersonFinder
@@ -227,6 +228,14 @@ def test_after_a_cut_to_other_light_and_another_distance_the_person_is_found_aga
     assert all(tracker(near) is not None for _ in range(6))
     dark = (0.35 * far).astype(np.uint8)
     assert any(tracker(dark) is not None for _ in range(24))
+
+
+def test_anchors_are_the_middles_of_their_cells():
+    places = anchors(224)
+    assert places.shape == (2254, 2)
+    np.testing.assert_allclose(places[:3] * 224, [[4, 4], [4, 4], [12, 4]])
+    np.testing.assert_allclose(places[1568] * 224, [8, 8])
+    np.testing.assert_allclose(places[-1] * 224, [208, 208])
 
 
 def test_a_flat_heat_map_leaves_a_point_where_it_is_and_a_peak_draws_it():

@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from capture.camera import Camera
 from preprocess.body.body_pose import Motion
-from preprocess.body.parametric_body import load_body_model
 from preprocess.tracking.keypoints import KeypointTrack
 from preprocess.tracking.tracking_grade import DISAGREE, TrackingGrade, grade_tracking
 from preprocess.tracking.video_tracking import PROBLEM_BITS, TrackingProblem
@@ -17,11 +16,6 @@ from tests.motions import make_motion, make_track
 FRAMES = 60
 FPS = 30.0
 TIMES = {number: number / FPS for number in range(FRAMES)}
-
-
-@pytest.fixture(scope="module")
-def shaped():
-    return load_body_model(None).with_shape()
 
 
 def a_motion(turns: float = 1.0, noise_rad: float = 0.0) -> Motion:
@@ -42,17 +36,12 @@ def some_keypoints() -> KeypointTrack:
 
 
 def grade(shaped, keypoints=None, motion=None, iou=0.85, times=TIMES) -> TrackingGrade:
-    camera = Camera.from_intrinsic(
-        np.array([[600.0, 0, 300], [0, 600.0, 300], [0, 0, 1]]), (600, 600)
-    )
-    return grade_tracking(
-        a_motion() if motion is None else motion,
-        some_keypoints() if keypoints is None else keypoints,
-        shaped,
-        camera,
-        times,
-        iou if isinstance(iou, dict) else dict.fromkeys(range(0, FRAMES, 4), iou),
-    )
+    matrix = np.array([[600.0, 0, 300], [0, 600.0, 300], [0, 0, 1]])
+    motion = a_motion() if motion is None else motion
+    keypoints = some_keypoints() if keypoints is None else keypoints
+    iou = iou if isinstance(iou, dict) else dict.fromkeys(range(0, FRAMES, 4), iou)
+    camera = Camera.from_intrinsic(matrix, (600, 600))
+    return grade_tracking(motion, keypoints, shaped, camera, times, iou)
 
 
 def test_good_poses_are_good_enough(shaped):
@@ -71,11 +60,6 @@ def test_three_frames_are_too_few(shaped):
     found = replace(grade(shaped), frames=3, jitter_mm=float("nan"))
     assert not found.is_good_enough
     assert "nan" not in found.describe()
-
-
-def test_one_frame_is_no_frames(shaped):
-    assert "Left out: 1 frame in which" in replace(grade(shaped), left_out=(7,)).describe()
-    assert "Left out: 2 frames in which" in replace(grade(shaped), left_out=(7, 8)).describe()
 
 
 def test_jitter_grows_with_noise(shaped):

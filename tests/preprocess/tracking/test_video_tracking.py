@@ -38,16 +38,12 @@ class FakeTracker:
     def __call__(self, rgb):
         if rgb.mean() < self.darkest:
             return None
+        place = np.array([[2.0, 0.0, 8.0], [0.0, 2.0, 16.0]])
         return PersonKeypoints(
-            image_px=np.full((33, 2), float(rgb.mean())),
-            world_m=np.zeros((33, 3)),
-            visibility=np.ones(33),
-            presence=1.0,
-            mask=CroppedMask(
-                values=np.full((8, 8), 255, np.uint8),
-                image_from_crop=np.array([[2.0, 0.0, 8.0], [0.0, 2.0, 16.0]]),
-            ),
-        )
+            image_px=np.full((33, 2), float(rgb.mean())), world_m=np.zeros((33, 3)),
+            visibility=np.ones(33), presence=1.0,
+            mask=CroppedMask(values=np.full((8, 8), 255, np.uint8), image_from_crop=place),
+        )  # fmt: skip
 
 
 def plain(rgb, mask, size_px):
@@ -126,18 +122,13 @@ def person(x=100.0, *, radius=10.0, crowded=False):
     """A person who is a disc in a square of 64 pixels around it, at half the frame's resolution."""
     rows, columns = np.mgrid[:64, :64] + 0.5
     disc = np.hypot(rows - 32, columns - 32) < radius / 2
+    around = np.resize([[-1, 0], [1, 0], [0, -1], [0, 1]], (33, 2))
+    values, place = np.where(disc, 255, 0), np.array([[2.0, 0, x - 64], [0, 2.0, 50 - 64]])
     return PersonKeypoints(
-        image_px=np.array([x, 50.0])
-        + radius * np.resize([[-1, 0], [1, 0], [0, -1], [0, 1]], (33, 2)),
-        world_m=np.zeros((33, 3)),
-        visibility=np.ones(33),
-        presence=1.0,
-        mask=CroppedMask(
-            values=np.where(disc, 255, 0).astype(np.uint8),
-            image_from_crop=np.array([[2.0, 0, x - 64], [0, 2.0, 50 - 64]]),
-        ),
-        crowded=crowded,
-    )
+        image_px=np.array([x, 50.0]) + radius * around, world_m=np.zeros((33, 3)),
+        visibility=np.ones(33), presence=1.0, crowded=crowded,
+        mask=CroppedMask(values=values.astype(np.uint8), image_from_crop=place),
+    )  # fmt: skip
 
 
 def problems_of(*found):
