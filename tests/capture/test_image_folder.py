@@ -138,11 +138,8 @@ class Writer:
     """Writes images into a folder while the clock, which stands still otherwise, is waited on."""
 
     def __init__(self, folder) -> None:
-        self.folder, self.now_s, self.pace = (
-            folder,
-            0.0,
-            PacingClock(clock=self.clock, wait=self.wait),
-        )
+        self.folder, self.now_s = folder, 0.0
+        self.pace = PacingClock(clock=self.clock, wait=self.wait)
         self._plan, self._lock = [], threading.Lock()
 
     def clock(self):

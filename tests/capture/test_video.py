@@ -84,9 +84,8 @@ def test_a_video_that_lies_on_its_side_is_turned_clockwise(write_video, degrees)
 
 def test_a_recording_is_described_before_its_frames_are_read(write_video):
     path = write_video(frames=20)
-    assert describe_recording(open_source(path)) == (
-        f"{path.name}: 20 frames of 64x48 px, 25 a second"
-    )
+    described = f"{path.name}: 20 frames of 64x48 px, 25 a second"
+    assert describe_recording(open_source(path)) == described
     some = open_source(path, frames=slice(0, 20, 2))
     assert describe_recording(some).startswith(f"{path.name}: 10 of 20 frames")
 
@@ -112,9 +111,7 @@ def test_a_truncated_video_gives_what_is_there_and_says_so(write_video):
     source = open_source(path)
     frames = list(source.frames())
     assert 5 < len(frames) < 40
-    assert greys(frames[:-1]) == [
-        i % 20 for i in range(len(frames) - 1)
-    ]  # the last one is cut itself
+    assert greys(frames[:-1]) == [i % 20 for i in range(len(frames) - 1)]  # the last one is cut
     warning = next(told for told in source.warnings if "only" in told)
     assert f"only {len(frames)} of 40 frames" in warning
     assert "truncated" in warning

@@ -10,9 +10,8 @@ from capture.work_ahead import RESULTS_PER_WORKER, map_ahead, read_ahead
 
 @pytest.mark.parametrize("workers", [1, 3])
 def test_results_come_in_the_order_of_the_items(workers):
-    assert list(map_ahead(lambda n: n * n, range(20), workers=workers)) == [
-        n * n for n in range(20)
-    ]
+    squares = [n * n for n in range(20)]
+    assert list(map_ahead(lambda n: n * n, range(20), workers=workers)) == squares
 
 
 def test_two_threads_work_side_by_side():

@@ -138,10 +138,7 @@ def test_an_avatar_that_shows_nothing_scores_like_a_white_sheet(rig, held):
 
 @given(count=st.integers(0, 60), most=st.integers(2, 20))
 def test_scored_frames_are_limited_and_evenly_spread(held, count, most):
-    frames = [
-        HeldOutFrame(observation=held.observation, correspondences=held.correspondences)
-        for _ in range(count)
-    ]
+    frames = [replace(held) for _ in range(count)]
     chosen = [frames.index(frame) for frame in subsample_evenly(frames, most)]
     assert len(chosen) == min(count, most)
     if count > most:
@@ -166,9 +163,8 @@ def test_of_a_long_stream_a_bounded_spread_of_held_out_frames_stays(held, count,
     kept, places = [], range(9, 10 * count, 10)
     for place in places:
         frame = replace(held.observation.frame, index=place)
-        add_held_out(
-            kept, HeldOutFrame(observation=replace(held.observation, frame=frame)), max_frames=most
-        )
+        one = HeldOutFrame(observation=replace(held.observation, frame=frame))
+        add_held_out(kept, one, max_frames=most)
     indices = [frame.observation.frame.index for frame in kept]
     assert min(len(places), most // 2) <= len(indices) <= most
     assert indices[0] == places[0]

@@ -3,11 +3,7 @@
 import numpy as np
 import pytest
 
-from avatar.evaluation.unfilmed_views import (
-    VIEW_PX,
-    half_transparent_share,
-    unfilmed_views,
-)
+from avatar.evaluation.unfilmed_views import VIEW_PX, half_transparent_share, unfilmed_views
 
 
 def picture(*alphas):

@@ -86,13 +86,11 @@ def test_factors_are_found_in_closed_form(true, objective):
 def test_a_crop_of_the_video_is_its_window(true, objective):
     window = (0.1, 0.05, 0.9, 0.95)
     low, high = np.array(window[:2]) * SIZE, np.array(window[2:]) * SIZE
-    cropped = KeypointObjective(
-        images=tuple(
-            replace(each, image_px=(each.image_px - low) / (high - low) * SIZE)
-            for each in objective.images
-        ),
-        shaped=objective.shaped,
+    images = tuple(
+        replace(each, image_px=(each.image_px - low) / (high - low) * SIZE)
+        for each in objective.images
     )
+    cropped = replace(objective, images=images)
     crop = fitted(cropped, true, "video_crop")
     found = crop.apply(true)
     np.testing.assert_allclose(found.video_transform.window, window, atol=1e-9)

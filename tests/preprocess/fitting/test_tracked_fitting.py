@@ -83,11 +83,8 @@ def lifted(truth, tmp_path_factory) -> Capture:
     track = track_points(truth)
     track.presence[7] = 0.0
     write_motion(poses, lift_keypoints(track, body, camera))
-    return open_capture(
-        CaptureInputs(
-            video=truth.paths.video, poses=poses, masks=truth.paths.masks, cameras="static"
-        )
-    )
+    paths = {"video": truth.paths.video, "poses": poses, "masks": truth.paths.masks}
+    return open_capture(CaptureInputs(**paths, cameras="static"))
 
 
 @pytest.fixture(scope="module")
@@ -127,14 +124,11 @@ def test_fitted_poses_keep_their_focal_length_beside_a_camera_file(lifted, fit, 
         tmp_path / "cameras.npz", intrinsic=np.diag([1.3, 1.3, 1.0]) @ stated.intrinsic,
         extrinsic=stated.camera_from_world, width=width, height=height,
     )  # fmt: skip
-    again = open_capture(
-        CaptureInputs(
-            video=lifted.paths.video,
-            poses=tmp_path / "poses.npz",
-            masks=lifted.paths.masks,
-            cameras=str(tmp_path / "cameras.npz"),
-        )
-    )
+    inputs = CaptureInputs(
+        video=lifted.paths.video, poses=tmp_path / "poses.npz", masks=lifted.paths.masks,
+        cameras=str(tmp_path / "cameras.npz"),
+    )  # fmt: skip
+    again = open_capture(inputs)
     assert again.cameras[0].focal_px == pytest.approx(apply_fit(lifted, fit).cameras[0].focal_px)
     np.testing.assert_allclose(again.cameras[0].camera_from_world, stated.camera_from_world)
 

@@ -93,12 +93,10 @@ def person(places, root, *, keypoints_only=False) -> dict:
     points = arranged(relative, "MHR's key points", KEY_POINT_COUNT)[0]
     seen = points + root
     held = {
-        "pred_keypoints_3d": points.tolist(),
+        "pred_keypoints_3d": points.tolist(), "pred_cam_t": root.tolist(),
         "pred_keypoints_2d": (FOCAL_PX * seen[:, :2] / seen[:, 2:] + CENTER_PX).tolist(),
-        "pred_cam_t": root.tolist(),
-        "focal_length": FOCAL_PX,
-        "body_pose_params": [0.0] * 133,
-    }
+        "focal_length": FOCAL_PX, "body_pose_params": [0.0] * 133,
+    }  # fmt: skip
     if not keypoints_only:
         held["pred_joint_coords"] = arranged(relative, "MHR", MHR_COUNT)[0].tolist()
     return held
@@ -208,12 +206,11 @@ def test_gem_xs_rotations_move_its_skeleton(tmp_path, poses):
 
     def view(root, places):
         return {
-            "global_orient": torch.tensor(root),
+            "global_orient": torch.tensor(root), "transl": torch.tensor(places),
             "body_pose": torch.tensor(turned[:, 1:].reshape(FRAMES, 228)),
-            "transl": torch.tensor(places),
             "identity_coeffs": torch.zeros(FRAMES, 45),
             "scale_params": torch.full((FRAMES, 69), 1.1),
-        }
+        }  # fmt: skip
 
     camera = np.tile([[FOCAL_PX, 0, 640.0], [0, FOCAL_PX, 360.0], [0, 0, 1.0]], (FRAMES, 1, 1))
     content = {
@@ -242,23 +239,14 @@ def test_gem_xs_rotations_move_its_skeleton(tmp_path, poses):
         ({"joints": np.zeros((0, 24, 3))}, "shape"),
         ({"joints": np.zeros((2, 24, 3))}, "lie in one place"),
         ({"joints": np.full((2, 24, 3), np.nan)}, "no frame has all shoulders"),
-        (
-            {"joints": np.zeros((2, 30, 3)), "joint_names": [f"Joint_{n:03d}" for n in range(30)]},
-            "30 joints; expected",
-        ),
-        (
-            {"joints": np.random.default_rng(0).normal(size=(2, 24, 3))},
-            "its joints are not SMPL-H's",
-        ),
-        (
-            {
-                "joints": np.random.default_rng(0).normal(size=(2, 52, 3)),
-                "joint_names": [f"mixamorig:{n}" for n in range(52)],
-            },
-            "known by their number; other skeletons are read as .bvh or .glb",
-        ),
+        ({"joints": np.zeros((2, 30, 3)), "joint_names": [f"Joint_{n:03d}" for n in range(30)]},
+         "30 joints; expected"),
+        ({"joints": np.random.default_rng(0).normal(size=(2, 24, 3))}, "joints are not SMPL-H's"),
+        ({"joints": np.random.default_rng(0).normal(size=(2, 52, 3)),
+          "joint_names": [f"mixamorig:{n}" for n in range(52)]},
+         "known by their number; other skeletons are read as .bvh or .glb"),
     ],
-)
+)  # fmt: skip
 def test_what_is_no_person_is_named(tmp_path, arrays, message):
     np.savez(tmp_path / "joints.npz", **arrays)
     with pytest.raises(InputError, match=message):

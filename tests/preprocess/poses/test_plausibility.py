@@ -63,9 +63,8 @@ def test_one_damaged_pose_is_left_out_and_named(walk):
     joints = walk.joint_rotations.copy()
     joints[4, 7] = 0.0, 25.0, 0.0
     damaged = replace(walk, joint_rotations=joints)
-    np.testing.assert_array_equal(
-        require_plausible(damaged, "walk.npz").valid, np.arange(POSES) != 4
-    )
+    kept = require_plausible(damaged, "walk.npz").valid
+    np.testing.assert_array_equal(kept, np.arange(POSES) != 4)
     (sentence,) = plausibility_warnings(damaged)
     assert sentence.startswith("Left out: 1 of 30 poses, with a joint bent by more")
 
@@ -85,10 +84,8 @@ def test_depths_for_a_trackers_own_lens_are_not_judged(walk):
     """4D-Humans takes a focal length of 5000 px for a crop, and puts people far away."""
     far = replace(walk, root_translations=25.0 * walk.root_translations, space="camera")
     assert list(plausibility_warnings(far)) != []
-    assert (
-        list(plausibility_warnings(replace(far, assumed_focal=RelativeFocalLength(ratio=19.5))))
-        == []
-    )
+    far = replace(far, assumed_focal=RelativeFocalLength(ratio=19.5))
+    assert list(plausibility_warnings(far)) == []
 
 
 def test_poses_that_are_all_lost_are_left_to_others(walk):

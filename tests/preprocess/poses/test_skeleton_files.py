@@ -33,26 +33,16 @@ def named(axis: str, limbs: str, pattern: str) -> dict[str, str]:
 
 
 MIXAMO = named(
-    "mixamorig:Hips mixamorig:Spine mixamorig:Spine1 mixamorig:Spine2 mixamorig:Neck "
-    "mixamorig:Head",
-    "UpLeg Leg Foot ToeBase Shoulder Arm ForeArm Hand",
-    "mixamorig:{Side}{limb}",
-)
-BLENDER = named(
-    "hips spine spine.001 chest neck head",
-    "thigh shin foot toe shoulder upper_arm forearm hand",
-    "{limb}.{S}",
-)
-VRM = named(
-    "hips spine chest upperChest neck head",
-    "UpperLeg LowerLeg Foot Toes Shoulder UpperArm LowerArm Hand",
-    "{side}{limb}",
-)
-MHR = named(
-    "root c_spine0 c_spine1 c_spine3 c_neck c_head",
-    "upleg lowleg foot ball clavicle uparm lowarm wrist",
-    "{s}_{limb}",
-)
+    " ".join(f"mixamorig:{name}" for name in ("Hips", "Spine", "Spine1", "Spine2", "Neck", "Head")),
+    "UpLeg Leg Foot ToeBase Shoulder Arm ForeArm Hand", "mixamorig:{Side}{limb}",
+)  # fmt: skip
+BLENDER = named("hips spine spine.001 chest neck head",
+                "thigh shin foot toe shoulder upper_arm forearm hand", "{limb}.{S}")  # fmt: skip
+VRM = named("hips spine chest upperChest neck head",
+            "UpperLeg LowerLeg Foot Toes Shoulder UpperArm LowerArm Hand",
+            "{side}{limb}")  # fmt: skip
+MHR = named("root c_spine0 c_spine1 c_spine3 c_neck c_head",
+            "upleg lowleg foot ball clavicle uparm lowarm wrist", "{s}_{limb}")  # fmt: skip
 SMPL = {name: name for name in JOINT_NAMES}
 NUMBERS = {point: known[BODIES.index("MHR")] for point, known in MIDDLE_JOINTS.items()} | {
     f"{side}_{point}": known[0][place]

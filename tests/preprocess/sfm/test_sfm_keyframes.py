@@ -38,9 +38,8 @@ def test_the_sharpest_frame_of_each_stretch_is_chosen(film):
 
 def test_only_wanted_frames_are_chosen(film):
     part = open_source(film.path, frames=slice(6, 30, 2))
-    assert {key.index for key in select_keyframes(part, no_person, lambda s: None, 60)} == set(
-        range(6, 30, 2)
-    )
+    chosen = select_keyframes(part, no_person, lambda share: None, 60)
+    assert {key.index for key in chosen} == set(range(6, 30, 2))
 
 
 def test_frames_without_a_known_person_are_skipped(film):
@@ -74,9 +73,6 @@ def test_colmap_does_not_look_at_the_person(film, tmp_path):
 
 
 def test_too_few_key_frames_are_refused(film, tmp_path):
+    chosen = select_keyframes(film, no_person, lambda share: None, 5)
     with pytest.raises(InputError, match="Only 5 frames"):
-        write_keyframes(
-            select_keyframes(film, no_person, lambda share: None, 5),
-            tmp_path / "images",
-            tmp_path / "masks",
-        )
+        write_keyframes(chosen, tmp_path / "images", tmp_path / "masks")

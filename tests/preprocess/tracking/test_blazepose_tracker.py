@@ -13,6 +13,8 @@ from preprocess.tracking.blazepose_networks import (
     PersonDetection,
     PersonSquare,
     anchors,
+    is_same_person,
+    parts_of_frame,
     refine,
 )
 from preprocess.tracking.first_look import PersonFinder
@@ -246,6 +248,24 @@ def test_a_flat_heat_map_leaves_a_point_where_it_is_and_a_peak_draws_it():
     np.testing.assert_array_equal(refined[0], points[0])
     np.testing.assert_allclose(refined[1], [84, 124], atol=0.1)
     np.testing.assert_array_equal(refine(points - 300, heatmaps, 256), points - 300)
+
+
+def test_the_parts_of_a_wide_frame_cover_it():
+    wide = parts_of_frame(np.zeros((100, 260, 3), np.uint8))
+    assert [part.x for part in wide] == [50.0, 130.0, 210.0]
+    assert {(part.y, part.side) for part in wide} == {(50.0, 100.0)}
+    tall = parts_of_frame(np.zeros((260, 100, 3), np.uint8))
+    assert [part.y for part in tall] == [50.0, 130.0, 210.0]
+
+
+def test_detections_of_one_head_are_one_person():
+    def detection(x, head_x):
+        box = np.array([head_x - 20.0, 0, head_x + 20, 40])
+        return PersonDetection(square=PersonSquare(x=x, y=100.0, side=200.0), box=box, score=1.0)
+
+    assert is_same_person(detection(100.0, 100.0), detection(110.0, 160.0))
+    assert is_same_person(detection(100.0, 100.0), detection(160.0, 105.0))
+    assert not is_same_person(detection(100.0, 100.0), detection(160.0, 160.0))
 
 
 def test_the_longer_a_person_is_lost_the_farther_it_may_be():

@@ -119,9 +119,8 @@ def test_bent_limbs_and_the_roots_turn_come_back(walker, shaped, keypoint_camera
     lifted = lift_keypoints(track_motion(walker), shaped, keypoint_camera)
     off = relative_joints(shaped, lifted) - relative_joints(shaped, walker)
     assert np.linalg.norm(off, axis=2).mean() < 0.03
-    turned = Rotation.from_rotvec(lifted.root_rotations).inv() * Rotation.from_rotvec(
-        walker.root_rotations
-    )
+    true, found = (Rotation.from_rotvec(each.root_rotations) for each in (walker, lifted))
+    turned = found.inv() * true
     assert np.degrees(turned.magnitude()).max() < 6.0
     assert np.abs(lifted.root_translations - walker.root_translations).max() < 0.15
     assert lifted.intrinsic[0, 0] == keypoint_camera.focal_px[0]
