@@ -25,7 +25,8 @@ def test_another_packages_tracker_is_made_for_the_person(monkeypatch):
         make_tracker("vitpose")
 
 
-def test_the_projects_own_tracker_needs_no_entry_point():
+def test_the_projects_own_tracker_and_segmenter_need_no_entry_point(shaped):
+    assert isinstance(make_segmenter("blazepose", shaped), BlazePoseSegmenter)
     tracker = make_tracker()
     assert isinstance(tracker, BlazePoseTracker)
     assert isinstance(tracker, PersonTracker)
@@ -40,10 +41,6 @@ def test_a_segmenter_is_named_by_its_prefix():
     assert segmenter_name("segmenter:blazepose") == "blazepose"
     assert segmenter_name("masks/") is None
     assert segmenter_name(None) is None
-
-
-def test_the_own_segmenter_is_made_by_its_name(shaped):
-    assert isinstance(make_segmenter("blazepose", shaped), BlazePoseSegmenter)
 
 
 def test_another_packages_segmenter_is_made_for_the_body(monkeypatch, shaped):

@@ -1,7 +1,7 @@
 """Words for scores: the truth's own blur is the yardstick."""
 
 import math
-from dataclasses import dataclass
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -21,14 +21,6 @@ from avatar.evaluation.image_metrics import (
 )
 
 PERSON_PX = 160
-
-
-@dataclass(frozen=True, kw_only=True)
-class Looks:
-    """A scored picture."""
-
-    blur: float
-    overlap: float = 0.9
 
 
 def dressed(stripe_px: int, contrast: float) -> tuple[np.ndarray, np.ndarray]:
@@ -89,10 +81,13 @@ def test_words_for_what_was_measured(blur, overlap, word):
 
 
 def test_of_several_frames_half_are_at_least_as_good_as_the_word():
-    assert overall_verdict([Looks(blur=0.01), Looks(blur=math.inf)]) == "soft"
-    assert overall_verdict([Looks(blur=0.01), *[Looks(blur=math.inf)] * 2]) == "failed"
-    assert overall_verdict([Looks(blur=0.01, overlap=0.1), Looks(blur=0.01, overlap=0.9)]) == "soft"
-    assert overall_verdict([Looks(blur=math.nan, overlap=math.nan), Looks(blur=0.001)]) == "sharp"
+    def looks(blur, overlap=0.9):
+        return SimpleNamespace(blur=blur, overlap=overlap)
+
+    assert overall_verdict([looks(0.01), looks(math.inf)]) == "soft"
+    assert overall_verdict([looks(0.01), *[looks(math.inf)] * 2]) == "failed"
+    assert overall_verdict([looks(0.01, 0.1), looks(0.01)]) == "soft"
+    assert overall_verdict([looks(math.nan, math.nan), looks(0.001)]) == "sharp"
     assert overall_verdict([]) is None
 
 

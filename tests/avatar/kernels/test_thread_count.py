@@ -2,7 +2,6 @@
 
 import numba
 import numpy as np
-import pytest
 import torch
 
 from avatar.kernels import operations
@@ -15,11 +14,6 @@ from avatar.kernels.operands import (
     PosedBones,
     PriorPoints,
 )
-
-OPERATIONS = (
-    "field_forward", "add_table_gradient", "march", "composite", "learn",
-    "scatter_max_density", "update_roots", "mean_normals", "adam_step",
-)  # fmt: skip
 
 
 def results_of(learnt) -> dict[str, list[torch.Tensor]]:
@@ -66,23 +60,16 @@ def results_of(learnt) -> dict[str, list[torch.Tensor]]:
     }
 
 
-@pytest.fixture(scope="module")
-def by_threads(learnt) -> list[dict[str, list[torch.Tensor]]]:
-    before = numba.get_num_threads()
-    results = []
+def test_every_operation_is_bit_equal_for_any_number_of_threads(learnt):
+    before, results = numba.get_num_threads(), []
     try:
         for threads in range(1, numba.config.NUMBA_NUM_THREADS + 1):
             numba.set_num_threads(threads)
             results.append(results_of(learnt))
     finally:
         numba.set_num_threads(before)
-    return results
-
-
-@pytest.mark.parametrize("operation", OPERATIONS)
-def test_an_operation_is_bit_equal_for_any_number_of_threads(by_threads, operation):
-    alone = by_threads[0][operation]
-    assert all(float(part.float().abs().max()) > 0 for part in alone)
-    for results in by_threads[1:]:
-        for one, other in zip(alone, results[operation], strict=True):
-            assert torch.equal(one, other)
+    for name, alone in results[0].items():
+        assert all(float(part.float().abs().max()) > 0 for part in alone), name
+        for others in results[1:]:
+            for one, other in zip(alone, others[name], strict=True):
+                assert torch.equal(one, other), name

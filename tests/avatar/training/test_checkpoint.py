@@ -197,9 +197,12 @@ def test_a_checkpoint_of_another_format_says_which(saved):
 
 
 @pytest.mark.parametrize(
-    "key", ["format", "config", "rig", "field", "optimizer", "density", "occupied", "counts"]
-)
-@pytest.mark.parametrize("change", ["missing", "nothing", "too little"])
+    ("key", "change"),
+    [("format", "missing"), ("config", "missing"), ("rig", "missing"), ("field", "missing"),
+     ("optimizer", "missing"), ("density", "missing"), ("occupied", "missing"),
+     ("counts", "missing"), ("format", "nothing"), ("rig", "nothing"), ("optimizer", "nothing"),
+     ("config", "too little"), ("field", "too little"), ("density", "too little")],
+)  # fmt: skip
 def test_a_checkpoint_that_lacks_something_is_refused_by_name(saved, key, change):
     def lose(state):
         if change == "missing":
