@@ -114,8 +114,8 @@ def trainers(rig, clip):
         for observation in clip.observations[:6]:
             filmed = exposed(observation, DARK if observation.frame.index % 2 else np.ones(3))
             trainer.add_frame(prepare_frame(filmed, rig))
-        for step in range(120):
-            trainer.step(rate=1.0 - step / 120, hard_surface_share=0.5)
+        for step in range(80):
+            trainer.step(rate=1.0 - step / 80, hard_surface_share=0.5)
         trained.append(trainer)
     return trained
 
