@@ -11,6 +11,7 @@ import multiprocessing
 import os
 import statistics
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -126,34 +127,47 @@ def waking_seconds() -> float:
 
 
 def _time_shares(capture: Path, waking: float, results) -> None:
-    """Puts speed and shared part, medians over slices, into a queue."""
+    """Puts speed and shared part into a queue: medians, over steps, of each thread's shares.
+
+    A longest share of single steps would be one that the machine's other work held up. Blocks that
+    threads claim are dealt out in turn.
+    """
     numba.set_num_threads(1)
     trainer = trained_on(capture)
     numba.set_num_threads(MANY_CORES)
     torch.set_num_threads(1)
-    shares = list[list[float]]()
+    shares = defaultdict[str, list[np.ndarray]](list)
 
-    def run_in_turn(kernel: Callable[..., Any], *arguments: Any) -> None:
+    def time_each(kernel: Callable[..., Any], arguments: list[tuple[Any, ...]]) -> None:
         marks = [time.perf_counter()]
         torch.set_flush_denormal(True)
-        for thread in range(MANY_CORES):
-            kernel(thread, MANY_CORES, *arguments)
+        for own in arguments:
+            kernel(*own)
             marks.append(time.perf_counter())
         torch.set_flush_denormal(False)
-        shares.append(np.diff(marks).tolist())
+        shares[kernel.__name__].append(np.diff(marks))
 
-    speeds, parts = [], []
+    def threads_in_turn(kernel: Callable[..., Any], *arguments: Any) -> None:
+        time_each(kernel, [(thread, MANY_CORES, *arguments) for thread in range(MANY_CORES)])
+
+    def blocks_in_turn(kernel: Callable[..., Any], *arguments: Any) -> None:
+        dealt = (np.array([thread, MANY_CORES]) for thread in range(MANY_CORES))
+        time_each(kernel, [(blocks, *arguments) for blocks in dealt])
+
     for module in (operations, pose_correction, replay_buffer):
-        patch.object(module, "run_threads", run_in_turn).start()
-    for _ in range(SLICES):
-        shares.clear()
-        began = time.perf_counter()
-        make_steps(trainer, STEPS_PER_SLICE)
-        wall, shared = time.perf_counter() - began, float(np.sum(shares))
-        longest = sum(max(each) + waking for each in shares)
-        speeds.append(wall / (wall - shared + longest))
-        parts.append(shared / wall)
-    results.put((statistics.median(speeds), statistics.median(parts)))
+        patch.object(module, "run_threads", threads_in_turn).start()
+    patch.object(operations, "run_blocks", blocks_in_turn).start()
+    make_steps(trainer, STEPS_PER_SLICE)
+    shares.clear()
+    count = SLICES * STEPS_PER_SLICE
+    began = time.perf_counter()
+    make_steps(trainer, count)
+    wall = (time.perf_counter() - began) / count
+    serial = wall - sum(float(np.sum(each)) for each in shares.values()) / count
+    medians = [(len(each) / count, np.median(each, axis=0)) for each in shares.values()]
+    shared = sum(calls * float(each.sum()) for calls, each in medians)
+    longest = sum(calls * (float(each.max()) + waking) for calls, each in medians)
+    results.put(((serial + shared) / (serial + longest), shared / (serial + shared)))
 
 
 def two_runs_at_once(capture: Path) -> float:

@@ -134,6 +134,20 @@ def _store(vector, array):
 
 
 @operation
+def claim(typing_context, counter):
+    """Number of a block that no other thread has claimed: `counter[0]`, which `counter[1]` is added
+    to at once (`run_blocks`)."""
+
+    def code(context, builder, signature, arguments):
+        array = context.make_array(counter)(context, builder, arguments[0])
+        index = context.get_value_type(intp)
+        stride = builder.load(builder.gep(array.data, [ir.Constant(index, 1)]))
+        return builder.atomic_rmw("add", array.data, stride, "monotonic")
+
+    return intp(counter), code
+
+
+@operation
 def load4(typing_context, array, row, column):
     """`array[row, column : column + 4]`; row and column are not negative, and not checked."""
     return _load(vector4, array)

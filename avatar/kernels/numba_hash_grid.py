@@ -13,6 +13,7 @@ from avatar.kernels.kernel_compiler import (
     INLINED,
     INLINED_ALLOCATION,
     add4,
+    claim,
     compile_kernel,
     dot4,
     load4,
@@ -225,18 +226,22 @@ def _adam_block(g, m, v, p, rates):
 
 
 @compile_kernel(**FAST_MATH)
-def adam_step(thread, threads, parameters):
+def adam_step(claimed, parameters):
     """Adam's step on flat arrays; the gradients are zeroed in the same pass over the memory.
 
     Blocks are slices, because LLVM vectorises only loops that begin at 0. A parameter has its
     gradient, mean, mean square and numbers, and its rates: the learning rate, the shares of the new
     gradient and of its square in their means, the scale of the squares' root, and epsilon.
     """
+    passed, claimed_block = 0, claim(claimed)
     for (grad, mean, square, numbers), rates in parameters:
         blocks = (numbers.shape[0] + ENTRIES_PER_BLOCK - 1) // ENTRIES_PER_BLOCK
-        for block in range(thread, blocks, threads):
-            part = slice(block * ENTRIES_PER_BLOCK, (block + 1) * ENTRIES_PER_BLOCK)
+        while claimed_block < passed + blocks:
+            start = (claimed_block - passed) * ENTRIES_PER_BLOCK
+            part = slice(start, start + ENTRIES_PER_BLOCK)
             _adam_block(grad[part], mean[part], square[part], numbers[part], rates)
+            claimed_block = claim(claimed)
+        passed += blocks
 
 
 @compile_kernel(**FAST_MATH)

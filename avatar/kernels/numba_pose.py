@@ -17,6 +17,7 @@ from avatar.kernels.kernel_compiler import (
     FAST_MATH,
     INLINED,
     add4,
+    claim,
     compile_kernel,
     load4,
     prefetch,
@@ -190,7 +191,7 @@ def _update_slab(
 
 @compile_kernel(**FAST_MATH)
 def update_roots(
-    thread, threads, slots, packed_cells, cells, grid_low, cell_m, roots, weights, shape, low,
+    claimed, slots, packed_cells, cells, grid_low, cell_m, roots, weights, shape, low,
     nodes_per_m, bones,
 ):  # fmt: skip
     """Moves roots to follow their frames' poses, by one chord step towards the cell's center.
@@ -199,13 +200,14 @@ def update_roots(
     place, inverse Jacobians and second-order terms stay. `bones` are the new poses' matrices
     (slots, 24, 12).
     """
-    passed = 0
+    passed, slab = 0, claim(claimed)
     for slot in slots:
-        for i in range((thread - passed) % threads, cells[slot, 0], threads):
+        while slab < passed + cells[slot, 0]:
             _update_slab(
-                i, packed_cells[slot], cells[slot], grid_low[slot], cell_m, roots[slot], weights,
-                shape, low, nodes_per_m, bones[slot],
+                slab - passed, packed_cells[slot], cells[slot], grid_low[slot], cell_m, roots[slot],
+                weights, shape, low, nodes_per_m, bones[slot],
             )  # fmt: skip
+            slab = claim(claimed)
         passed += cells[slot, 0]
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from avatar.kernels.kernel_compiler import (
     INLINED,
     NO_ALLOCATION,
+    claim,
     compile_kernel,
     prefetch,
 )
@@ -229,7 +230,7 @@ def _march_block(
 
 @compile_kernel(**NO_ALLOCATION)
 def march(
-    thread, threads, origins, directions, slots, jitter, sample_step_m,
+    claimed, origins, directions, slots, jitter, sample_step_m,
     cell_index, cell_roots, cell_low, cell_shape, cell_m,
     occupied, density, low, cells_per_m, opaque_margin_steps, most_samples, points, rows, counts,
     next_steps,
@@ -244,13 +245,15 @@ def march(
     rays lie together.
     """
     blocks = (origins.shape[0] + RAYS_PER_BLOCK - 1) // RAYS_PER_BLOCK
-    for block in range(thread, blocks, threads):
+    block = claim(claimed)
+    while block < blocks:
         _march_block(
             block, origins, directions, slots, jitter, sample_step_m,
             cell_index, cell_roots, cell_low, cell_shape, cell_m,
             occupied, density, low, cells_per_m, opaque_margin_steps, most_samples,
             points, rows, counts, next_steps,
         )  # fmt: skip
+        block = claim(claimed)
 
 
 @compile_kernel(**NO_ALLOCATION)

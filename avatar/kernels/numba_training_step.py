@@ -5,15 +5,14 @@ caches: field, light, composite and loss, the draw of the gradients to propagate
 through the network, to the gradients of the samples' positions and to the wrenches on the bones.
 Threads wait for one another once.
 
-Each thread has a run of blocks, with about as many points as any other's, and its own sums, which
-are added in the threads' order: runs with one number of threads are equal to the bit, and differ by
-rounding from those with another.
+Threads claim block after block. Each block has sums of its own, which are added in the blocks'
+order: a step is equal to the bit for any number of threads.
 """
 
 import numpy as np
 
 from avatar.kernels import numba_priors
-from avatar.kernels.kernel_compiler import FAST_MATH, compile_kernel
+from avatar.kernels.kernel_compiler import FAST_MATH, claim, compile_kernel
 from avatar.kernels.numba_field import backward_passes, forward_block
 from avatar.kernels.numba_hash_grid import POINTS_PER_BLOCK, encode_points_backward
 from avatar.kernels.numba_pose import write_wrenches
@@ -34,8 +33,6 @@ F32 = np.float32
 RAYS_PER_BLOCK = 32
 """Rays that pass through the step together: about 200 samples, whose features fit a core's cache
 beside the network."""
-RAY_COST = 4
-"""What a ray costs beside its samples, in samples."""
 
 
 @compile_kernel(**FAST_MATH)
@@ -135,7 +132,7 @@ def _block_range(block, kind_count, ends, sample_offsets, sample_count):
 
 @compile_kernel(**FAST_MATH)
 def learn(
-    thread, threads, settings, samples, rays, surface, priors, field, levels, pose_levels, pose,
+    claimed, settings, samples, rays, surface, priors, field, levels, pose_levels, pose,
     outputs, backward, sums,
 ):  # fmt: skip
     """Renders rays and propagates the gradients of their mean loss and of the priors.
@@ -160,8 +157,8 @@ def learn(
             world normals, wrenches (rays, 24, 6); written. No wrenches are computed for zero rays.
         backward: Points that have a gradient, the gradients of their features, and the first place
             and number of those of each block (blocks, 2); written.
-        sums: Each thread's sums of the gradients of W₁, W₂ᵀ, b₁ and b₂, zero before (threads,
-            width + 6, hidden; or no rows); sum of the gradients' strengths of each block.
+        sums: Of each block the sums of the gradients of W₁, W₂ᵀ, b₁ and b₂ (blocks, width + 6,
+            hidden; or no rows), and the sum of the gradients' strengths; written.
     """
     points, sample_offsets, sample_counts, root_rows = samples
     slots, target, world_from_body, roots = rays
@@ -172,13 +169,13 @@ def learn(
     skinning, skinning_shape, skinning_low, nodes_per_m, bones = pose
     raw, grad_raw, rendered, loss, normals, wrenches = outputs
     rows, grad_features, runs = backward
-    own_sums, strengths = sums[0][thread], sums[1]
+    network_sums, strengths = sums
     sample_step_m, alpha_weight, hard_weight, faint, seed, needs_normals = settings
 
     ray_count, kind_count = slots.shape[0], weights.shape[0]
     ray_blocks = (ray_count + RAYS_PER_BLOCK - 1) // RAYS_PER_BLOCK
     sample_count = ends[0]
-    total, longest, passed = points.shape[0] + RAY_COST * ray_count, 0, 0
+    longest = 0
     for block in range(kind_count + ray_blocks):
         start, stop, _ = _block_range(block, kind_count, ends, sample_offsets, sample_count)
         longest = max(longest, stop - start)
@@ -186,14 +183,12 @@ def learn(
     drawn = np.empty((longest, 4), F32)
     neutral = np.empty((ray_count, 4), F32)
     grad_points = np.empty((sample_count if wrenches.shape[0] > 0 else 0, 3), F32)
-    for block in range(kind_count + ray_blocks):
+    block = claim(claimed)
+    while block < kind_count + ray_blocks:
+        own_sums = network_sums[block]
+        _clear(own_sums)
         start, stop, ray = _block_range(block, kind_count, ends, sample_offsets, sample_count)
         last_ray, count = min(ray + RAYS_PER_BLOCK, ray_count), stop - start
-        cost = count if ray < 0 else count + RAY_COST * (last_ray - ray)
-        owner = (passed + cost // 2) * threads // max(total, 1)
-        passed += cost
-        if min(owner, threads - 1) != thread:
-            continue
         part, raw_part, grad_part = points[start:stop], raw[start:stop], grad_raw[start:stop]
         for chunk in range((count + POINTS_PER_BLOCK - 1) // POINTS_PER_BLOCK):
             forward_block(
@@ -234,3 +229,4 @@ def learn(
             )  # fmt: skip
         for n in range(kept):
             row_part[n] += start
+        block = claim(claimed)

@@ -9,7 +9,6 @@ import itertools
 import threading
 from collections.abc import Sequence
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Float32, Int32, Int64
@@ -50,7 +49,7 @@ from avatar.kernels.operands import (
     RaySamples,
     SkinningVolume,
 )
-from avatar.kernels.threads import run_threads
+from avatar.kernels.threads import run_blocks, run_threads
 from avatar.rig import Rig
 
 _SCRATCH = threading.local()
@@ -104,7 +103,7 @@ def learn(
     lists = samples.points, *priors.lists
     points = torch.cat(lists)
     ends = np.array(list(itertools.accumulate(part.shape[0] for part in lists)))
-    count, total, width, threads = len(rays.slots), len(points), levels.feature_width, _threads()
+    count, total, width = len(rays.slots), len(points), levels.feature_width
     blocks = len(priors.lists) - (-count // numba_training_step.RAYS_PER_BLOCK)
     raw, grad_raw = np.empty((2, total, 4), dtype=np.float32)
     rendered, loss = np.empty((count, 4), np.float32), np.empty(count, np.float32)
@@ -112,9 +111,9 @@ def learn(
     wrenches = np.empty((count if poses else 0, 24, 6), np.float32)
     rows, grad_features = np.empty(total, np.int64), np.empty((total, width), np.float32)
     runs, strengths = np.empty((blocks, 2), np.int64), np.empty(blocks, np.float32)
-    # each thread's sums of the gradients of W₁, W₂ᵀ and both biases; no rows if frozen
-    sums = np.zeros((threads, 0 if is_frozen else width + 6, HIDDEN_WIDTH), dtype=np.float32)
-    run_threads(
+    # each block's sums of the gradients of W₁, W₂ᵀ and both biases; no rows if frozen
+    sums = np.empty((blocks, 0 if is_frozen else width + 6, HIDDEN_WIDTH), dtype=np.float32)
+    run_blocks(
         numba_training_step.learn,
         (
             np.float32(how.sample_step_m), np.float32(how.alpha_weight),
@@ -173,10 +172,6 @@ def add_table_gradient(
     )  # fmt: skip
 
 
-def _threads() -> int:
-    return numba.get_num_threads()
-
-
 def _network_arrays(
     network: NetworkLayers,
 ) -> tuple[
@@ -195,9 +190,9 @@ def _network_arrays(
 
 
 def _network_gradients(
-    sums: Float32[np.ndarray, "threads rows hidden"], width: int
+    sums: Float32[np.ndarray, "blocks rows hidden"], width: int
 ) -> NetworkGradients:
-    """The gradients of both layers, added up in the order of the threads."""
+    """The gradients of both layers, added up in the order of the blocks."""
     total = sums.sum(axis=0)
     return total[:width], total[width + 4], total[width : width + 4].T, total[width + 5, :4]
 
@@ -221,7 +216,7 @@ def adam_step(parameters: list[tuple[AdamSettings, AdamArrays]]) -> None:
         (first, second), (rate, scale) = how.betas, how.scales
         rates = tuple(map(np.float32, (rate, 1.0 - first, 1.0 - second, scale, how.eps)))
         flat.append((tuple(arrays), rates))
-    run_threads(numba_hash_grid.adam_step, tuple(flat))
+    run_blocks(numba_hash_grid.adam_step, tuple(flat))
 
 
 def move_toward(means: Sequence[Tensor], values: Sequence[Tensor], share: float) -> None:
@@ -269,7 +264,7 @@ def _march(
     padded, padded_rows = _scratch_samples(len(rays.slots) * how.max_samples)
     count, reached = torch.empty(2, len(rays.slots), dtype=torch.int32)
     first = torch.empty(len(rays.slots), dtype=torch.int64)
-    run_threads(
+    run_blocks(
         numba_rendering.march,
         *(part.numpy() for part in rays), np.float32(how.sample_step_m),
         *(part.numpy() for part in cells[:4]), np.float32(cells.cell_m),
@@ -345,7 +340,7 @@ def update_roots(
     bones: Float32[Tensor, "slots 24 12"],
 ) -> None:
     """Moves the roots of some slots, in place, to follow their changed poses; bones are of all."""
-    run_threads(
+    run_blocks(
         numba_pose.update_roots,
         np.array(slots, dtype=np.int64), cells.packed_cells.numpy(), cells.shape.numpy(),
         cells.low.numpy(), np.float32(cells.cell_m), cells.roots.numpy(),

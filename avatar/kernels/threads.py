@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any, final
 
 import numba
+import numpy as np
 import torch
 
 _IN_USE = threading.Lock()
@@ -29,15 +30,31 @@ def run_threads(kernel: Callable[..., Any], *arguments: Any) -> None:
     end there, an eighth of them at a time, where entries of the table have no gradient.
     """
     threads = numba.get_num_threads()
+    _run_shares(kernel, [(thread, threads, *arguments) for thread in range(threads)])
+
+
+def run_blocks(kernel: Callable[..., Any], *arguments: Any) -> None:
+    """Runs `kernel(blocks, *arguments)` on each thread, as `run_threads` does.
+
+    Each thread claims block after block (`kernel_compiler.claim`) until none is left, so that one
+    whose core is slow, or has other work, is not waited for. No result may depend on who claims.
+    """
+    blocks = np.array([0, 1])
+    _run_shares(kernel, [(blocks, *arguments)] * numba.get_num_threads())
+
+
+def _run_shares(kernel: Callable[..., Any], shares: list[tuple[Any, ...]]) -> None:
+    """Calls the kernel with the arguments of each thread."""
+    threads = len(shares)
     is_alone = threads == 1 or not _IN_USE.acquire(blocking=False)
     torch.set_flush_denormal(True)
     try:
         if is_alone:
-            for thread in range(threads):
-                kernel(thread, threads, *arguments)
+            for share in shares:
+                kernel(*share)
             return
         team = _TEAMS.pop((os.getpid(), threads), None) or _Team(threads)
-        team.run(kernel, arguments)
+        team.run(kernel, shares)
         _TEAMS[os.getpid(), threads] = team  # one that an interrupt left waiting is not used again
     finally:
         torch.set_flush_denormal(False)
@@ -51,21 +68,20 @@ class _Team:
 
     def __init__(self, threads: int) -> None:
         """Starts all threads but the caller's own."""
-        self._threads = threads
         self._begin, self._end = ([threading.Lock() for _ in range(threads - 1)] for _ in "be")
-        self._work: tuple[Callable[..., Any], tuple[Any, ...]] | None = None
+        self._work: tuple[Callable[..., Any], list[tuple[Any, ...]]] | None = None
         self._error: BaseException | None = None
         for lock in (*self._begin, *self._end):
             lock.acquire()
         for place in range(threads - 1):
             threading.Thread(target=self._wait, args=(place,), daemon=True).start()
 
-    def run(self, kernel: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
+    def run(self, kernel: Callable[..., Any], shares: list[tuple[Any, ...]]) -> None:
         """Runs the kernel on all threads; an error of another thread is raised after the last."""
-        self._work, self._error = (kernel, arguments), None
+        self._work, self._error = (kernel, shares), None
         for lock in self._begin:
             lock.release()
-        kernel(0, self._threads, *arguments)
+        kernel(*shares[0])
         for lock in self._end:
             lock.acquire()
         self._work = None
@@ -78,9 +94,9 @@ class _Team:
             self._begin[place].acquire()
             try:
                 assert self._work is not None, "threads are woken for work alone"
-                kernel, arguments = self._work
-                kernel(place + 1, self._threads, *arguments)
-                del kernel, arguments  # nothing is kept alive while waiting
+                kernel, shares = self._work
+                kernel(*shares[place + 1])
+                del kernel, shares  # nothing is kept alive while waiting
             except BaseException as error:  # the calling thread raises it
                 self._error = error
             self._end[place].release()

@@ -1,4 +1,4 @@
-"""Whatever does not sum over points is bit-equal for any number of threads."""
+"""Operations are bit-equal for any number of threads."""
 
 import numba
 import numpy as np
@@ -54,7 +54,13 @@ def results_of(learnt) -> dict[str, list[torch.Tensor]]:
         "add_table_gradient": [grad_table],
         "march": list(samples),
         "composite": [operations.composite(raw, samples, 0.01)],
-        "learn": [learnt.log_density, learnt.rendered, learnt.loss, learnt.wrenches],
+        "learn": [
+            learnt.log_density,
+            learnt.rendered,
+            learnt.loss,
+            learnt.wrenches,
+            *(torch.from_numpy(np.ascontiguousarray(grad)) for grad in learnt.network),
+        ],
         "scatter_max_density": [grid.density],
         "update_roots": [moved.roots[0, : int((cells.packed_cells[0] >> 3).max())]],
     }

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from avatar.kernels.kernel_compiler import FAST_MATH, compile_kernel
-from avatar.kernels.threads import run_threads
+from avatar.kernels.kernel_compiler import FAST_MATH, claim, compile_kernel
+from avatar.kernels.threads import run_blocks, run_threads
 
 
 @compile_kernel(cache=False, **FAST_MATH)
@@ -16,6 +16,15 @@ def count_shares(thread, threads, counts):
     """Counts each place of a thread's share."""
     for place in range(thread, counts.shape[0], threads):
         counts[place] += 1
+
+
+@compile_kernel(cache=False, **FAST_MATH)
+def count_blocks(claimed, counts):
+    """Counts each block that a thread claims."""
+    block = claim(claimed)
+    while block < counts.shape[0]:
+        counts[block] += 1
+        block = claim(claimed)
 
 
 @compile_kernel(cache=False, **FAST_MATH)
@@ -37,6 +46,13 @@ def test_each_share_is_run_once(threads):
     counts = np.zeros(101, dtype=np.int64)
     for _ in range(20):
         run_threads(count_shares, counts)
+    assert (counts == 20).all()
+
+
+def test_each_block_is_claimed_once(threads):
+    counts = np.zeros(1000, dtype=np.int64)
+    for _ in range(20):
+        run_blocks(count_blocks, counts)
     assert (counts == 20).all()
 
 
