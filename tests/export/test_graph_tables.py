@@ -4,7 +4,7 @@ import pytest
 from baselines.reference_skinning import PosedNodes, skin_trilinear
 from capture.input_error import InputError
 from export.package.player_tables import RenderSettings, round_codes
-from export.player_inputs import skinning_nodes, subdivided_skinning_nodes
+from export.player_inputs import skinning_nodes
 
 
 @pytest.fixture(scope="module")
@@ -12,11 +12,17 @@ def skin(tables):
     return tables.skinning
 
 
-def test_stored_weights_are_the_rigs_own(stand_in, skin):
-    place = np.argwhere(skin.index > 0)
-    points = skin.low + place * skin.step_m
-    there = skin.weights[skin.index[tuple(place.T)]]
-    np.testing.assert_allclose(there, stand_in.rig.weights_at(points), atol=2e-4)
+@pytest.mark.parametrize("per_step", [1, 2])
+def test_nodes_have_the_rigs_own_weights_whatever_their_step(stand_in, skin, per_step):
+    nodes = skinning_nodes(skin, per_step)
+    place = np.argwhere(nodes.index > 0)
+    rows = nodes.index[tuple(place.T)]
+    points = nodes.low + place * nodes.step_m
+    np.testing.assert_allclose(nodes.positions[rows], points, atol=1e-6)
+    exact = stand_in.rig.weights_at(points)
+    np.testing.assert_allclose(nodes.weights[:, rows].T, exact, atol=2e-4)
+    both = (nodes.index[..., :-1] > 0) & (nodes.index[..., 1:] > 0)
+    assert (np.diff(nodes.index, axis=2)[both] == 1).all()  # along z rows follow each other
 
 
 def test_the_skinning_grid_surrounds_all_visible_depths(tables, skin):
@@ -27,22 +33,6 @@ def test_the_skinning_grid_surrounds_all_visible_depths(tables, skin):
         cell = np.floor((points - skin.low) / skin.step_m).astype(int)
         stored = [skin.index[tuple((cell + corner).T)] > 0 for corner in np.ndindex(2, 2, 2)]
         assert np.mean(stored) > 0.999  # normals and depths are rounded where they are stored
-
-
-def test_halving_the_step_changes_no_weight(stand_in, skin):
-    nodes = subdivided_skinning_nodes(skin)
-    place = np.argwhere(nodes.index > 0)
-    rows = nodes.index[tuple(place.T)]
-    points = nodes.low + place * nodes.step_m
-    np.testing.assert_allclose(nodes.positions[rows], points, atol=1e-6)
-    exact = stand_in.rig.weights_at(points)
-    np.testing.assert_allclose(nodes.weights[:, rows].T, exact, atol=2e-4)
-
-
-def test_along_z_rows_follow_each_other(skin):
-    index = subdivided_skinning_nodes(skin).index
-    both = (index[..., :-1] > 0) & (index[..., 1:] > 0)
-    assert (np.diff(index, axis=2)[both] == 1).all()
 
 
 @pytest.mark.parametrize("per_step", [1, 2])
@@ -85,16 +75,6 @@ def test_rounding_codes_moves_none_by_more_than_a_step(step, largest):
     error = np.abs(near.astype(int) - codes.astype(int))
     assert error[: largest - step].max() <= step // 2
     assert error.max() < step
-
-
-def test_stored_nodes_are_the_skins_own(skin):
-    nodes = skinning_nodes(skin, 1)
-    np.testing.assert_array_equal(nodes.weights[:, :-1], skin.weights.T)
-    place = np.argwhere(nodes.index > 0)
-    rows = nodes.index[tuple(place.T)]
-    np.testing.assert_allclose(nodes.positions[rows], nodes.low + place * nodes.step_m, atol=1e-6)
-    both = (nodes.index[..., :-1] > 0) & (nodes.index[..., 1:] > 0)
-    assert (np.diff(nodes.index, axis=2)[both] == 1).all()
 
 
 def test_steps_cut_in_other_ways_are_refused(skin):

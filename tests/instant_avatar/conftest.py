@@ -18,7 +18,7 @@ from export.build import ExportReport
 from export.player import Player
 from instant_avatar import ingest, play
 from instant_avatar.report import report_writer
-from instant_avatar.run import snapshot_writer, training_session
+from instant_avatar.run import final_scoring, snapshot_writer, training_session
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.open_capture import open_capture
@@ -63,17 +63,20 @@ BRIEF = pytest.MonkeyPatch()
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup():
     """Bake coarser voxels, fine-tune on fewer, smaller images, export fewer Gaussians
-    and texels, fit poses in fewer steps, and show a shorter film."""
+    and texels, fit poses in fewer steps, judge smaller pictures, and show a shorter film."""
     BRIEF.setattr(bake_tables, "MIN_VOXEL_M", BRIEF_VOXEL_M)
     BRIEF.setattr(bake_tables, "MAX_VOXEL_M", BRIEF_VOXEL_M)
-    BRIEF.setattr(bake_tables, "FINE_TUNING_PICTURES", 4)
-    BRIEF.setattr(fine_tuning, "TRAINING_PX", 128)
-    BRIEF.setattr(fine_tuning, "VALIDATION_PX", 128)
+    BRIEF.setattr(bake_tables, "FINE_TUNING_PICTURES", 2)
+    BRIEF.setattr(fine_tuning, "PROBE_PICTURES", 2)
+    BRIEF.setattr(fine_tuning, "TRAINING_PX", 64)
+    BRIEF.setattr(fine_tuning, "VALIDATION_PX", 64)
     BRIEF.setattr(splats, "MAX_CROSSED_M2", 0.4)
     BRIEF.setattr(splats, "PIXEL_M", 0.02)
     BRIEF.setattr(mesh_texture, "PIXEL_M", 0.01)
     BRIEF.setattr(mesh_texture, "TEXEL_M", 0.005)
-    BRIEF.setattr(held_out_pose_fitting, "CORRECTIONS_PER_FRAME", 4)
+    BRIEF.setattr(held_out_pose_fitting, "CORRECTIONS_PER_FRAME", 3)
+    BRIEF.setattr(held_out_pose_fitting, "RAYS_PER_CORRECTION", 1024)
+    BRIEF.setattr(final_scoring, "UNFILMED_REDUCTION", 5)
     BRIEF.setattr(report_writer, "ANIMATION_PX", 96)
     BRIEF.setattr(report_writer, "ANIMATION_FRAMES", 4)
 
@@ -89,7 +92,7 @@ def networks_run_once():
     """The same outputs of a network for the same image, of which these tests track many twice."""
     run = OnnxNetwork.run
 
-    @functools.lru_cache(maxsize=100)
+    @functools.lru_cache(maxsize=500)
     def run_once(network: tuple[str, ...], content: bytes, size: int, low: float, high: float):
         image = np.frombuffer(content, dtype=np.uint8).reshape(size, size, 3)
         return run(networks[network], image, low, high)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks import capture_corruptions
-from instant_avatar import check, ingest
+from instant_avatar import check
 from instant_avatar.capture_validation import passes_quick_check
 from instant_avatar.corrected_capture import renumber_motion
 from instant_avatar.studio.shoot import ShootConfig, film_capture
@@ -288,11 +288,11 @@ def test_a_glance_is_enough_for_a_good_capture_and_notices_a_late_one(dancing, s
     )
 
 
-def test_ingest_stops_before_an_unusable_capture_and_says_why(spoilt, capsys, tmp_path):
+def test_ingest_stops_before_an_unusable_capture_and_says_why(spoilt, call_ingest, tmp_path):
     folder = spoilt(capture_corruptions.scale_focal(0.4))
-    assert ingest.main([str(folder), "--out", str(tmp_path / "run")]) == 2
-    said = " ".join(capsys.readouterr().err.split())
-    assert "--force" in said
+    outcome = call_ingest(folder, "--out", tmp_path / "run")
+    assert outcome.code == 2
+    assert "--force" in outcome.complaint()
     assert not (tmp_path / "run").exists()
 
 

@@ -40,7 +40,7 @@ KEYS = {
     "all_round": "verdict limit advice seen half_transparent mean_cosine",
 }
 
-FEW = ("--frames", "0:8")
+FEW = ("--frames", "0:8", "--no-refine-poses")
 """Enough for everything that is not about how well something was learnt."""
 
 
@@ -108,7 +108,7 @@ def test_a_result_that_is_no_avatar_is_called_that_and_kept(
 
     monkeypatch.setattr(final_scoring, "score_rendering", as_of_a_room)
     out = tmp_path / "run"
-    outcome = call_ingest(capture, *FEW, "--out", out, "--no-refine-poses")
+    outcome = call_ingest(capture, *FEW, "--out", out)
     assert outcome.code == 1
     assert "no usable avatar" in outcome.complaint()
     assert "6.88 dB (failed)" in outcome.complaint()
@@ -216,9 +216,9 @@ def test_an_older_run_is_not_lost_by_accident_but_replaced_with_overwrite(
 def test_a_run_goes_on_where_it_stopped(capture, call_ingest, without_baking, tmp_path):
     out = tmp_path / "run"
     RunFolder(path=out).start_run(resume=False)  # as of a run that was killed at its start
-    assert "No checkpoint" in call_ingest(capture, *FEW, "--out", out, "--resume").err
+    assert "No checkpoint" in call_ingest(capture, *FEW[:2], "--out", out, "--resume").err
     first = json.loads((out / "report.json").read_text())
-    outcome = call_ingest(capture, *FEW, "--out", out, "--resume", steps=15)
+    outcome = call_ingest(capture, *FEW[:2], "--out", out, "--resume", steps=15)
     second = json.loads((out / "report.json").read_text())
     assert outcome.code == 0
     assert (first["training"]["steps"], second["training"]["steps"]) == (10, 15)
@@ -248,7 +248,7 @@ def test_a_full_disk_keeps_the_checkpoint_before(
         written.append(save(state, file))
 
     monkeypatch.setattr(torch, "save", full_after_one)
-    outcome = call_ingest(capture, *FEW, "--out", tmp_path / "run")
+    outcome = call_ingest(capture, *FEW[:2], "--out", tmp_path / "run")
     assert outcome.code == 3
     assert "--resume" in outcome.complaint()
     left = {file.name for file in (tmp_path / "run").rglob("*") if file.is_file()}

@@ -193,7 +193,9 @@ def test_the_viewer_reads_events_pauses_and_saves(
     monkeypatch.setattr(live_viewer, "ViserPage", StandInPage)
     monkeypatch.setattr(live_viewer, "PANEL_INTERVAL_S", 0.0)
     monkeypatch.setattr(session_start, "_open_viewer", open_viewer)
-    outcome = call_ingest(capture, "--frames", "0:8", "--out", tmp_path / "run")
+    outcome = call_ingest(
+        capture, "--frames", "0:8", "--no-refine-poses", "--out", tmp_path / "run"
+    )
     assert outcome.code == 0
     page = viewers[0].page
     assert page.notes == ["Package saved"]

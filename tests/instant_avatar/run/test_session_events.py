@@ -61,8 +61,8 @@ def learn(capture, call_ingest, without_baking, tmp_path):
 
     def learn(*readers, **options):
         return train(
-            capture, tmp_path / "run", frames="0:12", steps=10, quiet=True, readers=readers,
-            **options,
+            capture, tmp_path / "run", frames="0:12", steps=10, refine_poses=False, quiet=True,
+            readers=readers, **options,
         )  # fmt: skip
 
     return learn

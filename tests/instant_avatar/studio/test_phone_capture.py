@@ -26,12 +26,6 @@ def capture(tmp_path_factory):
     return folder
 
 
-def masks(folder):
-    return np.stack(
-        [cv2.imread(str(p), cv2.IMREAD_GRAYSCALE) for p in sorted(folder.glob("*.png"))]
-    )
-
-
 def mean_joint_error_deg(one, other):
     """Mean angle between the local rotations of joints 1 … 21 of two poses, degrees."""
     a = rotation_matrices(one.joint_rotations[:21])
@@ -40,7 +34,7 @@ def mean_joint_error_deg(one, other):
     return float(np.rad2deg(np.linalg.norm(vectors, axis=-1)).mean())
 
 
-def test_poses_are_off_by_some_degrees_and_the_focal_length_by_a_tenth(capture):
+def test_poses_are_off_by_some_degrees_the_focal_length_by_a_tenth_and_masks_a_little(capture):
     given, truth = (read_poses(folder / "poses.npz") for folder in (capture, capture / "truth"))
     errors = [mean_joint_error_deg(given[i], truth[i]) for i in range(FRAMES)]
     assert 2.5 < np.median(errors) < 7.0
@@ -50,14 +44,12 @@ def test_poses_are_off_by_some_degrees_and_the_focal_length_by_a_tenth(capture):
     ]
     assert 0.07 < abs(focal[0] / focal[1] - 1.0) < 0.13
     assert not np.any(given.betas)
-
-
-def test_masks_are_wrong_and_sometimes_lack_a_hand_or_have_a_hole(capture):
-    given, exact = masks(capture / "masks"), masks(capture / "truth" / "masks")
-    missing = ((exact > 250) & (given < 5)).sum(axis=(1, 2))
-    assert missing.max() > 5
-    iou = np.minimum(given, exact).sum() / np.maximum(given, exact).sum()
-    assert 0.85 < iou < 0.99
+    given, exact = (
+        np.stack([cv2.imread(str(path), 0) for path in sorted((folder / "masks").glob("*.png"))])
+        for folder in (capture, capture / "truth")
+    )
+    assert ((exact > 250) & (given < 5)).sum(axis=(1, 2)).max() > 5  # a hand, or a hole
+    assert 0.85 < np.minimum(given, exact).sum() / np.maximum(given, exact).sum() < 0.99
 
 
 def test_the_exact_twin_can_be_opened_and_so_can_the_novel_poses(capture):
