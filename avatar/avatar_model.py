@@ -54,7 +54,7 @@ MIN_FACTOR, MAX_FACTOR = 0.3, 3.0
 OBSERVATION_INTERVAL = 4
 """Steps between observations of the light."""
 SOLUTION_INTERVAL = 16
-"""Steps between its solutions, which take as long as all observations of these steps."""
+"""Steps between solutions for the light, a multiple of the steps between observations."""
 
 
 @final

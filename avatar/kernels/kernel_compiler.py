@@ -135,8 +135,10 @@ def _store(vector, array):
 
 @operation
 def claim(typing_context, counter):
-    """Number of a block that no other thread has claimed: `counter[0]`, which `counter[1]` is added
-    to at once (`run_blocks`)."""
+    """Returns `counter[0]`, the number of a block, and adds `counter[1]` to it in one operation.
+
+    No two threads that share a counter claim the same block (`run_blocks`).
+    """
 
     def code(context, builder, signature, arguments):
         array = context.make_array(counter)(context, builder, arguments[0])

@@ -2,8 +2,8 @@
 
 Points are worked on in blocks that stay in the nearest cache: first where all of a block's corners
 lie, in loops over points that LLVM vectorises, then the entries themselves, four features at once.
-Threads own blocks of points or, where the table's gradient is summed, whole levels, so that no two
-write to one place: no atomics, and the same sums for any number of threads.
+A block of points or of Adam's numbers is one thread's or, where the table's gradient is summed, a
+whole level, so that no two write to one place: sums are equal for any number of threads.
 """
 
 import numpy as np

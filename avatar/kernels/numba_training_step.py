@@ -138,6 +138,7 @@ def learn(
     """Renders rays and propagates the gradients of their mean loss and of the priors.
 
     Args:
+        claimed: Counter of the blocks that threads claim: first the priors' points, then the rays.
         settings: Distance between samples, metres; weights of the losses of alpha and of the hard
             surface; strength below which a gradient is drawn by chance, and a seed of the draw;
             whether normals are needed.
