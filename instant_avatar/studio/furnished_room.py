@@ -20,16 +20,8 @@ RoomStyle = Literal["room", "tiles"]
 
 ROOM_LOW_M, ROOM_HIGH_M = (-3.7, 0.0, -3.1), (3.7, 2.7, 3.5)
 """Corners of the room; the actor stands near the origin, on the floor y = 0."""
-FACE_LIGHT = np.array([0.84, 0.92, 0.90, 1.02, 0.97, 0.88], dtype=np.float32)
-"""Brightness of faces: low x, high x, low y, …"""
-FLOOR_FACE = 2
-"""Number of the floor among all faces: low y of the room."""
-SENSOR_NOISE = 1.5
-"""Standard deviation of the sensor's noise, of 255."""
 SUPERSAMPLING = 3
 """Subsamples along each side of a pixel."""
-CELL_M = 0.3
-"""Longest edge of the quads that a face is cut into: those that reach behind a camera are lost."""
 TILE_M, TILE_COLOR, GROUT_COLOR = 0.30, (160, 156, 146), (104, 104, 100)
 """Edge of a tile, metres, its color and that of its border."""
 LEAF_SIZES_M = (0.012, 0.45)
@@ -161,13 +153,14 @@ class FurnishedRoom:
         first, rows, columns = np.moveaxis(self.textures[face], -1, 0)
         column = np.clip(column.astype(np.int32), 0, columns - 1)
         texel = first + np.clip(row.astype(np.int32), 0, rows - 1) * columns + column
-        rgb = self.texels[texel] * FACE_LIGHT[face % 6][..., None]
+        light = np.array([0.84, 0.92, 0.90, 1.02, 0.97, 0.88], dtype=np.float32)  # by side
+        rgb = self.texels[texel] * light[face % 6][..., None]
         width, height = camera.size_px
         rgb = rgb.reshape(height, SUPERSAMPLING, width, SUPERSAMPLING, 3).mean(axis=(1, 3))
         thin = np.s_[::SUPERSAMPLING, ::SUPERSAMPLING]
         rgb *= _foot_shadows(face[thin], seen.depth[thin], camera, feet_world)[..., None]
         generator = np.random.default_rng([self.seed, 6, number])
-        rgb += SENSOR_NOISE * generator.standard_normal(rgb.shape, dtype=np.float32)
+        rgb += 1.5 * generator.standard_normal(rgb.shape, dtype=np.float32)
         return np.clip(rgb + 0.5, 0.0, 255.0).astype(np.uint8)
 
 
@@ -195,7 +188,8 @@ def _subdivide(
     Float[np.ndarray, "vertices 3"], Float[np.ndarray, "vertices 2"], Int64[np.ndarray, "some 3"]
 ]:
     """Cut a face into quads; return vertices, their places in its texture, and triangles."""
-    nx, ny = (int(np.ceil(np.linalg.norm(edge) / CELL_M)) for edge in (right, down))
+    # quads: those that reach behind a camera are lost
+    nx, ny = (int(np.ceil(np.linalg.norm(edge) / 0.3)) for edge in (right, down))
     share = np.stack(np.meshgrid(np.arange(nx + 1) / nx, np.arange(ny + 1) / ny), -1).reshape(-1, 2)
     first = (np.arange(ny)[:, None] * (nx + 1) + np.arange(nx)).reshape(-1, 1)
     halves = np.array([[0, 1, nx + 1], [1, nx + 2, nx + 1]])
@@ -211,7 +205,7 @@ def _foot_shadows(
 ) -> Float32[np.ndarray, "height width"]:
     """Return the factor of the floor's light about the feet."""
     light = np.ones(depth.shape, dtype=np.float32)
-    floor = face == FLOOR_FACE
+    floor = face == 2  # low y of the room
     height, width = floor.shape
     y, x = np.mgrid[0:height, 0:width][:, floor] + 0.5
     plane = np.stack([x, y], axis=-1) - camera.center_px

@@ -51,10 +51,6 @@ def add_mask_noise(
     return np.clip(moved + 0.5, 0.0, 1.0).astype(np.float32)
 
 
-NOISE_FRAMES = 3.0
-"""A tracker wanders rather than flickers: its error is smooth over about this many frames."""
-
-
 def add_pose_noise(motion: Motion, *, degrees: float, centimetres: float, seed: int) -> Motion:
     """Add smooth noise to rotations and place, as a tracker would.
 
@@ -65,6 +61,7 @@ def add_pose_noise(motion: Motion, *, degrees: float, centimetres: float, seed: 
         return motion
     generator = np.random.default_rng([seed, 3])
     frames = len(motion)
+    # a tracker's errors wander over some frames rather than flicker
     turned = smooth_noise(generator, (frames, 24, 3)) * np.deg2rad(degrees)
     moved = smooth_noise(generator, (frames, 3)) * centimetres / 100.0
     return replace(
@@ -86,7 +83,7 @@ def to_camera_space(
 
 
 def smooth_noise(
-    generator: np.random.Generator, shape: tuple[int, ...], over: float = NOISE_FRAMES
+    generator: np.random.Generator, shape: tuple[int, ...], over: float = 3.0
 ) -> Float[np.ndarray, "frames *rest"]:
     """Return Gaussian noise of unit variance, smoothed by a Gaussian of width `over`, in frames."""
     margin = max(1, int(4 * over))
@@ -96,15 +93,8 @@ def smooth_noise(
     return smooth * np.sqrt(2.0 * np.sqrt(np.pi) * over)
 
 
-BORDER_SHARE = 0.0028
-"""Standard deviation of the border, as a share of the picture's width: 1.5 of 540 pixels."""
-HALO_SHARE = 0.0022
-"""Swing of the whole mask's growth, as a share of the image's width; its mean is 0.4 of that."""
-SOFT_PX = 2.5
-"""Width of the ramp from 0 to 1 at the border."""
 HOLE_FRAMES, HAND_GAPS_PER_S = 0.12, 0.35
 """Share of frames with holes; lost hands a second."""
-HAND_RADIUS_M = 0.11
 
 
 @final
@@ -130,14 +120,14 @@ class SegmenterErrors:
         width = alpha.shape[1]
         wrong = add_mask_noise(
             alpha,
-            BORDER_SHARE * width,
+            0.0028 * width,  # 1.5 of 540 pixels
             self._generator,
-            grown_px=HALO_SHARE * width * (0.4 + float(self._halo[row])),
-            soft_px=SOFT_PX,
+            grown_px=0.0022 * width * (0.4 + float(self._halo[row])),
+            soft_px=2.5,
         )
         for side in (0, 1):
             if self._lost[row, side]:
-                wrong *= 1.0 - _disc(alpha.shape, hands_px[side], HAND_RADIUS_M * px_per_m)
+                wrong *= 1.0 - _disc(alpha.shape, hands_px[side], 0.11 * px_per_m)
         inside = np.argwhere(alpha > 0.99)
         if self._generator.random() < HOLE_FRAMES and len(inside):
             for _ in range(int(self._generator.integers(1, 4))):
@@ -156,9 +146,6 @@ def _disc(shape: tuple[int, int], middle_px: Float[np.ndarray, "2"], radius_px: 
 
 TRUNK_DEG, LIMBS_DEG, ENDS_DEG = 1.3, 2.5, 3.5
 """Errors of direction: standard deviation of the wandering part and, each, of the constant one."""
-WANDER_S = 0.3
-"""Standard deviation of the smoothing of directions: correlated over about 0.7 s."""
-JITTER_DEG = 0.5
 ACROSS_VIEW, ALONG_VIEW = 1.0, 0.35
 """Factors of errors that turn a limb towards the camera, and of those within the picture."""
 LEAN_DEG, LEAN_WANDER_DEG, FACING_DEG = 2.5, 1.2, 2.0
@@ -166,10 +153,6 @@ LEAN_DEG, LEAN_WANDER_DEG, FACING_DEG = 2.5, 1.2, 2.0
 DEPTH_M, DEPTH_WANDER_M = 0.04, 0.03
 SLOW_S = 1.2
 """Standard deviation of the smoothing of lean and depth: correlated over seconds."""
-PLACE_SHARE = 0.004
-"""Error of the place in the picture, as a share of its height."""
-FOCAL_ERROR = (0.08, 0.12)
-"""Least and largest error of the focal length, as a share, in either direction."""
 FACING_FLIPS, WRIST_FLIPS = 1, 2
 """Short mistakes of a film: front taken for back, and a hand turned over."""
 TRUNK, ENDS = (0, 3, 6, 9, 12, 13, 14, 15), (7, 8, 10, 11, 20, 21, 22, 23)
@@ -181,7 +164,7 @@ def mistake_focal_length(camera: Camera, amount: float, seed: int) -> Camera:
     """Return the camera with the focal length that a user would guess; 0 for `amount` is exact."""
     generator = np.random.default_rng([seed, 23])
     sign = 1.0 if generator.random() < 0.5 else -1.0
-    factor = 1.0 + amount * sign * generator.uniform(*FOCAL_ERROR)
+    factor = 1.0 + amount * sign * generator.uniform(0.08, 0.12)
     fx, fy = camera.focal_px
     return replace(camera, focal_px=(fx * factor, fy * factor))
 
@@ -235,10 +218,11 @@ def _sizes_deg() -> Float[np.ndarray, "24"]:
 def _direction_errors(
     generator: np.random.Generator, count: int, fps: float, amount: float
 ) -> Float[np.ndarray, "poses 24 3"]:
-    slow = smooth_noise(generator, (count, 24, 3), over=max(WANDER_S * fps, 0.5))
+    # correlated over about 0.7 s
+    slow = smooth_noise(generator, (count, 24, 3), over=max(0.3 * fps, 0.5))
     parts = np.array([ACROSS_VIEW, ACROSS_VIEW, ALONG_VIEW]) / np.hypot(1.0, 1.0)
     slow *= _sizes_deg()[:, None] * parts
-    jitter = JITTER_DEG * generator.standard_normal((count, 24, 3)) / np.sqrt(3.0)
+    jitter = 0.5 * generator.standard_normal((count, 24, 3)) / np.sqrt(3.0)
     errors = np.deg2rad(amount * (slow + jitter))
     errors[:, [22, 23]] = errors[:, [20, 21]]  # a tracker of bodies sees no fingers
     return errors
@@ -304,7 +288,7 @@ def _place_in_picture(
     true_camera, assumed = cameras
     view = assumed.camera_from_world
     wander = smooth_noise(generator, (len(motion), 2), over=10.0)
-    wander *= PLACE_SHARE * true_camera.size_px[1]
+    wander *= 0.004 * true_camera.size_px[1]
     places = []
     for row in range(len(motion)):
         pixels = true_camera.project(true_body.with_pose(truth[row]).joints()) + wander[row]

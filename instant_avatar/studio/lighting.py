@@ -146,16 +146,9 @@ def _rasterize_faces(
                 share_out[row, column, 1] = share_c
 
 
-LAMP_FROM = np.array([0.45, 0.75, 0.85]) / np.linalg.norm([0.45, 0.75, 0.85])
 LAMP_RGB = np.array([1.00, 0.96, 0.88])
-SKY_RGB = np.array([0.92, 0.97, 1.00])
-FLOOR_RGB = np.array([0.62, 0.56, 0.50])
 LAMP_STRENGTH = 0.42
 """Light of the lamp, as a factor of color."""
-SKY_DIRECTIONS = 32
-"""Directions from which light comes."""
-SHADOW_BIAS_M = 0.02
-"""Depth behind another surface at which half of the light has gone; no surface shades itself."""
 
 
 def bake_light(
@@ -167,16 +160,18 @@ def bake_light(
     lamp_strength: float = LAMP_STRENGTH,
 ) -> Float32[np.ndarray, "vertices 3"]:
     """Light on each vertex as a factor of its color, about 0.45 in folds to 1.15 in the lamp."""
+    sky_rgb, floor_rgb = np.array([0.92, 0.97, 1.00]), np.array([0.62, 0.56, 0.50])
+    lamp_from = np.array([0.45, 0.75, 0.85]) / np.linalg.norm([0.45, 0.75, 0.85])
     sky = np.zeros((len(points), 3))
     lamp = np.zeros(len(points))
     weight = lamp_weight = 0.0
-    for toward in fibonacci_directions(SKY_DIRECTIONS):
+    for toward in fibonacci_directions(32):
         free = lamp_visibility(points, faces, toward, cut)
         facing = np.maximum(normals @ toward, 0.0) * free
         up = 0.5 + 0.5 * toward[1]
-        sky += facing[:, None] * (up * SKY_RGB + (1.0 - up) * FLOOR_RGB)
+        sky += facing[:, None] * (up * sky_rgb + (1.0 - up) * floor_rgb)
         weight += 0.25
-        near_lamp = max(float(toward @ LAMP_FROM) - 0.55, 0.0)
+        near_lamp = max(float(toward @ lamp_from) - 0.55, 0.0)
         lamp += facing * near_lamp
         lamp_weight += near_lamp
     light = 0.32 + 0.58 * sky / weight + lamp_strength * LAMP_RGB * (lamp / lamp_weight)[:, None]
@@ -223,11 +218,11 @@ def _visibility(points: Vertices, camera: Camera, depth_seen: AlphaMask) -> PerV
     forward, away = camera.camera_from_world[2, :3], camera.camera_from_world[2, 3]
     depth = points @ forward + away
     pixel = camera.project(points)
-    free = np.zeros(len(points))
+    free = np.zeros(len(points))  # half of it 2 cm behind another surface: none shades itself
     for dx, dy in ((-0.5, -0.5), (0.5, -0.5), (-0.5, 0.5), (0.5, 0.5)):
         column = np.clip((pixel[:, 0] + dx).astype(int), 0, 255)
         row = np.clip((pixel[:, 1] + dy).astype(int), 0, 255)
-        free += 0.25 * np.clip(1.5 - (depth - depth_seen[row, column]) / SHADOW_BIAS_M, 0.0, 1.0)
+        free += 0.25 * np.clip(1.5 - (depth - depth_seen[row, column]) / 0.02, 0.0, 1.0)
     return free
 
 

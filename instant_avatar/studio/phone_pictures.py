@@ -63,11 +63,6 @@ def _looseness_m(actor: Actor) -> PerVertex:
 
 WINDOW_FROM = np.array([-0.75, 0.50, 0.45]) / np.linalg.norm([-0.75, 0.50, 0.45])
 """Direction of the window, from the actor, in the world (the camera is on +z)."""
-WINDOW_STRENGTH = 0.40
-"""As a factor of color. An avatar whose light turns with it comes to 31 dB of the film at best."""
-AMBIENT_STRENGTH = 0.92
-WRAP = 0.4
-"""A window is wide: it still lights surfaces this far (cosine) beyond the right angle."""
 
 
 @final
@@ -76,39 +71,30 @@ class RoomLight:
 
     def __init__(self, actor: Actor) -> None:
         """Bake the walls' light in the A-pose: it is the only part that turns with the actor."""
-        self._ambient = AMBIENT_STRENGTH * actor.with_baked_light(lamp_strength=0.0).baked_light
+        self._ambient = 0.92 * actor.with_baked_light(lamp_strength=0.0).baked_light
 
     def on(self, actor: Actor, pose: BodyPose) -> Float32[np.ndarray, "vertices 3"]:
         """Light on each vertex of an actor in a pose, as a factor of its color."""
         points = actor.vertices(pose)
         cosine = vertex_normals(points, actor.faces) @ WINDOW_FROM
-        facing = np.maximum((cosine + WRAP) / (1.0 + WRAP), 0.0)
+        # a window is wide: it still lights surfaces beyond the right angle, to a cosine of -0.4
+        facing = np.maximum((cosine + 0.4) / 1.4, 0.0)
         free = lamp_visibility(points, actor.faces, WINDOW_FROM, actor.cut)
-        window = WINDOW_STRENGTH * (facing * (0.25 + 0.75 * free))[:, None] * LAMP_RGB
+        # an avatar whose light turns with it comes to 31 dB of the film at best
+        window = 0.40 * (facing * (0.25 + 0.75 * free))[:, None] * LAMP_RGB
         return (self._ambient + window).astype(np.float32)
 
 
-SHUTTER_FRAMES = 0.5
-"""Exposure time of an image, in frames."""
 SUBFRAMES = 3
 """Moments that are averaged into one picture."""
-SUPERSAMPLING = 2
-"""Subsamples along each side of a pixel, at each of these moments."""
 GAIN_DRIFT, WARMTH_DRIFT = 0.15, 0.05
 """Largest drift of the exposure, and of red against blue."""
-DRIFT_S = 0.9
-"""Standard deviation of their smoothing: correlated over about two seconds."""
-SENSOR_NOISE = 2.0
-"""Standard deviation of the noise of each pixel and channel, of 255."""
-JPEG_QUALITY = 82
-"""The loss of video compression: blocks of 8 x 8 quantized, colors at half the resolution. The
-same on every machine, unlike an H.264 encoder."""
 
 
 def drifting_exposure(frames: int, fps: float, seed: int) -> Float[np.ndarray, "frames 3"]:
     """Gain of red, green and blue in each frame, about 1."""
     generator = np.random.default_rng([seed, 25])
-    slow = np.tanh(smooth_noise(generator, (frames, 2), over=max(DRIFT_S * fps, 0.5)))
+    slow = np.tanh(smooth_noise(generator, (frames, 2), over=max(0.9 * fps, 0.5)))  # about 2 s
     gain, warmth = 1.0 + GAIN_DRIFT * slow[:, 0], WARMTH_DRIFT * slow[:, 1]
     return np.stack([gain * (1.0 + warmth), gain, gain * (1.0 - warmth)], axis=1)
 
@@ -143,8 +129,10 @@ class PhoneScene:
         total = np.zeros((height, width, 3), dtype=np.float32)
         alphas = np.zeros((height, width), dtype=np.float32)
         for share in (np.arange(SUBFRAMES) + 0.5) / SUBFRAMES - 0.5:
-            at = float(np.clip(row + SHUTTER_FRAMES * share, 0.0, len(motion) - 1.0))
-            rgb, alpha = self._draw_moment(_pose_between(motion, at), at / self.fps, SUPERSAMPLING)
+            at = float(np.clip(row + 0.5 * share, 0.0, len(motion) - 1.0))  # shutter: half a frame
+            rgb, alpha = self._draw_moment(
+                _pose_between(motion, at), at / self.fps, supersampling=2
+            )
             total, alphas = total + rgb * alpha[..., None], alphas + alpha
         mean = (alphas / SUBFRAMES).astype(np.float32)
         rgb = (total / np.maximum(alphas, 1e-6)[..., None]).astype(np.float32)
@@ -169,9 +157,10 @@ def expose(
     rgb: RgbImage, gains: Float[np.ndarray, "3"], generator: np.random.Generator
 ) -> RgbImage:
     """Return a neutrally exposed image as the phone stores it: exposed, noisy and compressed."""
-    noise = SENSOR_NOISE * generator.standard_normal(rgb.shape, dtype=np.float32)
+    noise = 2.0 * generator.standard_normal(rgb.shape, dtype=np.float32)
     exposed = np.clip(rgb * gains + noise + 0.5, 0.0, 255.0).astype(np.uint8)
-    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    # JPEG loses what video does, and is the same on every machine, unlike an H.264 encoder
+    options = [cv2.IMWRITE_JPEG_QUALITY, 82]
     _, code = cv2.imencode(".jpg", np.ascontiguousarray(exposed[..., ::-1]), options)
     return np.ascontiguousarray(np.asarray(cv2.imdecode(code, cv2.IMREAD_COLOR))[..., ::-1])
 

@@ -63,8 +63,6 @@ def _write_track(path: Path, *cameras: Camera) -> None:
     write_cameras(path, CameraTrack(cameras=cameras, source="studio"))
 
 
-PHONE_ARM_LIFT_DEG = -64.0
-"""Arms near the body: they fit into a portrait."""
 PHONE_TURNS, WALK_TURNS, TURNS = 1.25, -0.75, 2.0
 """Turns of the actor before a phone, a phone that is carried around, or the studio's camera, if the
 user names none."""
@@ -121,7 +119,7 @@ def _choose_motion(actor: Actor, config: ShootConfig) -> Motion:
     }
     if config.like_a_phone:
         turns = PHONE_TURNS
-        acts["turn"] = partial(acts["turn"], arm_lift_deg=PHONE_ARM_LIFT_DEG)
+        acts["turn"] = partial(acts["turn"], arm_lift_deg=-64.0)  # fits into a portrait
     return acts[config.motion](
         actor,
         frames=config.frames,

@@ -27,9 +27,6 @@ from instant_avatar.studio.gestures import (
 from instant_avatar.studio.input_errors import smooth_noise
 from preprocess.body.body_pose import BodyPose, Motion
 
-ARM_LIFT_DEG = -44.0
-"""Upper arms above the horizontal, while the actor turns before a wide camera."""
-
 
 def turning_motion(
     actor: Actor,
@@ -38,7 +35,7 @@ def turning_motion(
     fps: float,
     turns: float,
     seed: int,
-    arm_lift_deg: float = ARM_LIFT_DEG,
+    arm_lift_deg: float = -44.0,
 ) -> Motion:
     """Turning round on the spot, arms off the body, swaying a little (PeopleSnapshot's way)."""
     phases = np.random.default_rng([seed, 1]).uniform(0.0, 2.0 * np.pi, 8)
@@ -202,37 +199,25 @@ def _set_on_floor(actor: Actor, pose: BodyPose, hop: float) -> BodyPose:
 
 
 STATIC_DISTANCE_M = 3.2
-STATIC_HEIGHT_M = 1.2
-
-PERSON_HEIGHT_SHARE = 0.825
-"""Height of the standing person as a share of the picture's."""
-HEADROOM_SHARE = 0.110
-"""Share of the picture above the head: room for raised arms."""
-
-
-PORTRAIT_HEIGHT_SHARE, PORTRAIT_HEADROOM_SHARE = 0.85, 0.075
-"""The same of a portrait."""
-DANCE_HEIGHT_SHARE, DANCE_HEADROOM_SHARE = 0.62, 0.20
-"""The same of a portrait of a dance: arms and legs reach to all sides."""
 
 
 def static_camera(actor: Actor, size: int) -> Camera:
     """The studio's square camera, set up for one actor; the world's floor is y = 0."""
-    return _frame_actor(actor, (size, size), PERSON_HEIGHT_SHARE, HEADROOM_SHARE)
+    return _frame_actor(actor, (size, size), height_share=0.825, headroom_share=0.110)
 
 
 def portrait_camera(actor: Actor, width: int, *, dances: bool = False) -> Camera:
     """Return a phone's camera upright on a tripod, 9:16, set up for one actor; sides are even."""
     size_px = 2 * round(width / 2), 2 * round(width * 8 / 9)
     if dances:
-        return _frame_actor(actor, size_px, DANCE_HEIGHT_SHARE, DANCE_HEADROOM_SHARE)
-    return _frame_actor(actor, size_px, PORTRAIT_HEIGHT_SHARE, PORTRAIT_HEADROOM_SHARE)
+        return _frame_actor(actor, size_px, height_share=0.62, headroom_share=0.20)
+    return _frame_actor(actor, size_px, height_share=0.85, headroom_share=0.075)
 
 
 def _frame_actor(
-    actor: Actor, size_px: tuple[int, int], height_share: float, headroom_share: float
+    actor: Actor, size_px: tuple[int, int], *, height_share: float, headroom_share: float
 ) -> Camera:
-    """A camera whose picture the standing actor fills to a share of its height."""
+    """Frame the standing actor: shares of the image's height, of the person and above the head."""
     points, height = _standing_vertices(actor), size_px[1]
     focal, target = 1.3 * height, 0.9
     camera = _aim_camera(size_px, focal, target)
@@ -260,7 +245,7 @@ def _standing_vertices(actor: Actor) -> Float[np.ndarray, "vertices 3"]:
 
 def _aim_camera(size_px: tuple[int, int], focal: float, target: float) -> Camera:
     """A camera in front of the actor that looks at the height `target` above the origin."""
-    eye = np.array([0.0, STATIC_HEIGHT_M, STATIC_DISTANCE_M])
+    eye = np.array([0.0, 1.2, STATIC_DISTANCE_M])
     forward = np.array([0.0, target, 0.0]) - eye
     forward /= np.linalg.norm(forward)
     right = np.array([1.0, 0.0, 0.0])
@@ -268,21 +253,9 @@ def _aim_camera(size_px: tuple[int, int], focal: float, target: float) -> Camera
     return Camera.at(eye, axes, focal, size_px)
 
 
-WALK_ASPECT = (16, 9)
-FOCAL_SHARE = 0.68
-"""Focal length in units of the picture's longer side: a phone's main camera."""
-ARC_DEG = 120.0
-WALK_DISTANCE_HEIGHTS = 1.52
-"""Distance to the actor, in heights of the actor: the whole body is in the image."""
 HANDHELD_HEIGHT_M = 1.4
-STANDING_DISTANCE_M = 3.4
-"""Distance from which the camera that stands still sees raised arms, too."""
-NEAR_FOOT_OFFSET_M = 0.2
-"""Distance by which the nearer foot is closer to the camera than the body center, metres."""
 SHAKE_M, SHAKE_DEG = 0.012, 0.6
 """Standard deviation of the hand's trembling, for each axis."""
-SHAKE_FRAMES = 2.5
-"""Standard deviation of its smoothing, frames."""
 
 
 def handheld_cameras(
@@ -295,12 +268,12 @@ def handheld_cameras(
     frames = len(actor_xz_m)
     generator = np.random.default_rng([seed, 7])
     # two frames more, as in the films of which the figures in docs and log are
-    shake = smooth_noise(generator, (frames + 2, 6), SHAKE_FRAMES)[1:-1]
+    shake = smooth_noise(generator, (frames + 2, 6), 2.5)[1:-1]
     slow = smooth_noise(generator, (frames + 2, 3), max(frames / 6.0, 1.0))[1:-1]
     share = np.linspace(0.0, 1.0, frames) + 0.02 * np.sin(2.0 * np.pi * np.linspace(0, 1, frames))
-    angles = np.deg2rad(ARC_DEG) * (share - 0.5)
+    angles = np.deg2rad(120.0) * (share - 0.5)
     steps = np.arange(frames) * (2.0 * np.pi / 16.0)  # a step lifts the hand, twice a second
-    away = WALK_DISTANCE_HEIGHTS * height_m + 0.05 * np.tanh(slow[:, 0])
+    away = 1.52 * height_m + 0.05 * np.tanh(slow[:, 0])
     eyes = np.column_stack(
         [away * np.sin(angles), np.full(frames, HANDHELD_HEIGHT_M), away * np.cos(angles)]
     )
@@ -316,7 +289,7 @@ def handheld_cameras(
 
 def standing_camera(height_m: float, size: int) -> Camera:
     """A camera that stands still in the middle of the arc, a step behind it."""
-    eye = np.array([0.0, HANDHELD_HEIGHT_M, STANDING_DISTANCE_M])
+    eye = np.array([0.0, HANDHELD_HEIGHT_M, 3.4])
     return _aim_handheld_camera(eye, np.zeros(2), height_m, size, np.zeros(3))
 
 
@@ -336,7 +309,7 @@ def _aim_handheld_camera(
     """A camera whose picture has the head as far from its middle as the feet, then turned."""
     across = np.array([actor_xz_m[0] - eye[0], 0.0, actor_xz_m[1] - eye[2]])
     away = float(np.linalg.norm(across))
-    ends = np.arctan2(height_m - eye[1], away), np.arctan2(-eye[1], away - NEAR_FOOT_OFFSET_M)
+    ends = np.arctan2(height_m - eye[1], away), np.arctan2(-eye[1], away - 0.2)  # the nearer foot
     pitch = 0.5 * (ends[0] + ends[1]) + shake_rotation[0]
     yaw = np.arctan2(across[0], across[2]) + shake_rotation[1]
     forward = np.array([np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)])
@@ -345,5 +318,5 @@ def _aim_handheld_camera(
     down = np.cross(forward, right)
     cosine, sine = np.cos(shake_rotation[2]), np.sin(shake_rotation[2])
     axes = np.stack([cosine * right + sine * down, cosine * down - sine * right, forward])
-    height = max(1, round(size * WALK_ASPECT[1] / WALK_ASPECT[0]))
-    return Camera.at(eye, axes, FOCAL_SHARE * size, (size, height))
+    height = max(1, round(size * 9 / 16))
+    return Camera.at(eye, axes, 0.68 * size, (size, height))  # a phone's main camera
