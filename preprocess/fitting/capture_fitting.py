@@ -46,44 +46,18 @@ KEY_FRAMES = 50
 MORE_MASKS = 100
 """Fewest frames with key points (`_count_keypoint_frames`) from which given poses are fitted to as
 many masks, too: reading a mask takes 20 core-ms."""
-CHAIN_FRAMES = 150
-"""Frames, evenly spread, whose given poses are fitted: those without a mask follow their neighbors
-and are human; poses between them follow."""
-MIN_ITERATIONS = 4
-"""Fewest Gauss-Newton iterations."""
-MAX_ITERATIONS = 12
-"""Most Gauss-Newton iterations."""
 TRACKED_KEY_FRAMES = 300
 """Most frames, evenly spread, whose masks are fitted together with key points."""
-KEYPOINT_ITERATIONS = 3
-"""Iterations with key points alone, after which the body is near its outline."""
-TRACKED_ITERATIONS = 3
-"""Iterations with outlines after that."""
 POSE_ITERATIONS = 1
 """Iterations over poses alone after those, with `TRACKED_POSE_WEIGHTS`."""
 TRACKED_POSE_WEIGHTS = EvidenceWeights(outline_rows=480.0, keypoints=0.6)
 """Weights while poses alone are fitted: with these, proportions would follow the clothes."""
-BLENDED_ITERATIONS = 3
-"""Iterations over poses alone, once key points count beside given poses."""
-MIN_ERROR_DECREASE = 0.01
-"""Relative decrease of the error below which the iterations end."""
 NOISE_DEG_PER_CM = 1.5
 """Rotation by which the fit changes exact poses, degrees for each cm by which outlines still differ
 after it (1.4, 1.4 and 1.55 on three exact captures; a tracker's, real and simulated: 5 to 8)."""
-EQUAL_TRACKED_FRAMES = 60
-"""Frames in which key points are found if they are expected to count as much as the given poses,
-30 core-ms each. The number is this times the ratio of both's expected weights."""
-BESIDE_ITERATIONS = (4, 3)
-"""Of those poses, iterations with key points alone, and then with outlines."""
-ERROR_PER_TURN = 1.2
-"""Error that outlines leave in given poses, per rotation by which they turned them: 0.9 to 1.3 in
-films of studio motions, 1.7 to 2.3 in real ones."""
 LEAST_ERROR_RAD = math.radians(5.0)
 """Least error of a joint by key points that is assumed: the mean is 3.5 degrees in films of studio
 motions, 10 to 14 in real ones."""
-LEAST_HEAD_ERROR_RAD = math.radians(14.0)
-"""Least error assumed of neck and head: key points are off by 2 cm, and a face's lie within 8 cm of
-the axis about which it turns, where those of a limb are 20 to 40 cm away."""
 HEAD_JOINTS = (12, 15)
 """Neck and head."""
 
@@ -179,7 +153,7 @@ def _take_keypoints(capture: Capture, fitter: ClipFitter, error_rad: float) -> f
     )
     beside.take_person(fitter)
     beside.poses = fitter.poses.rows(rows)
-    beside.iterate_stages(POSES_ALONE, *BESIDE_ITERATIONS)
+    beside.iterate_stages(POSES_ALONE, keypoint_count=4, outline_count=3)
     steps = beside.poses.steps_from(fitter.poses.rows(rows), beside.camera_rotations)
     weights = weigh_joints(steps, error_rad)
     each_weight = np.repeat(np.append(weights, weights[0]), 3)  # the root's place as it turns
@@ -188,20 +162,22 @@ def _take_keypoints(capture: Capture, fitter: ClipFitter, error_rad: float) -> f
     stated = fitter.as_stated(fitter.poses.moved(further, turns))
     fitter.expect(fitter.given.moved(each_weight * stated.steps_from(fitter.given, turns), turns))
     fitter.poses = fitter.poses.moved(each_weight * further, turns)
-    fitter.iterate_stages(POSES_ALONE, 0, BLENDED_ITERATIONS)
+    fitter.iterate_stages(POSES_ALONE, 0, 3)
     return float(weights[1:22].mean())
 
 
 def _expected_error_rad(fitter: ClipFitter) -> float:
     """Error that outlines leave in given poses, mean over the joints, by how far they turned."""
     joints = fitter.corrections[:, 3:66].reshape(-1, 21, 3)  # without hands' inner ones and root
-    return ERROR_PER_TURN * float(np.linalg.norm(joints, axis=2).mean())
+    # 0.9 to 1.3 in films of studio motions, 1.7 to 2.3 in real ones
+    return 1.2 * float(np.linalg.norm(joints, axis=2).mean())
 
 
 def _count_keypoint_frames(error_rad: float) -> int:
     """Number of frames in which key points are found: the further given poses err, the more."""
     ratio = (error_rad / LEAST_ERROR_RAD) ** 2
-    return min(round(EQUAL_TRACKED_FRAMES * ratio), TRACKED_KEY_FRAMES)
+    # 60 frames (30 core-ms each) if both are expected to count alike
+    return min(round(60 * ratio), TRACKED_KEY_FRAMES)
 
 
 def _with_more_masks(capture: Capture, fitter: ClipFitter, count: int) -> ClipFitter | None:
@@ -219,7 +195,8 @@ def weigh_joints(
 ) -> Float[np.ndarray, "24"]:
     """Weight of each joint by key points, from given poses that err so far to these by `steps`."""
     least = np.full(24, LEAST_ERROR_RAD)
-    least[list(HEAD_JOINTS)] = LEAST_HEAD_ERROR_RAD
+    # points are 2 cm off; a face's lie within 8 cm of the axis about which it turns
+    least[list(HEAD_JOINTS)] = math.radians(14.0)
     apart2 = (steps[:, :72].reshape(-1, 24, 3) ** 2).sum(axis=2).mean(axis=0)
     return given_error_rad**2 / np.maximum(apart2, given_error_rad**2 + least**2)
 
@@ -240,19 +217,18 @@ def _fit_tracked(fitter: ClipFitter, everything: FitParameters) -> list[float]:
 
     Returns the error before each iteration with outlines.
     """
-    errors = fitter.iterate_stages(everything, KEYPOINT_ITERATIONS, TRACKED_ITERATIONS)
+    errors = fitter.iterate_stages(everything, keypoint_count=3, outline_count=3)
     fitter.weights = TRACKED_POSE_WEIGHTS
     poses = everything._replace(proportions=False, focal=False)
     return errors + fitter.iterate_stages(poses, 0, POSE_ITERATIONS)
 
 
 def _iterate_until_settled(fitter: ClipFitter, fitted: FitParameters) -> list[float]:
-    """Iterates until the error hardly decreases; returns it before each iteration."""
+    """Iterates 4 to 12 times, until the error decreases by less than 1 %; the error before each."""
     errors: list[float] = []
-    while len(errors) < MAX_ITERATIONS:
+    for number in range(12):
         errors.append(fitter.iterate(fitted))
-        settled = errors[-1] > (1.0 - MIN_ERROR_DECREASE) * errors[max(len(errors) - 2, 0)]
-        if len(errors) >= MIN_ITERATIONS and settled:
+        if number >= 3 and errors[-1] > 0.99 * errors[-2]:
             break
     return errors
 
@@ -291,9 +267,9 @@ def make_fitter(capture: Capture, mask_count: int = TRACKED_KEY_FRAMES) -> ClipF
 
 
 def _spread_frames(source: FrameSource) -> range:
-    """Numbers of at most `CHAIN_FRAMES` frames, evenly spread."""
+    """Numbers of at most 150 frames, evenly spread: between masks, poses follow their neighbors."""
     chosen, count = source.selection, source.frame_count or 1
-    stride = chosen.step * -(-count // CHAIN_FRAMES)
+    stride = chosen.step * -(-count // 150)
     return range(chosen.start, chosen.start + count * chosen.step, stride)
 
 

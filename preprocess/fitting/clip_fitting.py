@@ -28,12 +28,6 @@ SIGMA_LOG_FOCAL = 0.3
 tracker's own guess (with 0.08 a stated one stays 1.25 times too short that is 1.38 times so)."""
 SIGMA_LOG_LIVE_FOCAL = 0.08
 """The same of a camera file of a stream, whose first frames show the person from one side."""
-MAX_TURN_STEP_RAD = 0.25
-"""Largest change of a rotation's component in one iteration, radians."""
-MAX_PLACE_STEP_M = 0.5
-"""Largest change of the root's place in one iteration, metres."""
-MAX_LOG_FOCAL_STEP = 0.1
-"""Largest change of the logarithm of the focal length in one iteration."""
 HELD_PRECISION = 1e9
 """Precision that holds a parameter that is not fitted."""
 
@@ -79,8 +73,6 @@ USUAL_WEIGHTS = EvidenceWeights()
 """Weights where proportions are fitted to few frames, or poses are given."""
 TRACKED_WEIGHTS = EvidenceWeights(outline_rows=120.0, keypoints=0.3)
 """Outlines tell where limbs are better than key points, which are off by 2 cm for many frames."""
-ALL_PARAMETERS = FitParameters()
-"""Poses, proportions and focal length together."""
 POSES_ALONE = FitParameters(proportions=False, focal=False)
 """Poses of a person and a camera that stay."""
 
@@ -177,7 +169,7 @@ class ClipFitter:
             self.iterate(fitted._replace(outlines=False))
         return [self.iterate(fitted) for _ in range(outline_count)]
 
-    def iterate(self, fitted: FitParameters = ALL_PARAMETERS) -> float:
+    def iterate(self, fitted: FitParameters) -> float:
         """Makes one Gauss-Newton step; returns the outlines' robust error before it.
 
         The error is a root mean square distance, px of the reduced masks.
@@ -186,11 +178,9 @@ class ClipFitter:
         steps = self._add_priors(equations, fitted)
         found, step = equations.solve()
         moved = (steps @ found[..., None])[..., 0]
-        zoom = float(
-            np.clip(step[-1] * self._sigma_log_focal, -MAX_LOG_FOCAL_STEP, MAX_LOG_FOCAL_STEP)
-        )
-        moved[:, :72] = np.clip(moved[:, :72], -MAX_TURN_STEP_RAD, MAX_TURN_STEP_RAD)
-        moved[:, 72:] = np.clip(moved[:, 72:], -MAX_PLACE_STEP_M, MAX_PLACE_STEP_M)
+        zoom = float(np.clip(step[-1] * self._sigma_log_focal, -0.1, 0.1))
+        moved[:, :72] = np.clip(moved[:, :72], -0.25, 0.25)  # radians
+        moved[:, 72:] = np.clip(moved[:, 72:], -0.5, 0.5)  # metres
         moved[:, 74] += zoom * self._depths_m(self.poses)  # distances go with the focal length
         self.poses = self.poses.moved(moved, self.camera_rotations)
         if fitted.proportions:

@@ -23,12 +23,6 @@ from preprocess.body.kinematics import (
 )
 from preprocess.fitting.normal_equations import ChainEquations
 
-SIGMA_ROOT_RAD = 0.12
-"""Prior standard deviation of the root's rotation, radians."""
-SIGMA_SIDE_M = 0.05
-"""Prior standard deviation of the root's position across the view, metres."""
-SIGMA_DEPTH_M = 0.25
-"""Prior standard deviation of the root's distance, metres."""
 JOINT_SIGMAS_RAD = (
     (0.10, (1, 2)), (0.10, (4, 5)), (0.08, (7, 8)), (0.01, (10, 11)), (0.04, (3, 6, 9)),
     (0.07, (12, 15)), (0.05, (13, 14)), (0.12, (16, 17)), (0.12, (18, 19)), (0.08, (20, 21)),
@@ -36,22 +30,6 @@ JOINT_SIGMAS_RAD = (
 )  # fmt: skip
 """Prior standard deviation of joints' rotations, radians: of hips, knees, ankles, toes, spine, neck
 and head, collars, shoulders, elbows, wrists and hands."""
-CHANGE_PER_FRAME = 0.15
-"""Standard deviation of a correction's change from a frame to the next, in prior standard
-deviations; over n frames it grows with the root of n."""
-SHARED_PRECISION = 0.1
-"""Precision of the correction that all frames share, relative to that of a frame's own: a tracker
-errs alike in all frames, and a turn that they share blurs nothing."""
-SIGMA_GUESSED_RAD = 0.12
-"""Standard deviation of the given rotations of toes and hands, which trackers guess, radians."""
-TURN_FACTOR = 1.5
-"""Standard deviation of a given rotation relative to the root, in `JOINT_SIGMAS_RAD`."""
-SHARED_ERROR = 0.5
-"""Share of the variance of a frame's errors that another frame of the same pose has, too: clothes
-and key points err alike in frames that are alike."""
-ALIKE_M = 0.1
-"""Distance of poses at which `SHARED_ERROR` has fallen by exp(-1/2): root mean square over the
-joints, in camera axes and from the root, metres."""
 UNUSUAL_TURN_RAD = 0.08
 """Root mean square of given axis-angles about their mean in `LEFT_PRIORS` and `MIDDLE_PRIORS` at
 which the prior counts a quarter, radians: what trackers err by, or else how this person moves."""
@@ -159,7 +137,8 @@ class ClipPoses:
         places = self.joints(rest_joints, np.array(PARENTS)).places
         seen = ((places - places[:, :1]) @ camera_rotations.swapaxes(-1, -2)).reshape(-1, 72)
         squares = pdist(seen, "sqeuclidean") / 24.0
-        shared = 2.0 * SHARED_ERROR * float(np.exp(-0.5 * squares / ALIKE_M**2).sum())
+        # two frames of one pose share half of their errors' variance, of poses 0.1 m apart less
+        shared = float(np.exp(-0.5 * squares / 0.1**2).sum())
         return len(seen) ** 2 / (len(seen) + shared)
 
     def joints(
@@ -186,18 +165,16 @@ def rotation_vectors(matrices: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndar
 
 def _pose_sigma() -> Float[np.ndarray, "75"]:
     sigma = np.zeros((25, 3))
-    sigma[0] = SIGMA_ROOT_RAD
+    sigma[0] = 0.12  # radians
     for value, joints in JOINT_SIGMAS_RAD:
         sigma[list(joints)] = value
-    sigma[24] = SIGMA_SIDE_M, SIGMA_SIDE_M, SIGMA_DEPTH_M
+    sigma[24] = 0.05, 0.05, 0.25  # metres: across the view, and distance
     return sigma.ravel()
 
 
 POSE_SIGMA = _pose_sigma()
 """Prior standard deviation of a frame's correction: root and joint rotations, root position. These
 are the units of a frame's parameters in the equations."""
-MIRRORED_AXES = (1.0, -1.0, -1.0)
-"""An axis-angle of a left joint times this is that of the right one."""
 LEFT_PRIORS = {
     1: ((0.0, 0.0, 0.0), (0.70, 0.35, 0.30)), 4: ((0.25, 0.0, 0.0), (0.70, 0.12, 0.08)),
     7: ((0.0, 0.0, 0.0), (0.20, 0.13, 0.10)), 10: ((0.0, 0.0, 0.0), (0.10, 0.03, 0.03)),
@@ -211,24 +188,17 @@ MIDDLE_PRIORS = {3: 0.08, 6: 0.07, 9: 0.07, 12: 0.20, 15: 0.20}
 """Standard deviation of the axis-angles of spine, neck and head, radians."""
 SIGMA_FREE = 30.0
 """Standard deviation of what is not known at all, radians or metres."""
-STEADY_S = 0.17
-"""Standard deviation of the time over which a motion is nearly steady, seconds."""
 CHANGES_PER_SECOND = (
     (0.04, (0,)), (0.015, (3, 6, 9, 13, 14)), (0.03, (12, 15)), (0.07, (1, 2, 4, 5)),
     (0.05, (7, 8, 20, 21)), (0.005, (10, 11, 22, 23)), (0.11, (16, 17, 18, 19)),
 )  # fmt: skip
 """Standard deviation of how far a joint strays from a steady motion in a second, radians."""
-CHANGE_M = (0.013, 0.013, 0.013)
-"""Standard deviation of how far the root strays from a steady motion in a second, metres."""
 CUT_TURN_RAD = 0.25
 """Rotation of the root from frame to frame that photographs show, but no video; at it neighbors
 tell a quarter about each other."""
 FAST_CHANGE = 2.0
 """Standard deviations of a change between frames at which it counts a quarter (Geman-McClure):
 people move fast at times. At 6 the arms of boxers and dancers lag behind their key points."""
-FIRST_FAST_CHANGE = 25.0
-"""`FAST_CHANGE` in the first iteration, halved from one to the next: a frame that a tracker got
-wrong is drawn to its neighbors before it may count as a fast motion (graduated non-convexity)."""
 
 
 @final
@@ -248,7 +218,8 @@ class GivenPosePrior:
     ) -> None:
         """Takes the given poses of the frames, and the frames' numbers."""
         self._given, self._cameras = given, camera_rotations
-        links = 1.0 / (CHANGE_PER_FRAME**2 * np.maximum(np.diff(frame_numbers), 1.0))
+        # prior standard deviations from a frame to the next, growing with the root of the distance
+        links = 1.0 / (0.15**2 * np.maximum(np.diff(frame_numbers), 1.0))
         self._links = links[:, None] * _GIVEN_PRECISION
         self._given_turns, self._sigma = _turns_from_root(given), _sigma_beside_given(given)
 
@@ -267,7 +238,8 @@ class GivenPosePrior:
         turned = self._given_turns.swapaxes(-1, -2) @ _turns_from_root(poses)
         apart[:, 3:72] = rotation_vectors(turned[:, 1:]).reshape(-1, 69)
         apart /= POSE_SIGMA
-        apart -= (1.0 - SHARED_PRECISION) * apart.mean(axis=0)
+        # trackers err alike in all frames: what these share counts a tenth
+        apart -= 0.9 * apart.mean(axis=0)
         equations.add_chain(apart, _GIVEN_PRECISION, self._links)
         return steps
 
@@ -291,11 +263,12 @@ class HumanPosePrior:
         change = np.zeros((25, 3))
         for value, joints in CHANGES_PER_SECOND:
             change[list(joints)] = value
-        change[24] = CHANGE_M
+        change[24] = 0.013  # metres
         gaps = np.maximum(np.diff(times_s), 1e-3)
         self._change = change.ravel() * np.sqrt(gaps)[:, None]
-        self._steady_frames = STEADY_S / float(np.median(gaps)) if len(gaps) else 1.0
-        self._fast_change = FAST_CHANGE if settled else FIRST_FAST_CHANGE
+        self._steady_frames = 0.17 / float(np.median(gaps)) if len(gaps) else 1.0  # 0.17 s
+        # graduated non-convexity: a frame that a tracker got wrong is drawn to its neighbors first
+        self._fast_change = FAST_CHANGE if settled else 25.0
 
     def add_to(
         self, equations: ChainEquations, poses: ClipPoses
@@ -338,7 +311,7 @@ def _add_human(
 def _human_priors() -> tuple[Float[np.ndarray, "24 3"], Float[np.ndarray, "24 3"]]:
     mean, sigma = np.zeros((24, 3)), np.full((24, 3), SIGMA_FREE)
     for left, (middle, spread) in LEFT_PRIORS.items():
-        mean[left], mean[left + 1] = middle, np.array(middle) * MIRRORED_AXES
+        mean[left], mean[left + 1] = middle, np.array(middle) * (1.0, -1.0, -1.0)
         sigma[left] = sigma[left + 1] = spread
     for joint, spread in MIDDLE_PRIORS.items():
         sigma[joint] = spread
@@ -378,10 +351,10 @@ def _steps_by_turns(poses: ClipPoses) -> Float[np.ndarray, "frames 75 75"]:
 
 def _given_precision() -> Float[np.ndarray, "75"]:
     """Precision of the given rotations relative to the root, in units of `POSE_SIGMA`."""
-    precision = np.full((25, 3), TURN_FACTOR**-2.0)
+    precision = np.full((25, 3), 1.5**-2.0)  # standard deviation in `JOINT_SIGMAS_RAD`
     precision[[0, 24]] = 1.0
     guessed = [10, 11, 22, 23]  # toes and hands
-    precision[guessed] = (POSE_SIGMA.reshape(25, 3)[guessed] / SIGMA_GUESSED_RAD) ** 2
+    precision[guessed] = (POSE_SIGMA.reshape(25, 3)[guessed] / 0.12) ** 2  # trackers guess them
     return precision.ravel()
 
 

@@ -23,23 +23,10 @@ from preprocess.capture_session import Capture
 from preprocess.fitting.outlines import IMAGE_BORDER_PX
 from preprocess.fitting.silhouettes import read_first_silhouettes
 
-SIGMA_SHIFT_M = 0.2
-"""Prior standard deviation of the pelvis's shift, metres: from one side, a smaller distance and a
-shift towards the camera look alike."""
 SIGMA_SIDE_PX = 3.0
 """Error of a box's side, px of the reduced masks, beyond which it counts ever less (Cauchy)."""
 MIN_AGREEMENT = 0.6
-"""Mean IoU of body and masks from which a start is taken, better than by chance."""
-MIN_GAIN = 0.01
-"""Gain in mean IoU from which a start is taken."""
-MIN_OWN_GAIN = 0.02
-"""Gain in mean IoU by which the body's own proportions must beat SMPL's."""
-NO_PERSON_FOUND = (
-    "There are no masks, and where the poses put the body no person was found in the images; "
-    "distances stay as they are. Do poses and video belong together? Give --masks, from which "
-    "ia-check can find what is wrong, or your own SMPL file (--body)."
-)
-"""Note about a capture in which no masks can be estimated."""
+"""Mean IoU of body and masks from which a start is taken, 0.01 better than before."""
 
 
 class _Start(NamedTuple):
@@ -60,7 +47,7 @@ class _Start(NamedTuple):
     @property
     def is_taken(self) -> bool:
         """Whether body and masks agree better by it, and well enough."""
-        return self.after >= max(MIN_AGREEMENT, self.before + MIN_GAIN)
+        return self.after >= max(MIN_AGREEMENT, self.before + 0.01)
 
 
 def start_distances(
@@ -76,11 +63,16 @@ def start_distances(
     """
     samples = read_first_silhouettes(capture)
     if not samples:
-        return capture, "" if capture.masks.is_given else NO_PERSON_FOUND, None
+        note = (
+            "There are no masks, and where the poses put the body no person was found in the "
+            "images; distances stay as they are. Do poses and video belong together? Give --masks, "
+            "from which ia-check can find what is wrong, or your own SMPL file (--body)."
+        )
+        return capture, "" if capture.masks.is_given else note, None
     start = _find_start(capture, samples, by_focal_length=False)
     if own is not None:
         other = _find_start(replace(capture, shaped=own), samples, by_focal_length=False)
-        if other.is_taken and other.after > start.after + MIN_OWN_GAIN:
+        if other.is_taken and other.after > start.after + 0.02:  # of mean IoU
             capture, start = replace(capture, shaped=own), other
     moved_cm = 100.0 * float(np.linalg.norm(start.shift_m))
     figures = {
@@ -139,7 +131,8 @@ def _find_start(
         return _place(stated, shaped, magnification, numbers[1:])
 
     bodies = list(_bodies_before_camera(stated, objective))
-    prior = SIGMA_SIDE_PX * np.sqrt(max(4 * len(bodies), 1)) / SIGMA_SHIFT_M
+    # 0.2 m: from one side, a smaller distance and a shift towards the camera look alike
+    prior = SIGMA_SIDE_PX * np.sqrt(max(4 * len(bodies), 1)) / 0.2
 
     def distances_px(numbers: Float[np.ndarray, "numbers"]) -> Float[np.ndarray, "rows"]:
         """Of the sides of both boxes, and the shift's prior; none at the image's border."""

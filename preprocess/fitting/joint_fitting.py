@@ -33,22 +33,10 @@ JOINT_SIGMAS_M = (
 )  # fmt: skip
 """Standard deviation between joints of the same name of two bodies, metres: limbs, toes, the
 trunk's, which depend most on the person, and hands."""
-SIGMA_LANDMARK_M = 0.012
-"""The same of landmarks, metres."""
 SAME_JOINTS = np.zeros((24, 3))
 """Offsets of a body that has its joints where ours has them."""
 COMPARED_JOINTS = tuple(range(22))
 """Joints whose distance is stated: all but the hands, which bodies have in different places."""
-KEY_FRAMES = 60
-"""Frames, evenly spread, to which proportions are fitted."""
-CHUNK_FRAMES = 300
-"""Frames whose poses are fitted at once."""
-ITERATIONS = 12
-"""Gauss-Newton iterations of proportions and poses."""
-POSE_ITERATIONS = 6
-"""Gauss-Newton iterations of poses alone."""
-MAX_TURN_STEP_RAD = 0.5
-"""Largest change of a rotation's component in one iteration, radians."""
 
 
 class FittedJoints(NamedTuple):
@@ -93,11 +81,11 @@ def fit_joints(
     """
     fitter = _JointFitter(places, times_s, turns, offsets_m)
     count = len(places)
-    keys = np.unique(np.linspace(0, count - 1, KEY_FRAMES).round().astype(int))
+    keys = np.unique(np.linspace(0, count - 1, 60).round().astype(int))
     fitter.fit(keys, proportions=True)
     parts = [
         fitter.fit(some, proportions=False)
-        for some in np.array_split(np.arange(count), -(-count // CHUNK_FRAMES))
+        for some in np.array_split(np.arange(count), -(-count // 300))  # at most 300 at once
     ]
     poses = ClipPoses(
         rotations=np.concatenate([part.rotations for part in parts]),
@@ -127,7 +115,7 @@ class _JointFitter:
         joints = np.concatenate([np.arange(24), KEYPOINT_JOINTS[numbers]])
         offsets = np.concatenate([offsets_m, KEYPOINT_OFFSETS_M[numbers]])
         self._attached = AttachedPoints(self.space, joints, offsets)
-        sigma = np.full(len(POINT_NAMES), SIGMA_LANDMARK_M)
+        sigma = np.full(len(POINT_NAMES), 0.012)  # metres, of landmarks
         for value, some in JOINT_SIGMAS_M:
             sigma[list(some)] = value
         self._precision = sigma**-2
@@ -150,7 +138,7 @@ class _JointFitter:
             if self._turns is None
             else GivenPosePrior(poses, still, ASSUMED_FPS * times_s)
         )
-        for _ in range(ITERATIONS if proportions else POSE_ITERATIONS):
+        for _ in range(12 if proportions else 6):
             fitted = self.space.count if proportions else 0
             equations = ChainEquations.empty(len(places), 75, fitted)
             found, by_pose, by_shape = self._attached.place(
@@ -167,7 +155,7 @@ class _JointFitter:
             equations.add_shared(np.full(fitted, float(len(places))), self.coefficients[:fitted])
             own, shared = equations.solve()
             moved = (steps @ own[..., None])[..., 0]
-            moved[:, :72] = np.clip(moved[:, :72], -MAX_TURN_STEP_RAD, MAX_TURN_STEP_RAD)
+            moved[:, :72] = np.clip(moved[:, :72], -0.5, 0.5)
             poses = poses.moved(moved, still)
             if proportions:
                 self.coefficients = self.coefficients + np.clip(shared, -2.0, 2.0)

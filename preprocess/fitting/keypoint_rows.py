@@ -23,8 +23,6 @@ KEYPOINT_JOINTS = np.array(
      0, 0, 4, 5, 7, 8, 7, 8, 7, 8]
 )  # fmt: skip
 """The joint in whose frame each of the 33 key points is fixed."""
-MIDDLE_OFFSETS_CM = {0: (1.8, 10.9)}
-"""Place of the nose before its joint: up and to the front, centimetres."""
 LEFT_OFFSETS_CM = {
     1: (1.5, 5.0, 8.6), 2: (2.6, 5.0, 8.0), 3: (3.7, 5.1, 7.5), 7: (5.5, 3.7, 3.3),
     9: (1.9, -1.4, 9.3), 11: (-2.1, 0.6, -0.1), 13: (-2.3, -0.2, 0.9), 15: (0.8, -0.8, 0.1),
@@ -37,8 +35,6 @@ PIXEL_WEIGHTS = np.array([0.4] + [0.15] * 6 + [0.4] * 2 + [0.15] * 2 + [1.0] * 6
                          + [1.0] * 6 + [0.6] * 4)  # fmt: skip
 """Precision of each key point in the image, 1 / px² of the reduced masks (of 1.4 cm); those of the
 face and of a hand err alike."""
-ROBUST_KEYPOINT_PX = 6.0
-"""Distance at which a key point counts a quarter (Geman-McClure), px of the reduced masks."""
 DEPTH_PAIRS = (
     (11, 12, 0.12), (23, 24, 0.12), (11, 23, 0.15), (12, 24, 0.15), (11, 13, 0.15), (12, 14, 0.15),
     (13, 15, 0.36), (14, 16, 0.36), (23, 25, 0.15), (24, 26, 0.15), (25, 27, 0.15), (26, 28, 0.15),
@@ -48,8 +44,6 @@ DEPTH_PAIRS = (
 NEARER_M = ((11, 12, 0.06), (13, 14, 0.10), *((hand, hand + 1, 0.135) for hand in (15, 17, 19, 21)))
 """Left and right key points that BlazePose finds too near to the camera, relative to the hips, and
 by how much, metres: shoulders, elbows, wrists, hands. Means of five videos, all of one sign."""
-ROBUST_DEPTH = 3.0
-"""Standard deviations at which a difference in depth counts a quarter."""
 RATIO_BONES = ((11, 13, 16, 18), (12, 14, 17, 19), (13, 15, 18, 20), (14, 16, 19, 21),
                (23, 25, 1, 4), (24, 26, 2, 5), (25, 27, 4, 7), (26, 28, 5, 8))  # fmt: skip
 """Two key points and the joints next to them, whose distances tell the points' scale."""
@@ -57,8 +51,7 @@ RATIO_BONES = ((11, 13, 16, 18), (12, 14, 17, 19), (13, 15, 18, 20), (14, 16, 19
 
 def _offsets_m() -> Float[np.ndarray, "33 3"]:
     offsets = np.zeros((33, 3))
-    for middle, (up, front) in MIDDLE_OFFSETS_CM.items():
-        offsets[middle] = 0.0, up, front
+    offsets[0] = 0.0, 1.8, 10.9  # the nose
     for left, place in LEFT_OFFSETS_CM.items():
         offsets[left] = place
         offsets[MIRRORED_POINTS[left]] = np.array(place) * (-1.0, 1.0, 1.0)
@@ -261,7 +254,8 @@ class KeypointModel:
         view = np.zeros((*points.shape[:2], 2, 3))
         view[..., 0, 0], view[..., 1, 1] = scale[..., 0], scale[..., 1]
         view[..., 2] = -scale * plane
-        robust = 1.0 / (1.0 + (off**2).sum(axis=-1) / ROBUST_KEYPOINT_PX**2) ** 2
+        # Geman-McClure: what is 6 px off, or 3 standard deviations, counts a quarter
+        robust = 1.0 / (1.0 + (off**2).sum(axis=-1) / 6.0**2) ** 2
         weights = factors[:, None] * PIXEL_WEIGHTS * found.confidence * robust
         one, other = _PAIRS[:, 0], _PAIRS[:, 1]
         farther = (points[:, other, 2] - points[:, one, 2]) - (
@@ -275,7 +269,7 @@ class KeypointModel:
             weights=np.concatenate(
                 [
                     np.repeat(weights, 2, axis=1),
-                    sure / (1.0 + (farther / (ROBUST_DEPTH * _PAIR_SIGMAS)) ** 2) ** 2,
+                    sure / (1.0 + (farther / (3.0 * _PAIR_SIGMAS)) ** 2) ** 2,
                 ],
                 axis=1,
             ),

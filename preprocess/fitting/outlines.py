@@ -27,18 +27,8 @@ OUTLINE_PERSON_PX = 128
 """Height of a person in the reduced masks, px: a pixel is about 1.4 cm."""
 OUTLINE_SKIN_POINTS = 7000
 """Points on the skin: about one per pixel of a person `OUTLINE_PERSON_PX` high."""
-SPLAT_GROWTH_PX = 0.5
-"""Reach of a splatted silhouette beyond the outline: it has every pixel that is touched."""
 BORDER_POINTS = 160
 """Points of the borders of mask and skin that are compared."""
-MAX_RIM_COSINE = 0.2
-"""Cosine between normal and view up to which a skin point is on the rim."""
-MAX_RIM_DEPTH_PX = 2.0
-"""Distance from the silhouette's border up to which a rim point belongs to the outline, px."""
-MAX_MATCH_PX = 24.0
-"""Distance beyond which a border point has no match, px."""
-ROBUST_SCALE_PX = 3.0
-"""Residual at which a match counts a quarter (Geman-McClure), px."""
 IMAGE_BORDER_PX = 2.0
 """Distance from the image's border within which a mask's border is no outline, px."""
 
@@ -160,12 +150,12 @@ class OutlineModel:
             np.einsum("pa,pa->p", one, other)
             for one, other in ((normals, view), (normals, normals), (view, view))
         )
-        near = np.flatnonzero(towards**2 < MAX_RIM_COSINE**2 * lengths * distances)
+        near = np.flatnonzero(towards**2 < 0.2**2 * lengths * distances)  # |cosine| below 0.2
         pixels = camera.project(points[near].astype(np.float64))
         depth_px, _ = _sample(signed_distance_px(splat_silhouette(points, camera)), pixels)
-        outer = np.abs(depth_px) < MAX_RIM_DEPTH_PX
+        outer = np.abs(depth_px) < 2.0  # from the silhouette's border
         chosen, pixels = near[outer], pixels[outer]
-        within = depth_px[outer] + SPLAT_GROWTH_PX  # rim points lie a little inside the outline
+        within = depth_px[outer] + 0.5  # rim points lie a little inside the outline
         if len(chosen) < 16:
             return chosen, _Matches.none()
         some = np.linspace(0, len(chosen), min(BORDER_POINTS, len(chosen)), endpoint=False)
@@ -220,10 +210,11 @@ class OutlineModel:
         wrench = wrench @ turns
         pose = wrench.swapaxes(0, 1).reshape(len(rows), 72)
         size = np.abs(matched.residuals)
-        robust = 1.0 / (1.0 + (matched.residuals / ROBUST_SCALE_PX) ** 2) ** 2
+        # Geman-McClure: a match 3 px off counts a quarter; beyond 24 px there is none
+        robust = 1.0 / (1.0 + (matched.residuals / 3.0) ** 2) ** 2
         return OutlineRows(
             residuals=matched.residuals,
-            weights=np.where(size < MAX_MATCH_PX, robust, 0.0),
+            weights=np.where(size < 24.0, robust, 0.0),
             pose_jacobian=np.column_stack([pose, in_camera]),
             shape_jacobian=(
                 self._shape_jacobian(rows, weights, turns, in_world)

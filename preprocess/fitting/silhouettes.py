@@ -14,14 +14,6 @@ from preprocess.observation import Observation, associate_cameras
 
 START_FRAMES = 16
 """Frames of the first masks, spread evenly."""
-FIRST_FRAMES = 240
-"""Frames at the beginning of a video over which the first masks are spread that are estimated:
-decoding takes longest."""
-FIRST_SIZE_PX = 320
-"""Longer side of the images in which they are estimated."""
-LEAST_PICTURE_PX, MOST_PICTURE_PX = 480, 960
-"""Longer side from and up to which reduced pictures are kept for the key points: the network sees
-them at 256 px, and 50 take 80 MB."""
 
 
 def read_first_silhouettes(capture: Capture) -> tuple[MaskSample, ...]:
@@ -29,8 +21,8 @@ def read_first_silhouettes(capture: Capture) -> tuple[MaskSample, ...]:
     with suppress(InputError):
         if capture.masks.is_given:
             return _read_given(capture, START_FRAMES)
-        total = min(capture.source.frame_count or 1, FIRST_FRAMES)
-        small = replace(capture, size_px=min(capture.size_px, FIRST_SIZE_PX))
+        total = min(capture.source.frame_count or 1, 240)  # decoding takes longest
+        small = replace(capture, size_px=min(capture.size_px, 320))
         return _observe(small, START_FRAMES, total)
     return ()
 
@@ -73,7 +65,8 @@ def _observe(capture: Capture, count: int, total: int) -> tuple[MaskSample, ...]
         if isinstance(each, Observation):
             index = each.frame.index
             longer, is_whole = max(each.frame.size_px), each.filmed_rgb is None
-            keeps = longer <= MOST_PICTURE_PX and (is_whole or longer >= LEAST_PICTURE_PX)
+            # for the key points, whose network sees them at 256 px; 50 of 960 px take 80 MB
+            keeps = longer <= 960 and (is_whole or longer >= 480)
             samples.append(
                 MaskSample(
                     index=index, camera_row=camera_row(index), alpha=each.alpha,

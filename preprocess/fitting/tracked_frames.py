@@ -36,8 +36,6 @@ CHUNK_FRAMES = 8
 ones, poses jitter three times as much."""
 FIRST_ITERATIONS = (5, 5)
 """Iterations over the first frames, with key points alone and then with outlines."""
-CHUNK_ITERATIONS = (1, 3)
-"""The same over those of three chunks."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -123,7 +121,7 @@ class StreamPoseFitter:
         if self._done == end:
             return {}
         fitter = _fitter(self._seen, ClipPoses.stack(self._poses), self._model, self._camera)
-        fitter.iterate_stages(POSES_ALONE, *CHUNK_ITERATIONS)
+        fitter.iterate_stages(POSES_ALONE, keypoint_count=1, outline_count=3)
         self._poses = [fitter.poses[place] for place in range(len(self._seen))]
         new = range(self._done, end)
         found = {self._seen[place].number: self._poses[place] for place in new}

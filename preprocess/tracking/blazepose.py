@@ -34,24 +34,11 @@ from preprocess.tracking.blazepose_networks import (
 )
 from preprocess.tracking.keypoints import HIPS, MIN_PRESENCE, CroppedMask, PersonKeypoints
 
-SHOULDERS, KNEES = (11, 12), (25, 26)
-"""Numbers of key points, left and right."""
-ACROSS = np.linspace(0.2, 0.8, 8)
-ALONG = np.linspace(0.1, 0.9, 12)
-"""Places where colors are taken: shares of the way from left to right, and downwards."""
 QUANTILES = (0.15, 0.5, 0.85)
 """Quantiles of the colors that are compared: stripes differ from one color of the same mean."""
-LEARNING_RATE = 0.15
-"""Share of a new image in what is remembered."""
-HIP_JOINTS, NECK_JOINT = (1, 2), 12
-"""SMPL's hips and neck."""
 MAX_CLOTHING_M = 0.2
 """Distance from the posed body beyond which all is background, metres: hair, wide clothes and
 errors of poses are within."""
-BODY_REACH_PX = 2.0
-"""Distance from a point of the skin within which a pixel of the network's image is body."""
-MIN_BODY_IOU = 0.4
-"""Least IoU of mask and posed body; masks below it are rejected."""
 
 
 class PersonLooks:
@@ -80,7 +67,7 @@ class PersonLooks:
         """Remember the colors of an image that shows the person."""
         away = self.distance(colors) if self.is_known else 0.0
         self._pictures += 1
-        rate = max(LEARNING_RATE, 1 / self._pictures)
+        rate = max(0.15, 1 / self._pictures)
         self._colors += rate * (colors - self._colors)
         self._variation += rate * (away - self._variation)
 
@@ -90,12 +77,13 @@ def colors_of(rgb: RgbImage, found: PersonKeypoints) -> Float[np.ndarray, "numbe
     points = found.image_px
     height, width = rgb.shape[:2]
     colors = []
-    for upper, lower in ((SHOULDERS, HIPS), (HIPS, KNEES)):
+    for upper, lower in (((11, 12), HIPS), (HIPS, (25, 26))):  # shoulders to hips to knees
+        along = np.linspace(0.1, 0.9, 12)[:, None]
         rows = [
-            points[upper[0]] + ALONG[:, None] * (points[lower[0]] - points[upper[0]]),
-            points[upper[1]] + ALONG[:, None] * (points[lower[1]] - points[upper[1]]),
+            points[a] + along * (points[b] - points[a]) for a, b in zip(upper, lower, strict=True)
         ]
-        grid = (rows[0] + ACROSS[:, None, None] * (rows[1] - rows[0])).reshape(-1, 2)
+        across = np.linspace(0.2, 0.8, 8)[:, None, None]
+        grid = (rows[0] + across * (rows[1] - rows[0])).reshape(-1, 2)
         columns, lines = np.clip(grid.astype(int), 0, (width - 1, height - 1)).T
         lab = cv2.cvtColor(rgb[lines, columns][None].astype(np.float32) / 255, cv2.COLOR_RGB2LAB)
         colors.append(np.quantile(lab[0], QUANTILES, axis=0).ravel())
@@ -104,12 +92,6 @@ def colors_of(rgb: RgbImage, found: PersonKeypoints) -> Float[np.ndarray, "numbe
 
 MAX_STEP = 0.2
 """Farthest that a person moves in one frame, in sides of the square; farther is someone else."""
-MAX_GROWTH = 1.4
-"""Most that a person grows or shrinks in the image in one frame."""
-MAX_STEP_AFTER_LOSS = 0.1
-"""Distance beyond `MAX_STEP` that a lost person may have moved, for each frame since."""
-SEARCH_SIDE = 1.5
-"""Side of the area around the last place that is searched, in sides of the person's square."""
 WATCH_INTERVAL = 5
 """Frames from one look for other persons to the next."""
 NEAR = 0.6
@@ -118,20 +100,10 @@ OVERLAPPING = 0.3
 """Distance within which two persons hide each other."""
 REACHING = 1.0
 """Distance of another person within which its limbs may reach into the person's square."""
-MAX_MIXED = 0.1
-"""Share of a person's mask that may be nearer to another one's limbs: an arm is 0.06."""
-MAX_COLOR_DISTANCE = 8.0
-"""Largest difference of a person's colors, in units of CIELAB, if the others' are not known."""
-MAX_UNSEEN_COLOR_DISTANCE = 12.0
-"""Largest difference of colors where the detector finds no person, in units of CIELAB: past it the
-networks hold on to a thing that the person passed."""
 CROWD_MEMORY = 20
 """Frames for which colors tell persons apart after another one was near."""
 SEEN_AGO = WATCH_INTERVAL + 1
 """Frames for which another person who was seen near may still be in the person's mask."""
-MASK_JUMP = 1.2
-"""Factor by which the person's mask changes from one frame to the next only if another person comes
-or goes, or the film is cut: of persons who turn and dance it changes by 1.15 at most."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,9 +115,9 @@ class LastPlace:
 
     def strangeness(self, square: PersonSquare) -> float:
         """Improbability that a square shows the same person; above 1 it does not."""
-        reach = MAX_STEP + MAX_STEP_AFTER_LOSS * (self.frames_ago - 1)
+        reach = MAX_STEP + 0.1 * (self.frames_ago - 1)
         step = distance_in_sides(self.square, square)
-        growth = abs(np.log(square.side / self.square.side)) / np.log(MAX_GROWTH)
+        growth = abs(np.log(square.side / self.square.side)) / np.log(1.4)
         return max(step / reach, float(growth) * MAX_STEP / reach)
 
 
@@ -180,7 +152,8 @@ class BlazePoseTracker:
         rgb = self._brighten(rgb)
         found = self._follow(rgb) or self._find(rgb)
         mask_px = 0.0 if found is None else found.keypoints.mask.person_px()
-        jumps = self._mask_px and abs(np.log(max(mask_px, 1.0) / self._mask_px)) > np.log(MASK_JUMP)
+        # of persons who turn and dance the mask changes by 1.15: another one, or the film is cut
+        jumps = self._mask_px and abs(np.log(max(mask_px, 1.0) / self._mask_px)) > np.log(1.2)
         self._mask_px = mask_px
         if found is None or (jumps and self._is_strange(rgb, found)):
             self._look_for_who_hides(rgb)
@@ -198,7 +171,7 @@ class BlazePoseTracker:
             return replace(person, crowded=self._crowded_frames > CROWD_MEMORY - SEEN_AGO)
         mask, mixed = separate_mask(person, self._beside.keypoints)
         is_alike = self._looks.is_like(self._company)
-        return replace(person, mask=mask, crowded=is_alike or mixed > MAX_MIXED)
+        return replace(person, mask=mask, crowded=is_alike or mixed > 0.1)  # an arm is 0.06
 
     def _follow(self, rgb: RgbImage) -> FoundLandmarks | None:
         """The person, where the last frame's key points say; None if it is not there."""
@@ -210,7 +183,7 @@ class BlazePoseTracker:
     def _is_strange(self, rgb: RgbImage, found: FoundLandmarks) -> bool:
         """True if the colors are another one's."""
         distance = self._looks.distance(colors_of(rgb, found.keypoints))
-        return self._looks.is_known and distance > MAX_UNSEEN_COLOR_DISTANCE
+        return self._looks.is_known and distance > 12.0  # in CIELAB, as below
 
     def _look_for_who_hides(self, rgb: RgbImage) -> None:
         """Look for another person where the person was, who is not there now."""
@@ -267,7 +240,7 @@ class BlazePoseTracker:
         last = self._last
         if last is None:
             return self._choose(rgb)
-        around = replace(last.square, side=SEARCH_SIDE * last.square.side, angle=0.0)
+        around = replace(last.square, side=1.5 * last.square.side, angle=0.0)
         for area in (None, around):
             detections = self._detect(rgb, area)
             likely = [each for each in detections if last.strangeness(each.square) <= 1]
@@ -347,7 +320,7 @@ class BlazePoseTracker:
         distance = self._looks.distance(colors)
         if self._company.is_known:
             return distance < self._company.distance(colors)
-        return distance < MAX_COLOR_DISTANCE
+        return distance < 8.0
 
 
 def find_persons(
@@ -423,7 +396,7 @@ class BlazePoseSegmenter:
             InputError: If the body is outside the image, or the mask disagrees with it.
         """
         person, agreement = self._find(frame.rgb, pose, camera)
-        if agreement < MIN_BODY_IOU:
+        if agreement < 0.4:
             raise InputError(
                 f"the estimated mask agrees by {agreement:.0%} only with the posed body"
             )
@@ -437,8 +410,8 @@ def _square_around(
     pixels: Float[np.ndarray, "points 2"], joints: Float[np.ndarray, "24 2"]
 ) -> PersonSquare:
     """The square in which BlazePose expects a posed body, by its skin and joints in the frame."""
-    hips = joints[list(HIP_JOINTS)].mean(axis=0)
-    up = joints[NECK_JOINT] - hips
+    hips = joints[[1, 2]].mean(axis=0)
+    up = joints[12] - hips  # the neck
     radius = np.linalg.norm(pixels - hips, axis=1).max()
     return PersonSquare.around(hips, hips + radius * up / max(float(np.linalg.norm(up)), 1e-6))
 
@@ -456,7 +429,7 @@ def _limit_to_body(
     away = cv2.distanceTransform(free, cv2.DIST_L2, 3)
     reach = MAX_CLOTHING_M * px_per_m / float(np.hypot(*turn[:, 0]))
     values = np.where(away < reach, mask.values, 0).astype(np.uint8)
-    person, body = values > 127, away < BODY_REACH_PX
+    person, body = values > 127, away < 2.0
     iou = float((person & body).sum() / max(int((person | body).sum()), 1))
     return CroppedMask(values=values, image_from_crop=mask.image_from_crop), iou
 
@@ -468,28 +441,25 @@ LIMBS = (
     (23, 25), (25, 27), (27, 31), (27, 29), (24, 26), (26, 28), (28, 32), (28, 30),
 )  # fmt: skip
 """Pairs of key points: arms with hands, head, and legs with feet."""
-LIMB_RADIUS = 0.1
-"""Distance from a person's limbs within which its skin and clothes lie, trunk lengths (5 cm)."""
-MIN_VISIBILITY = 0.5
-"""Visibility of both ends below which a limb of the other person is not drawn: it may be a guess
-that lies across the person."""
 
 
 def separate_mask(person: PersonKeypoints, other: PersonKeypoints) -> tuple[CroppedMask, float]:
     """Remove from a person's mask what another one's limbs reach into it.
 
-    Pixels that are nearer to the other's limbs go, unless they are within `LIMB_RADIUS` of the
-    person's: a hand may lie before the other's chest. Returns the mask, and the share of its area
-    that is nearer to the other, in [0, 1].
+    Pixels that are nearer to the other's limbs go, unless they are within 5 cm of the person's: a
+    hand may lie before the other's chest. Returns the mask, and the share of its area that is
+    nearer to the other, in [0, 1].
     """
     mask = person.mask
+    # a limb that is hardly seen may be a guess that lies across the person
     own, others = (
         _distance_to_limbs(mask, each.image_px, each.visibility >= least)
-        for each, least in ((person, 0.0), (other, MIN_VISIBILITY))
+        for each, least in ((person, 0.0), (other, 0.5))
     )
     middles = person.image_px[list(TRUNK)].reshape(2, 2, 2).mean(axis=1)
     px_per_pixel = float(np.hypot(*mask.image_from_crop[:, 0]))
-    radius = LIMB_RADIUS * float(np.hypot(*(middles[1] - middles[0]))) / px_per_pixel
+    # a tenth of the trunk, 5 cm: skin and clothes
+    radius = 0.1 * float(np.hypot(*(middles[1] - middles[0]))) / px_per_pixel
     is_others, is_person = own > others, mask.values > 127
     kept = np.where(is_others & (own > radius), 0, mask.values).astype(np.uint8)
     share = float((is_others & is_person).sum() / max(1, is_person.sum()))

@@ -20,23 +20,8 @@ from preprocess.tracking.keypoints import KEYPOINT_COUNT, CroppedMask, PersonKey
 
 WEIGHTS = Path(__file__).parent / "weights"
 """Folder of this project's own networks."""
-MARGIN = 1.25
-"""Side of the square, in diameters of the circle."""
-ANCHOR_GRIDS = ((8, 2), (16, 2), (32, 6))
-"""Distance of the anchors, pixels, and how many there are at each place."""
-MIN_SCORE = 0.5
-"""Least probability of a person."""
-MAX_OVERLAP = 0.3
-"""Largest intersection over union of two persons' boxes."""
 SAME_PERSON_DISTANCE = 0.12
 """Two detections whose middles are nearer than this share of their squares' side are one person."""
-SMALL_PERSON = 0.6
-"""A person whose square is smaller than this share of the searched one is searched again, larger:
-the network was made for persons who fill the image."""
-HEATMAP_REACH = 3
-"""Cells of a heat map on each side of a key point that make it more exact."""
-MIN_HEAT = 0.5
-"""Least peak of a heat map that is used."""
 
 
 class OnnxNetwork:
@@ -97,7 +82,7 @@ class PersonSquare:
         return cls(
             x=float(hips[0]),
             y=float(hips[1]),
-            side=float(2 * MARGIN * np.hypot(x, y)),
+            side=float(2.5 * np.hypot(x, y)),  # a quarter wider than the circle
             angle=float(np.arctan2(x, -y)),
         )
 
@@ -167,7 +152,7 @@ class BlazePoseDetector:
         size = self._network.picture_size
         output = self._network.run(area.crop(rgb, size), -1.0, 1.0)
         scores = sigmoid(output["scores"][:, 0])
-        candidates = np.flatnonzero(scores >= MIN_SCORE)
+        candidates = np.flatnonzero(scores >= 0.5)
         candidates = candidates[np.argsort(-scores[candidates], kind="stable")]
         image_from_crop = area.image_from_crop(size)
         found: list[PersonDetection] = []
@@ -202,8 +187,9 @@ class BlazePoseDetector:
                 for detection in self(rgb, part):
                     if not any(is_same_person(detection, other) for other in found):
                         found.append(detection)
+        # the network was made for persons who fill the image
         return [
-            self._look_closer(rgb, each) if each.square.side < SMALL_PERSON * whole.side else each
+            self._look_closer(rgb, each) if each.square.side < 0.6 * whole.side else each
             for each in found
         ]
 
@@ -231,7 +217,7 @@ def parts_of_frame(rgb: RgbImage) -> list[PersonSquare]:
 def anchors(picture_size: int) -> Float[np.ndarray, "anchors 2"]:
     """Places of the anchors, as shares of the image's width and height."""
     grids = []
-    for distance, count in ANCHOR_GRIDS:
+    for distance, count in ((8, 2), (16, 2), (32, 6)):  # distance in px, and how many at each place
         cells = picture_size // distance
         rows, columns = np.mgrid[:cells, :cells] + 0.5
         grids.append(np.repeat(np.column_stack([columns.ravel(), rows.ravel()]) / cells, count, 0))
@@ -243,7 +229,7 @@ def is_same_person(a: PersonDetection, b: PersonDetection) -> bool:
     apart = np.hypot(a.square.x - b.square.x, a.square.y - b.square.y)
     if apart < SAME_PERSON_DISTANCE * min(a.square.side, b.square.side):
         return True
-    return overlap(a.box, b.box) > MAX_OVERLAP
+    return overlap(a.box, b.box) > 0.3
 
 
 def overlap(a: Float[np.ndarray, "4"], b: Float[np.ndarray, "4"]) -> float:
@@ -301,7 +287,7 @@ def refine(
     """Move points, pixels of the crop, to the centroid of their heat maps (logits) nearby."""
     cells = heatmaps.shape[1]
     cell_px = size / cells
-    reach = np.arange(-HEATMAP_REACH, HEATMAP_REACH + 1)
+    reach = np.arange(-3, 4)
     middle = np.floor(crop_px / cell_px).astype(int)
     columns, rows = (middle[:, axis, None] + reach for axis in (0, 1))
     points = np.arange(len(middle))[:, None, None]
@@ -309,7 +295,7 @@ def refine(
     heat = sigmoid(heatmaps[points, *near].astype(np.float64))
     for axis, places in ((1, columns), (2, rows)):
         heat *= np.expand_dims((places >= 0) & (places < cells), axis)
-    use = ((middle >= 0) & (middle < cells)).all(axis=1) & (heat.max(axis=(1, 2)) >= MIN_HEAT)
+    use = ((middle >= 0) & (middle < cells)).all(axis=1) & (heat.max(axis=(1, 2)) >= 0.5)
     total = heat.sum(axis=(1, 2))
     refined = crop_px.copy()
     for axis, places in ((0, columns), (1, rows)):

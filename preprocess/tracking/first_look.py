@@ -27,32 +27,13 @@ from preprocess.tracking.blazepose_networks import (
 from preprocess.tracking.keypoints import MIN_PRESENCE
 from preprocess.tracking.video_tracking import TrackingProblem, touched_borders
 
-MIN_OTHER_SIZE = 0.5
-"""Height of another person, in that of the largest, from which it counts as one in the film."""
-FITTING_STEP = 0.1
-"""Way and growth of a person, in sides of its square, up to which an earlier square fits."""
-BACKGROUND_PX = 480
-"""Longer side of the images in which the background is followed, px."""
 CELL_PX = 24
 """Side of the squares of which each has one corner that is followed, px: all parts of the picture
 count alike, however much stronger a title's corners are."""
-MIN_GRADIENT = 1.5
-"""Least change of gray along and across a corner, levels a pixel: noise is below it."""
 MIN_CORNERS = 12
 """Fewest corners of the background of which a motion is believed."""
-PERSON_MARGIN = 0.1
-"""Margin around the person that is no background, person heights."""
 STILL_SHARE = 0.01
 """Most that the background shifts from place to place before a camera that stands, longer sides."""
-STILL_FRAME_SHARE = 0.001
-"""Most that the background shifts between the two frames of a place before a camera that stands:
-half a pixel of those that are looked at; a hand trembles more. Longer sides."""
-HELD_SHARE = 0.08
-"""Most that the background shifts if the camera is held by someone who stands, longer sides."""
-MIN_PARALLAX_SHARE = 0.02
-"""Least shift between two frames that tells turning from walking, longer sides."""
-TURNING_SHARE, WALKING_SHARE = 0.9, 0.75
-"""Share of the corners that move as one plane: more when the camera turns, less when it walks."""
 
 
 class CameraMotion(Enum):
@@ -194,7 +175,7 @@ class _Glimpse:
         mask = np.full(self.size_px[::-1], 255, np.uint8)
         for each in self.persons:
             points = each.keypoints.image_px
-            margin = PERSON_MARGIN * float(np.ptp(points, axis=0).max())
+            margin = 0.1 * float(np.ptp(points, axis=0).max())
             low = np.clip(points.min(axis=0) - margin, 0.0, None).astype(int)
             high = np.clip(points.max(axis=0) + margin, 0.0, None).astype(int)
             mask[low[1] : high[1], low[0] : high[0]] = 0
@@ -228,7 +209,7 @@ class PersonFinder:
         if square is not None:
             found = self._landmarks(rgb, square)
             change = abs(np.log(found.square.side / square.side))
-            if distance_in_sides(square, found.square) + change > FITTING_STEP:
+            if distance_in_sides(square, found.square) + change > 0.1:
                 found = self._landmarks(rgb, found.square)
             if found.keypoints.presence >= MIN_PRESENCE:
                 return found
@@ -243,7 +224,7 @@ class PersonFinder:
             each
             for each in persons
             if each.keypoints.presence >= MIN_PRESENCE
-            and each.square.side > MIN_OTHER_SIZE * persons[0].square.side
+            and each.square.side > 0.5 * persons[0].square.side
         ]
 
 
@@ -274,19 +255,21 @@ def camera_motion(
     followed = [each for each in near if each is not None]
     if len(followed) < max(2, len(pairs) // 2):
         return None, 0.0
-    stays = [each.share for each in far if each is not None and each.share < HELD_SHARE]
+    stays = [each.share for each in far if each is not None and each.share < 0.08]
     if 2 * len(stays) > len(far):  # some places are hidden by the person
         shift = max(stays)
         return CameraMotion.STILL if shift < STILL_SHARE else CameraMotion.HELD, shift
-    planes = [each.plane for each in followed if each.share > MIN_PARALLAX_SHARE]
+    # smaller shifts do not tell turning from walking
+    planes = [each.plane for each in followed if each.share > 0.02]
     shift = max(each.share for each in followed)
     # a background too plain to be recognized from far
-    if max(stays, default=0.0) < STILL_SHARE and shift < STILL_FRAME_SHARE:
+    # a background too plain to be recognized from far; 0.001 is half a pixel, a hand trembles more
+    if max(stays, default=0.0) < STILL_SHARE and shift < 0.001:
         return CameraMotion.STILL, shift
-    if len(planes) < 2 or WALKING_SHARE < np.median(planes) < TURNING_SHARE:
-        return CameraMotion.MOVES, shift
-    turns = np.median(planes) >= TURNING_SHARE
-    return CameraMotion.TURNS if turns else CameraMotion.WALKS, shift
+    one_plane = float(np.median(planes)) if len(planes) > 1 else 0.8  # share of the corners in it
+    if one_plane >= 0.9:
+        return CameraMotion.TURNS, shift
+    return CameraMotion.WALKS if one_plane <= 0.75 else CameraMotion.MOVES, shift
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -298,7 +281,7 @@ class _Shift:
 
 
 def _reduced_gray(rgb: RgbImage) -> UInt8[np.ndarray, "rows columns"]:
-    scale = min(1.0, BACKGROUND_PX / max(rgb.shape[:2]))
+    scale = min(1.0, 480 / max(rgb.shape[:2]))
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     return cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
 
@@ -313,7 +296,7 @@ def _corners(
         for left in range(0, gray.shape[1], CELL_PX):
             cell = sharpness[top : top + CELL_PX, left : left + CELL_PX]
             row, column = np.unravel_index(cell.argmax(), cell.shape)
-            if 255.0 / 2.0 * np.sqrt(cell[row, column]) > MIN_GRADIENT:
+            if 255.0 / 2.0 * np.sqrt(cell[row, column]) > 1.5:  # levels a pixel; noise is below
                 corners.append((left + column, top + row))
     return np.array(corners, np.float32).reshape(-1, 1, 2)
 

@@ -24,29 +24,12 @@ LEFT_POINTS = [11, 13, 23, 25, 27]
 """Left shoulder, elbow, hip, knee and ankle."""
 RIGHT_POINTS = [12, 14, 24, 26, 28]
 """Those on the right."""
-EXCHANGE_COST = 0.4
-"""Cost of an exchange between two rows, where that of a half turn is 1."""
-ALL_EXCHANGED_COST = 1.2
-"""Cost of exchanging left and right in all rows of a film: the shorter part is the wrong one."""
-MIN_DISTANCE_SHARE = 0.5
-"""Distance between left and right, share of its median, below which a row tells them not apart:
-between two guesses, key points of both sides lie in the middle."""
-CUT_MOTION = 3.0
-"""Motion in the image, relative to that of the frames around, at which a film may have been cut."""
-LEAST_MOTION = 0.01
-"""Motion from row to row of a person at rest, body sizes."""
-NEAR_ROWS = 3
-"""Rows before and after an exchange whose motion counts as usual."""
-MAX_GAP_FRAMES = 3
-"""Frames between two rows beyond which they are not compared."""
 LIMBS = (
     (16, 18, 20, 11, 13, 15, (0.0, -1.0, 0.0)), (17, 19, 21, 12, 14, 16, (0.0, 1.0, 0.0)),
     (1, 4, 7, 23, 25, 27, (1.0, 0.0, 0.0)), (2, 5, 8, 24, 26, 28, (1.0, 0.0, 0.0)),
 )  # fmt: skip
 """Of arms and legs: three joints, the three key points next to them, and the axis that the middle
 joint bends about at rest."""
-STRAIGHT = 0.35
-"""Sine of a limb's bend at which its key points and its rest pose tell its twist alike."""
 PLACED_JOINTS = (1, 2, 4, 5, 7, 8, 16, 17, 18, 19, 20, 21)
 """Joints that are placed at their key points in the image."""
 PLACED_POINTS = (23, 24, 25, 26, 27, 28, 11, 12, 13, 14, 15, 16)
@@ -78,12 +61,13 @@ def find_swaps(track: KeypointTrack) -> Bool[np.ndarray, "rows"]:
     across = track.world_m[:, LEFT_POINTS] - track.world_m[:, RIGHT_POINTS]
     across = across.reshape(len(track), -1)
     sizes = np.linalg.norm(across, axis=1)
-    kept = np.flatnonzero(sizes >= MIN_DISTANCE_SHARE * np.median(sizes))
+    # between two guesses, key points of both sides lie in the middle and tell them not apart
+    kept = np.flatnonzero(sizes >= 0.5 * np.median(sizes))
     across /= np.maximum(sizes, 1e-9)[:, None]
     cosines = (across[kept[1:]] * across[kept[:-1]]).sum(axis=1)
     link = _continuity(track, kept)
-    turn, exchange = link * (1.0 - cosines) / 2.0, link * ((1.0 + cosines) / 2.0 + EXCHANGE_COST)
-    row_cost = np.array([0.0, ALL_EXCHANGED_COST / len(kept)])
+    turn, exchange = link * (1.0 - cosines) / 2.0, link * ((1.0 + cosines) / 2.0 + 0.4)
+    row_cost = np.array([0.0, 1.2 / len(kept)])  # of the whole film: the shorter part is wrong
     costs, crossed = row_cost, np.zeros((len(kept), 2), dtype=bool)
     for row, (stay, cross) in enumerate(zip(turn, exchange, strict=True), start=1):
         crossed[row] = costs[::-1] + cross < costs + stay
@@ -106,11 +90,12 @@ def _continuity(track: KeypointTrack, rows: Int[np.ndarray, "rows"]) -> Float[np
     size = np.linalg.norm(middles - middles.mean(axis=1, keepdims=True), axis=2).mean(axis=1)
     moved = np.linalg.norm(np.diff(middles, axis=0), axis=2).mean(axis=1)
     moved /= np.maximum(size[:-1], 1e-9) * np.diff(rows)
-    beside = [*range(-NEAR_ROWS, 0), *range(1, NEAR_ROWS + 1)]
+    beside = [-3, -2, -1, 1, 2, 3]
     places = np.arange(len(moved))[:, None] + beside
     usual = np.median(moved[np.abs(places) % max(len(moved), 1)], axis=1)
-    gaps = np.concatenate([[0], np.cumsum(np.diff(track.frames) > MAX_GAP_FRAMES)])
-    link = np.exp(-((moved / (CUT_MOTION * np.maximum(usual, LEAST_MOTION))) ** 2))
+    gaps = np.concatenate([[0], np.cumsum(np.diff(track.frames) > 3)])  # not compared over these
+    # three times the usual motion may be a cut; one at rest moves by 0.01 body sizes
+    link = np.exp(-((moved / (3.0 * np.maximum(usual, 0.01))) ** 2))
     return link * (np.diff(gaps[rows]) == 0)
 
 
@@ -183,7 +168,8 @@ def _limb_turn(
     """
     along, further = unit_vectors(first), unit_vectors(second)
     unbent = parent @ shortest_turn(rest, parent.T @ first)
-    axis = np.cross(along, further) + STRAIGHT * (unbent @ hinge)
+    # at a bend of sine 0.35, key points and rest pose tell the twist alike
+    axis = np.cross(along, further) + 0.35 * (unbent @ hinge)
     axis = unit_vectors(axis - (axis @ along) * along)
     start = unit_vectors(rest)
     side = unit_vectors(hinge - (hinge @ start) * start)

@@ -21,33 +21,10 @@ from preprocess.tracking.video_tracking import MIN_FRAMES, PROBLEM_BITS, Trackin
 
 MIN_IOU = 0.7
 """Least mean IoU of body and mask of poses that are good enough for an avatar."""
-DOUBTFUL_IOU = 0.65
-"""IoU below which a frame is doubtful."""
-USUAL_SPREADS, IOU_NOISE = 5.0, 0.01
-"""Standard deviations (by the median absolute deviation) below the film's median IoU from which a
-frame is doubtful, as where another person walks by in front, and the least standard deviation."""
-MAX_MISSED_SHARE = 0.3
-"""Largest share of the frames with the person in which the tracker may miss them."""
-ABSENCE_S = 1.0
-"""Length of a gap whose frames count half as missed, seconds: in longer ones the person is away, as
-before a title of an edited video."""
-MAX_DOUBTFUL_SHARE = 0.5
-"""Largest share of doubtful frames of poses that are good enough for an avatar."""
 MIN_PERSON_PX = 96.0
 """Least median height of the person in the frames, px."""
-MIN_CUT_FRAMES = 16
-"""Fewest frames in which cuts are looked for; a few photographs have no times."""
-BRIDGED_S = 0.35
-"""Gap between two doubtful stretches with the same reason that are joined, seconds."""
 MIN_STRETCH_FRAMES = 3
 """Fewest frames of a doubtful stretch that is reported."""
-BREADTHS = (0.78, 1.17)
-"""Least and largest breadth of shoulders and hips to the height, relative to the mean body's: in 40
-videos 0.82 to 1.10, in videos stretched by a third 1.3."""
-JUMP_HEIGHTS = 0.1
-"""Way of the hips from one frame to the next that may be a cut of the video, body heights."""
-JUMP_STEPS = 8.0
-"""The same, in medians of that way."""
 DISAGREE = "body and mask disagree (something may hide the person)"
 """Reason of frames whose IoU is low, or far below the film's usual."""
 JUMPED = "the person jumps to another place; was the film cut here?"
@@ -111,11 +88,11 @@ class TrackingGrade:
     def objections(self) -> tuple[str, ...]:
         """Reasons why the poses are not good enough for an avatar; empty if they are."""
         objections = []
-        if self.doubtful_share > MAX_DOUBTFUL_SHARE:
+        if self.doubtful_share > 0.5:
             most = f"{self.main_doubt} in {self.main_doubt_frames} of {self.frames} frames"
             others = len(self.doubts) - self.main_doubt_frames
             objections.append(f"{most}, and {others} more are doubtful" if others else most)
-        if self.missed_share > MAX_MISSED_SHARE:
+        if self.missed_share > 0.3:
             objections.append(
                 f"the person was missed in {self.missed_share:.0%} of the frames that seem to "
                 "show them"
@@ -131,7 +108,8 @@ class TrackingGrade:
             objections.append(
                 f"the person is only {self.person_px:.0f} px tall (expected {MIN_PERSON_PX:.0f})"
             )
-        if not BREADTHS[0] <= self.breadth**self.breadth_seen <= BREADTHS[1]:
+        # in 40 videos 0.82 to 1.10, in videos stretched by a third 1.3
+        if not 0.78 <= self.breadth**self.breadth_seen <= 1.17:
             which = "broad" if self.breadth > 1.0 else "narrow"
             objections.append(
                 f"the body is too {which}, {self.breadth:.2f} times the usual (the pictures may be "
@@ -269,7 +247,7 @@ def _missed(
     weights: dict[int, float] = {}
     for first, end in edges.reshape(-1, 2):
         length_s = times_s[end - 1] - times_s[first]
-        degree = 1.0 / (1.0 + (length_s / ABSENCE_S) ** 2)
+        degree = 1.0 / (1.0 + length_s**2)  # half in a gap of 1 s; in longer ones they are away
         weights.update(dict.fromkeys(numbers[first:end].tolist(), float(degree)))
     return weights
 
@@ -283,8 +261,8 @@ def _disagreeing(
         return np.zeros(len(keypoints), dtype=bool)
     ious = np.array([iou_of_frame[number] for number in numbers])
     usual = float(np.median(ious))
-    spread = max(IOU_NOISE, 1.4826 * float(np.median(np.abs(ious - usual))))  # of a normal's
-    least = max(DOUBTFUL_IOU, usual - USUAL_SPREADS * spread)
+    spread = max(0.01, 1.4826 * float(np.median(np.abs(ious - usual))))  # of a normal's
+    least = max(0.65, usual - 5.0 * spread)  # below, as where another person walks by in front
     return np.interp(keypoints.frames, numbers, ious) < least
 
 
@@ -306,12 +284,12 @@ def _crowded(keypoints: KeypointTrack) -> Bool[np.ndarray, "rows"]:
 def _jumps(keypoints: KeypointTrack) -> Bool[np.ndarray, "rows"]:
     """Rows on both sides of a cut in which the person goes on in another place."""
     jumps = np.zeros(len(keypoints), dtype=bool)
-    if len(keypoints) < MIN_CUT_FRAMES:
+    if len(keypoints) < 16:  # a few photographs have no times
         return jumps
     hips = keypoints.image_px[:, HIPS].mean(axis=1)
     tall = max(1.0, float(np.median(np.ptp(keypoints.image_px[:, :, 1], axis=1))))
     way = np.linalg.norm(np.diff(hips, axis=0), axis=1) / tall / np.diff(keypoints.frames)
-    cut = way > max(JUMP_HEIGHTS, JUMP_STEPS * float(np.median(way)))
+    cut = way > max(0.1, 8.0 * float(np.median(way)))  # body heights
     jumps[1:] |= cut
     jumps[:-1] |= cut
     return jumps
@@ -364,7 +342,7 @@ def _stretches(
         rows = [number for number in numbers if reason in reasons.get(number, [])]
         groups: list[list[int]] = []
         for number in rows:
-            near = groups and frame_times_s[number] - frame_times_s[groups[-1][-1]] <= BRIDGED_S
+            near = groups and frame_times_s[number] - frame_times_s[groups[-1][-1]] <= 0.35  # s
             groups[-1].append(number) if near else groups.append([number])
         stretches += [
             DoubtfulStretch(

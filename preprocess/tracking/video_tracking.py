@@ -23,34 +23,15 @@ from preprocess.tracking.keypoints import HIPS, CroppedMask, KeypointTrack, Pers
 
 BORDER_SAMPLES = 128
 """Places along each border of a frame at which the mask is read."""
-MIN_TOUCHING = 2
-"""Places with the person in them that make a touch."""
-BODY_POINTS = (0, 7, 8, *range(11, 17), *range(23, 29))
-"""Key points of the body, without fingers, heels and toes."""
-CUT_MARGIN = 0.05
-"""Distance of a key point of the body from a border within which the person is cut there, person
-heights. Shoes and fingertips that touch a border are farther: they cut nothing off."""
 ELSEWHERE = 0.6
 """Distance from the last place, in sides of the square around the person, that is worth a word."""
 MIN_FRAMES = 4
 """Fewest frames with the person, or with a usable mask, that an avatar is made of."""
-MIN_FOUND = 8
-"""Fewest frames in which the person must be found; 4 of fewer than 16 frames."""
 FRAMES_REFINED_AGAIN = 60
 """First frames of a film, of which those that are used have their masks made again in the end, when
 the background behind them is known."""
-APPROACH_FRAMES = 4
-"""Frames before another person is seen to be near in which it may have come near."""
 RETURN_FRAMES = 20
 """Frames around those with another person in which a jump of the hips is from or to that one."""
-HIP_ACCELERATION = 9.0
-"""Largest acceleration of a person's hips, body heights per second squared: 15 m/s²."""
-HIP_NOISE = 0.02
-"""Change of the hips' way from frame to frame by errors of key points, body heights."""
-USUAL_CHANGES = 4.0
-"""Largest change of that way, in medians of it: errors are larger in one of 60,000 frames."""
-QUEUED_MASKS = 8
-"""Most masks that wait to be written."""
 
 
 class TrackingProblem(Enum):
@@ -99,9 +80,10 @@ class ProblemFinder:
 def touched_borders(found: PersonKeypoints, size_px: tuple[int, int]) -> set[TrackingProblem]:
     """The borders of the frame that cut a person: the mask touches them, key points are near."""
     width, height = size_px
-    body = found.image_px[list(BODY_POINTS)]
+    # neither fingers nor feet: shoes and fingertips that touch a border cut nothing off
+    body = found.image_px[[0, 7, 8, *range(11, 17), *range(23, 29)]]
     low_xy, high_xy = body.min(axis=0), body.max(axis=0)
-    margin = CUT_MARGIN * float(np.ptp(found.image_px, axis=0).max())
+    margin = 0.05 * float(np.ptp(found.image_px, axis=0).max())
     near = {
         TrackingProblem.LEFT: low_xy[0] < margin,
         TrackingProblem.RIGHT: high_xy[0] > width - margin,
@@ -125,7 +107,7 @@ def touched_borders(found: PersonKeypoints, size_px: tuple[int, int]) -> set[Tra
             continue
         column, row = np.floor(crop_from_image @ np.array([x, y, high])).astype(int)
         inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-        if (found.mask.values[row[inside], column[inside]] > 127).sum() >= MIN_TOUCHING:
+        if (found.mask.values[row[inside], column[inside]] > 127).sum() >= 2:
             touched.add(problem)
     return touched
 
@@ -202,9 +184,7 @@ class VideoTracking:
                     self._problems.append(sum(PROBLEM_BITS[each] for each in seen))
                 if self._mask_folder is not None:
                     self._writing.append(pool.submit(self._write_mask, frame, person))
-                while len(self._writing) > QUEUED_MASKS or (
-                    self._writing and self._writing[0].done()
-                ):
+                while len(self._writing) > 8 or (self._writing and self._writing[0].done()):
                     self._writing.pop(0).result()
                 yield len(self._times_s)
         if self._mask_folder is not None:
@@ -251,7 +231,7 @@ class VideoTracking:
 def _mark_approach(problems: Int[np.ndarray, "rows"]) -> Int[np.ndarray, "rows"]:
     """Mark frames right before others are seen to be near, too: not every frame is searched."""
     crowded = (problems & PROBLEM_BITS[TrackingProblem.CROWDED]) > 0
-    near = [crowded[row : row + APPROACH_FRAMES + 1].any() for row in range(len(crowded))]
+    near = [crowded[row : row + 5].any() for row in range(len(crowded))]
     return problems | np.array(near, dtype=np.int64) * PROBLEM_BITS[TrackingProblem.CROWDED]
 
 
@@ -285,8 +265,9 @@ def _hip_jumps(track: KeypointTrack) -> Bool[np.ndarray, "rows"]:
     ways = np.diff(hips, axis=0) / tall / apart[:, None]
     changes = np.linalg.norm(np.diff(ways, axis=0), axis=1)
     frame_s = float(np.median(np.diff(track.times_s) / apart))
-    usual = max(HIP_NOISE, USUAL_CHANGES * float(np.median(changes)))
-    jumps[2:] = changes > usual + HIP_ACCELERATION * frame_s**2 * apart[1:]
+    # errors of key points: 0.02 heights, and 4 medians, which they pass in one of 60,000 frames
+    usual = max(0.02, 4.0 * float(np.median(changes)))
+    jumps[2:] = changes > usual + 9.0 * frame_s**2 * apart[1:]  # body heights / s²
     return jumps
 
 
@@ -307,7 +288,7 @@ def _require_person(source: FrameSource, found: int, total: int, is_complete: bo
             f"{source.path} breaks off after {total} of {source.frame_count} frames; an avatar "
             f"needs {MIN_FRAMES} at least. Copy it again from the camera."
         )
-    if found and found >= min(MIN_FOUND, max(1, total // 4)):
+    if found and found >= min(8, max(1, total // 4)):
         return
     where = "none" if not found else f"only {found}"
     raise InputError(

@@ -95,7 +95,7 @@ def test_poses_and_proportions_come_back(space):
     truth, person = turning_motion(), space.shape(coefficients)
     fitter = fitter_of(err_like_a_tracker(truth), space, outlines(space, coefficients, truth))
     off, turned = joint_error_cm(fitter, person, truth), turn_error_deg(fitter, truth)
-    errors_px = [fitter.iterate() for _ in range(9)]
+    errors_px = [fitter.iterate(FitParameters()) for _ in range(9)]
     assert errors_px[-1] < 0.4 * errors_px[0]
     assert joint_error_cm(fitter, person, truth) < 0.6 * off
     assert turn_error_deg(fitter, truth) < 0.6 * turned
@@ -116,7 +116,7 @@ def test_exact_poses_hardly_move(space):
     truth = turning_motion()
     fitter = fitter_of(truth, space, outlines(space, np.zeros(space.count), truth))
     for _ in range(3):
-        fitter.iterate()
+        fitter.iterate(FitParameters())
     assert np.degrees(np.abs(fitter.corrections[:, :72]).max()) < 2.0
     assert np.degrees(np.linalg.norm(fitter.corrections[:, :3], axis=1).mean()) < 0.5
 
@@ -142,6 +142,6 @@ def test_a_still_person_is_believed_no_more_the_longer_the_film(space):
         still = replace(turning_motion(), root_rotations=np.zeros((FRAMES, 3)))
         fitter = fitter_of(still, space, outlines(space, coefficients, still)[:count])
         for _ in range(6):
-            fitter.iterate()
+            fitter.iterate(FitParameters())
         found.append(fitter.coefficients[17])
     assert found[1] == pytest.approx(found[0], abs=0.15)
