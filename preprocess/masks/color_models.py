@@ -21,54 +21,21 @@ Pixels = Float32[np.ndarray, "pixels"]
 FullImage = UInt8[np.ndarray, "rows columns 3"]
 FullPlane = Float32[np.ndarray, "rows columns"]
 """Planes and channels of a working image, some of its pixels, and a frame of full size."""
-REFERENCE_SPREAD = 16.0
-"""Standard deviation, in levels, at whose peak a density is 1."""
-UNSEEN_BACKGROUND = 0.00025
-"""Least density of a color where the background is known (`color_density`)."""
 SHADOW_GAIN = 0.6, 1.05
 """Range of the factors by which the person's shadow and reflected light change the background."""
-SHADOW_PROBABILITY = 0.1
-"""Probability that a background pixel is shaded or lit by the person."""
-MEMORY_FRAMES = 30.0
-"""Length of the running mean, frames."""
 MIN_SEEN_FRAMES = 2.0
 """Frames in which a pixel must have been background before its color is known."""
-MIN_SPREAD = 6.0
-"""Least standard deviation of a background pixel's color, in levels."""
-CHANGED_DIFFERENCE = 12.0
-"""Difference from the plate, in levels, of a background pixel that has changed."""
-MAX_CHANGED_FRACTION = 0.12
-"""Fraction of changed background pixels from which the camera has moved: static ones have at most
-0.1 (texts, shadows, passers-by), a hand-held one 0.2 to 0.3."""
-MIN_GAIN = 0.2
-"""Least gain; less is a frame without light, after which the plate starts again."""
-PLATE_STRIDE = 7
-"""Gains are estimated from every n-th row and column."""
-MIN_SAMPLES = 50
-"""Fewest known background pixels from which gains are estimated."""
 
 
-SIGHT_WINDOW_PX = 7
-"""Edge of the windows in which a background is recognized, px."""
-MIN_TEXTURE = 7.0
-"""Least standard deviation of a channel in a window that can be recognized, in levels."""
-MAX_UNLIKE_FRACTION = 0.2
-"""Largest squared difference from the plate in a window, relative to the plate's own variance."""
-MIN_KNOWN_FRACTION = 0.7
-"""Least fraction of a window that must be known."""
 DARK_LEVEL, BRIGHT_LEVEL = 80.0, 180.0
 """Level of the brightest pixels (2 %) below which a film is brightened, and the level after it."""
-NOISE_BLUR_PX = 1.0
-"""Gaussian σ, px, by which the noise of a dark film is smoothed."""
-LEVEL_STRIDE = 4
-"""The level is taken from every n-th row and column."""
 
 
 def color_density(
     squared: Float32[np.ndarray, "*pixels"], variance: Float32[np.ndarray, "*pixels"]
 ) -> Float32[np.ndarray, "*pixels"]:
-    """Density of a color at a squared distance from its mean, relative to the reference peak."""
-    ratio = np.float32(REFERENCE_SPREAD**2) / variance
+    """Density of a color at a squared distance from its mean; 1 at the peak of σ = 16 levels."""
+    ratio = np.float32(256.0) / variance
     return np.exp(np.float32(-0.5) * squared / variance) * ratio * np.sqrt(ratio)
 
 
@@ -87,7 +54,7 @@ class PlateColors(NamedTuple):
 
         A flat background of a sleeve's color says little, leaves and books say nearly everything.
         """
-        window = SIGHT_WINDOW_PX, SIGHT_WINDOW_PX
+        window = 7, 7  # px
         weight = self.known.astype(np.float32)
         share = cv2.blur(weight, window)
         off, texture, squared = (np.zeros_like(weight) for _ in range(3))
@@ -99,9 +66,9 @@ class PlateColors(NamedTuple):
         off = cv2.blur(off * weight, window)
         texture /= np.maximum(share, np.float32(0.01))
         texture += cv2.blur(squared, window)
-        textured = texture > np.float32(3.0 * MIN_TEXTURE**2) * share
-        alike = off < np.float32(MAX_UNLIKE_FRACTION) * texture
-        return self.known & (share > MIN_KNOWN_FRACTION) & textured & alike
+        textured = texture > np.float32(3.0 * 7.0**2) * share  # a deviation of 7 levels a channel
+        alike = off < np.float32(0.2) * texture
+        return self.known & (share > 0.7) & textured & alike
 
 
 def plate_density(
@@ -121,9 +88,9 @@ def plate_density(
         plain += (color - expected) ** 2
         shaded += (color - gain * expected) ** 2
     return (
-        np.float32(1.0 - SHADOW_PROBABILITY) * color_density(plain, variance)
-        + np.float32(SHADOW_PROBABILITY) * color_density(shaded, variance)
-        + np.float32(UNSEEN_BACKGROUND)
+        np.float32(0.9) * color_density(plain, variance)
+        + np.float32(0.1) * color_density(shaded, variance)  # shaded or lit by the person
+        + np.float32(0.00025)
     )
 
 
@@ -144,9 +111,9 @@ class BackgroundPlate:
         """
         self._gain = np.ones(3, np.float32)
         self._rescale(background.shape)
-        some = np.s_[::PLATE_STRIDE, ::PLATE_STRIDE]
+        some = np.s_[::7, ::7]
         known = background[some] & (self._frames[some] >= MIN_SEEN_FRAMES)
-        if known.sum() < MIN_SAMPLES:
+        if known.sum() < 50:
             return
         seen, before = (
             np.stack([plane[some][known] for plane in planes]) for planes in (image, self._mean)
@@ -156,8 +123,10 @@ class BackgroundPlate:
             count = np.float32(alike.sum())  # of one level: a black background has gain 1
             total = (before[:, alike] ** 2).sum(axis=1) + count
             self._gain = ((seen[:, alike] * before[:, alike]).sum(axis=1) + count) / total
-            alike = np.abs(seen - self._gain[:, None] * before).max(axis=0) < CHANGED_DIFFERENCE
-            if alike.mean() < 1.0 - MAX_CHANGED_FRACTION or self._gain.min() < MIN_GAIN:
+            alike = np.abs(seen - self._gain[:, None] * before).max(axis=0) < 12.0  # levels
+            # Before static cameras at most 0.1 changes (texts, shadows, passers-by), before held
+            # ones 0.2 to 0.3; a gain below 0.2 is a frame without light.
+            if alike.mean() < 0.88 or self._gain.min() < 0.2:
                 self._frames[:] = 0.0
                 self._gain = np.ones(3, np.float32)
                 return
@@ -166,7 +135,7 @@ class BackgroundPlate:
         """The background in some rows and columns of the aligned frame."""
         frames = self._frames[part]
         # The mean of a few frames is uncertain itself.
-        variance = np.maximum(self._variance[part], np.float32(MIN_SPREAD**2))
+        variance = np.maximum(self._variance[part], np.float32(6.0**2))  # at least 6 levels
         variance *= np.float32(1.0) + np.float32(2.0) / np.maximum(frames, np.float32(1.0))
         mean = self._mean[:, part[0], part[1]] * self._gain[:, None, None]
         return PlateColors(frames >= MIN_SEEN_FRAMES, mean, variance)
@@ -174,7 +143,7 @@ class BackgroundPlate:
     def update(self, image: Channels, background: PixelMask) -> None:
         """Average the sure background of the aligned frame into the plate."""
         self._frames += background
-        share = background / np.clip(self._frames, np.float32(1.0), np.float32(MEMORY_FRAMES))
+        share = background / np.clip(self._frames, np.float32(1.0), np.float32(30.0))
         squared = np.zeros_like(self._variance)
         for seen, mean, gain in zip(image, self._mean, self._gain, strict=True):
             off = seen / gain - mean
@@ -208,9 +177,9 @@ class DarkFilmBrightener:
     def __call__(self, rgb: RgbImage) -> RgbImage:
         """Brighten the next frame, as much as the brightest one until now allows: some fade in."""
         if self._brightest < DARK_LEVEL:
-            level = float(np.percentile(rgb[::LEVEL_STRIDE, ::LEVEL_STRIDE], 98))
+            level = float(np.percentile(rgb[::4, ::4], 98))
             self._brightest = max(self._brightest, level)
         if self._brightest >= DARK_LEVEL:
             return rgb
-        smooth = cv2.GaussianBlur(rgb.astype(np.float32), (0, 0), NOISE_BLUR_PX)
+        smooth = cv2.GaussianBlur(rgb.astype(np.float32), (0, 0), 1.0)
         return np.clip(BRIGHT_LEVEL / self._brightest * smooth, 0.0, 255.0).astype(np.uint8)

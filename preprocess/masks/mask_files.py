@@ -24,14 +24,6 @@ MAX_PERSON_FRACTION = 0.5
 """Largest fraction of the image's rim that a person covers."""
 MAX_OBJECTS = 32
 """Largest object number of masks that hold object numbers."""
-MIN_OBJECT_AREA = 0.01
-"""Least median fraction of the image that objects cover: compression artifacts cover less."""
-SOFT_MIN, SOFT_MAX = 0.1, 0.9
-"""Range of alpha that only the borders of soft masks have."""
-VIDEO_BLACK = 16.0
-"""Brightness of a video up to which alpha is 0: compression rings around edges."""
-VIDEO_WHITE = 239.0
-"""Brightness of a video from which alpha is 1."""
 
 
 def shows_background(samples: list[Float32[np.ndarray, "_ _"]], path: Path) -> bool:
@@ -48,7 +40,7 @@ def shows_background(samples: list[Float32[np.ndarray, "_ _"]], path: Path) -> b
 
 def check_are_masks(samples: list[Float32[np.ndarray, "_ _"]], path: Path) -> None:
     """Raise InputError for photographs, depth maps and the like: masks are mostly 0 or 1."""
-    between = [float(((mask > SOFT_MIN) & (mask < SOFT_MAX)).mean()) for mask in samples]
+    between = [float(((mask > 0.1) & (mask < 0.9)).mean()) for mask in samples]
     if np.median(between) > MAX_PERSON_FRACTION:
         raise InputError(
             f"{path} holds photographs, not masks: {np.median(between):.0%} of their pixels are "
@@ -62,7 +54,7 @@ def are_object_ids(samples: list[Float32[np.ndarray, "_ _"]]) -> bool:
         return False
     found = np.unique(np.concatenate([np.unique(mask) for mask in samples]))
     area = float(np.median([float((mask > 0.0).mean()) for mask in samples]))
-    return len(found) <= MAX_OBJECTS and area > MIN_OBJECT_AREA
+    return len(found) <= MAX_OBJECTS and area > 0.01  # compression artifacts cover less
 
 
 def _coverage(alpha: AlphaMask) -> Float[np.ndarray, "2"]:
@@ -71,8 +63,6 @@ def _coverage(alpha: AlphaMask) -> Float[np.ndarray, "2"]:
     return np.array([alpha.mean(), rim.mean()], dtype=np.float64)
 
 
-POLARITY_SAMPLES = 9
-"""Number of masks from which polarity and kind are detected."""
 MaskReader = Callable[[int], AlphaMask]
 """From a row to the mask as stored."""
 
@@ -101,7 +91,7 @@ class Masks:
         self.names = names
         self._read = read
         self._stated = invert
-        rows = np.unique(np.linspace(0, count - 1, POLARITY_SAMPLES).round().astype(int))
+        rows = np.unique(np.linspace(0, count - 1, 9).round().astype(int))
         samples = _readable(read, [int(row) for row in rows])
         self._numbers = are_object_ids(samples)
         samples = [self._binarize_ids(sample) for sample in samples]
@@ -214,9 +204,8 @@ class _MaskVideo:
             self._at = -1  # the next call decodes from the start
             raise InputError(f"Frame {row} of the masks {self._video.path} cannot be decoded.")
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
-        self._last = np.clip(
-            (gray - np.float32(VIDEO_BLACK)) / np.float32(VIDEO_WHITE - VIDEO_BLACK), 0.0, 1.0
-        )
+        # black up to 16 (compression rings around edges), white from 239 on
+        self._last = np.clip((gray - np.float32(16.0)) / np.float32(223.0), 0.0, 1.0)
         return self._last
 
 

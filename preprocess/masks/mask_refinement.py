@@ -42,45 +42,12 @@ from preprocess.masks.matting import (
 )
 from preprocess.tracking.keypoints import CroppedMask
 
-WORKING_SCALE = 2.0
-"""Pixels of the working image for each pixel of the network's square, about; the working image is
-the frame, or smaller by a whole number."""
-RESCALE_MARGIN = 0.4
-"""Distance of that number from the best before it changes."""
-OUTER_BAND, INNER_BAND = 6.0, 6.0
+BAND = 6.0
 """Reach of the band outside and inside the mask's border, in the network's pixels."""
-MARGIN = 2.0
-"""Width of the background beyond the band that is looked at, in the network's pixels."""
-SURE_PERSON, SURE_PERSON_DEPTH = 0.9, 1.5
-"""Probability, and distance from the border, of pixels that teach the person's colors."""
-SURE_BACKGROUND, SURE_BACKGROUND_DISTANCE = 0.1, 2.5
-"""Probability, and distance from the border, of pixels that teach the background's colors."""
-HISTOGRAM_WEIGHT = 0.75
-"""Weight of the log ratio of a color's frequencies on the person and around them."""
-HISTOGRAM_MEMORY = 0.9
-"""Share of earlier frames in the histograms."""
-MIN_FREQUENCY = 3e-4
-"""Least frequency of a color in a histogram."""
-BIN_DENSITY = 32.0
-"""Density of a color of frequency 1 on the person, to compare with the background plate's: twice
-that of a bin of 16 levels in `color_density`'s unit."""
-MAX_LOG_RATIO = 8.0
-"""Bound of the log likelihood ratio of person and background."""
-FILTER_RADIUS_PX = 3
-"""Radius of the guided filter's windows in the working image, px."""
-FILTER_TOLERANCE = 5.0
-"""Standard deviation of colors, in levels, that the guided filter does not follow."""
-PERSON_FREE_ALPHA = 0.05
-"""Alpha below which a pixel enters the background plate."""
 COMPARED_FRAMES = 10
 """Frames whose borders are compared; what they say holds for all others."""
-MIN_EDGE_RATIO = 1.15
-"""Ratio of the edge strengths along refined and given borders from which masks are refined; noise
-in the images alone makes it up to 1.12."""
 SQUARE_PX = 256
 """Width and height of the square that holds the person, as in a tracker's masks."""
-SQUARE_MARGIN = 1.25
-"""Its width as a multiple of the person's longer side."""
 
 
 class _Band(NamedTuple):
@@ -129,8 +96,8 @@ class MaskRefiner:
 
     def _refine(self, rgb: FullImage, mask: CroppedMask) -> Plane:
         square_px = float(np.hypot(*mask.image_from_crop[:, 0]))
-        best = square_px / WORKING_SCALE
-        if abs(self._reduction - best) > 0.5 + RESCALE_MARGIN or not self._reduction:
+        best = square_px / 2.0  # the working image has two pixels for each of the network's
+        if abs(self._reduction - best) > 0.9 or not self._reduction:
             self._reduction = max(1, round(best))
         times = self._reduction
         working_px = self._frame_px[0] // times, self._frame_px[1] // times
@@ -147,9 +114,9 @@ class MaskRefiner:
             part = np.s_[top : top + height, left : left + width]
             plate = self._plate.within(part)
             alpha = self._decide(band, plate)
-            fitted = guided_coefficients(band.image, alpha, FILTER_RADIUS_PX, FILTER_TOLERANCE)
+            fitted = guided_coefficients(band.image, alpha, radius_px=3, tolerance=5.0)
             filtered = apply_coefficients(band.image, fitted)
-            person = filtered > PERSON_FREE_ALPHA
+            person = filtered > 0.05  # below, pixels enter the background plate
             far[part] = cv2.dilate(person.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
             there = np.s_[
                 top * times : (top + height) * times, left * times : (left + width) * times
@@ -165,16 +132,17 @@ class MaskRefiner:
         band = band._replace(person=band.person & ~shown, background=band.background | shown)
         at = band.rows, band.columns
         front, back = self._color_frequencies(band)
-        ratio = np.float32(HISTOGRAM_WEIGHT) * np.log(front / back)
+        ratio = np.float32(0.75) * np.log(front / back)
         known = plate.known[at]
         rows, columns = band.rows[known], band.columns[known]
         behind = plate_density(
             band.colors[:, known], plate.mean[:, rows, columns], plate.variance[rows, columns]
         )
-        ratio[known] += np.log(np.float32(BIN_DENSITY) * front[known] / behind)
+        # 32: twice the density of a bin of 16 levels in `color_density`'s unit
+        ratio[known] += np.log(np.float32(32.0) * front[known] / behind)
         prior = np.clip(band.prior[at], np.float32(0.01), np.float32(0.99))
         odds = prior / (np.float32(1.0) - prior)
-        odds *= np.exp(np.clip(ratio, np.float32(-MAX_LOG_RATIO), np.float32(MAX_LOG_RATIO)))
+        odds *= np.exp(np.clip(ratio, np.float32(-8.0), np.float32(8.0)))
         alpha = band.inside.astype(np.float32)
         alpha[at] = odds / (np.float32(1.0) + odds)
         alpha[shown] = 0.0
@@ -190,10 +158,10 @@ class MaskRefiner:
                 for each in (band.person, band.background)
             ]
         ).astype(np.float32)
-        kept = np.float32(HISTOGRAM_MEMORY) if self._histograms.any() else np.float32(0.0)
+        kept = np.float32(0.9) if self._histograms.any() else np.float32(0.0)
         self._histograms = kept * self._histograms + (np.float32(1.0) - kept) * now
         total = np.maximum(self._histograms.sum(axis=1, keepdims=True), np.float32(1e-3))
-        front, back = self._histograms / total + np.float32(MIN_FREQUENCY)
+        front, back = self._histograms / total + np.float32(3e-4)
         bins = _color_bins(band.colors)
         return front[bins], back[bins]
 
@@ -207,7 +175,7 @@ def _find_band(image: Channels, soft: Plane, unit_px: float) -> tuple[_Band | No
     left, top, width, height = cv2.boundingRect((soft > 0.5).astype(np.uint8))
     if not width:
         return None, far
-    margin = int((OUTER_BAND + MARGIN) * unit_px) + 1
+    margin = int((BAND + 2.0) * unit_px) + 1
     top, bottom = max(top - margin, 0), min(top + height + margin, soft.shape[0])
     left, right = max(left - margin, 0), min(left + width + margin, soft.shape[1])
     around = np.s_[top:bottom, left:right]
@@ -216,8 +184,8 @@ def _find_band(image: Channels, soft: Plane, unit_px: float) -> tuple[_Band | No
     hard = inside.astype(np.uint8)
     out = cv2.distanceTransform(1 - hard, cv2.DIST_L2, 3)
     depth = cv2.distanceTransform(hard, cv2.DIST_L2, 3)
-    far[around] = beyond = out > OUTER_BAND * unit_px
-    deep = depth > INNER_BAND * unit_px
+    far[around] = beyond = out > BAND * unit_px
+    deep = depth > BAND * unit_px
     rows, columns = np.nonzero(~(beyond | deep))
     part = np.ascontiguousarray(image[:, top:bottom, left:right])
     index = rows * part.shape[2] + columns
@@ -226,9 +194,8 @@ def _find_band(image: Channels, soft: Plane, unit_px: float) -> tuple[_Band | No
         corner=(top, left),
         prior=prior,
         inside=inside,
-        person=deep | ((prior > SURE_PERSON) & (depth > SURE_PERSON_DEPTH * unit_px)),
-        background=beyond
-        | ((prior < SURE_BACKGROUND) & (out > SURE_BACKGROUND_DISTANCE * unit_px)),
+        person=deep | ((prior > 0.9) & (depth > 1.5 * unit_px)),
+        background=beyond | ((prior < 0.1) & (out > 2.5 * unit_px)),
         rows=rows,
         columns=columns,
         colors=np.stack([plane.ravel()[index] for plane in part]),
@@ -265,7 +232,8 @@ class GivenMaskRefiner:
     @property
     def is_needed(self) -> bool:
         """True if masks are refined, by the frames that were seen; at first they are not."""
-        return bool(self._ratios) and float(np.mean(self._ratios)) >= MIN_EDGE_RATIO
+        # noise in the images alone makes it up to 1.12
+        return bool(self._ratios) and float(np.mean(self._ratios)) >= 1.15
 
     @property
     def note(self) -> str | None:
@@ -327,7 +295,7 @@ def _crop(alpha: Plane) -> CroppedMask:
     rows, columns = np.nonzero(alpha > 0.5)
     low = np.array([columns.min(), rows.min()], np.float64)
     high = np.array([columns.max(), rows.max()], np.float64) + 1.0
-    scale = SQUARE_MARGIN * float((high - low).max()) / SQUARE_PX
+    scale = 1.25 * float((high - low).max()) / SQUARE_PX
     corner = 0.5 * (low + high) - 0.5 * SQUARE_PX * scale
     image_from_crop = np.column_stack([scale * np.eye(2), corner])
     there = image_from_crop.copy()

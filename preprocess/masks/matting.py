@@ -27,16 +27,10 @@ from preprocess.masks.color_models import (
 BORDER_WIDTHS_PX = np.array([1.0, 2.0, 4.0], np.float32)
 """Widths over which alpha falls from 1 to 0: borders are soft where a picture was enlarged, is out
 of focus or moves. How often each occurs is estimated in each frame."""
-BORDER_SIGMA_PX = 0.35
-"""Standard deviation of the error of a mask's sharp border, px; it grows with the root of the
-border's width."""
 BORDER_SHIFTS_PX = np.linspace(-1.6, 1.6, 9, dtype=np.float32)
 """Displacements of a sharp border that are averaged, px; they grow alike."""
 BORDER_BAND_PX = 3.6
 """Largest distance from the mask's border of a pixel that is refined, px."""
-SHARE_STRIDE, SHARE_ITERATIONS, MIN_SHARE = 4, 8, 0.05
-"""Pixels of which one tells how often each width occurs, iterations of that estimate, and the
-share below which a width is left out."""
 COLOR_AXES = np.array(
     [[0.45, 0.35, -0.118], [0.88, -0.293, -0.232], [0.171, -0.057, 0.35]], np.float32
 )
@@ -44,24 +38,7 @@ COLOR_AXES = np.array(
 half the resolution, so at a border they are the neighbors' too."""
 OUTLIER_PROBABILITY = 0.2
 """Probability of a foreground color that the appearance model does not predict."""
-OUTLIER_SPREAD = 50.0
-"""Standard deviation of such a color, in levels."""
-LIKELIHOOD_FLOOR = 1e-4
-"""Likelihood of a color that fits neither model, relative to a perfect fit."""
-LIKELIHOOD_EXPONENT = 0.6
-"""Exponent of the color likelihood: errors of neighboring pixels are correlated."""
-CONTRAST = 2.0
-"""Steepening of the filtered mask around 1/2."""
-SURE_ALPHA = 0.8
-"""Alpha above which a pixel teaches the person's color beside the border."""
-NEARBY_PX = 3
-"""Edge of the window in which it does, in twice the working image's pixels."""
-NEARBY_SPREAD = 14.0
-"""Standard deviation of a color that the window's mean misses, in levels."""
 
-COLOR_WINDOW_PX = 3
-"""Edge of the window in which the colors beside a border are averaged, in pixels of half the
-size."""
 COLOR_MARGIN_PX = 4
 """Width of the background about the person whose colors are averaged, px."""
 
@@ -82,7 +59,7 @@ def person_colors(
     part = np.s_[top:bottom, left:right]
     image, opacity = found[part], alpha[part]
     half_px = (image.shape[1] + 1) // 2, (image.shape[0] + 1) // 2
-    window = COLOR_WINDOW_PX, COLOR_WINDOW_PX
+    window = 3, 3
     share, person, both = (
         cv2.blur(cv2.resize(each, half_px, interpolation=cv2.INTER_AREA), window)
         for each in (opacity, image * opacity[..., None], image)
@@ -125,7 +102,7 @@ def refine_border(
         spread=foreground[1][at],
     )
     shares = _width_shares(pixels)
-    likely = shares > MIN_SHARE
+    likely = shares > 0.05
     tried, weight = _weigh_borders(pixels, BORDER_WIDTHS_PX[likely])
     weight *= shares[likely, None]
     found[at] = (weight * tried).sum(axis=(1, 2)) / weight.sum(axis=(1, 2))
@@ -166,14 +143,11 @@ def _weigh_borders(
     squared = (off**2).sum(axis=-1) - np.float32(2.0) * tried * (off * apart).sum(axis=-1)
     squared += tried**2 * (apart**2).sum(axis=-1)
     noisy = noise * (np.float32(1.0) - tried) ** 2 + np.float32(1.0)
-    likely = LIKELIHOOD_FLOOR + (1.0 - OUTLIER_PROBABILITY) * _color_likelihood(
-        squared, noisy, tried, spread
-    )
-    likely += OUTLIER_PROBABILITY * _color_likelihood(
-        squared, noisy, tried, np.float32(OUTLIER_SPREAD)
-    )
-    weight = np.float32(LIKELIHOOD_EXPONENT) * np.log(likely)
-    weight -= np.float32(0.5) * (BORDER_SHIFTS_PX / np.float32(BORDER_SIGMA_PX)) ** 2
+    likely = 1e-4 + (1.0 - OUTLIER_PROBABILITY) * _color_likelihood(squared, noisy, tried, spread)
+    likely += OUTLIER_PROBABILITY * _color_likelihood(squared, noisy, tried, np.float32(50.0))
+    weight = np.float32(0.6) * np.log(likely)  # errors of neighboring pixels are correlated
+    # a sharp border is off by 0.35 px (σ); shift and σ grow with the root of its width
+    weight -= np.float32(0.5) * (BORDER_SHIFTS_PX / np.float32(0.35)) ** 2
     return tried, np.exp(weight, out=weight)
 
 
@@ -186,9 +160,9 @@ def _width_shares(pixels: _BorderPixels) -> Float32[np.ndarray, "widths"]:
     inside = pixels.away < 1.0 - BORDER_BAND_PX
     off = np.linalg.norm(pixels.off[inside] - pixels.apart[inside], axis=1)
     expected = np.float32((off < 2.0 * pixels.spread[inside]).sum() / max(inside.sum(), 1))
-    likelihoods = _weigh_borders(pixels.every(SHARE_STRIDE), BORDER_WIDTHS_PX)[1].sum(axis=2)
+    likelihoods = _weigh_borders(pixels.every(4), BORDER_WIDTHS_PX)[1].sum(axis=2)
     shares = BORDER_WIDTHS_PX**-2 / (BORDER_WIDTHS_PX**-2).sum()  # mostly sharp, if all are alike
-    for _ in range(SHARE_ITERATIONS):
+    for _ in range(8):
         belongs = likelihoods * shares
         shares = (belongs / belongs.sum(axis=1, keepdims=True)).mean(axis=0)
     shares *= expected
@@ -215,11 +189,6 @@ def border_distance_px(alpha: Plane) -> Plane:
     return np.where(mixed, 0.5 - alpha, steps).astype(np.float32)
 
 
-STRIP_PX = 24_000
-"""Pixels of the strips that are processed at once: planes that stay in the cache are twice as
-fast."""
-
-
 def guided_coefficients(
     guide: Channels, alpha: Plane, radius_px: int, tolerance: float
 ) -> Float32[np.ndarray, "4 height width"]:
@@ -234,7 +203,8 @@ def guided_coefficients(
         tolerance: Standard deviation of colors, in levels, below which a window counts as one.
     """
     height, width = alpha.shape
-    rows, halo = max(STRIP_PX // width, 4 * radius_px), 2 * radius_px
+    # strips whose planes stay in the cache are twice as fast
+    rows, halo = max(24_000 // width, 4 * radius_px), 2 * radius_px
     found = np.empty((4, height, width), np.float32)
     for top in range(0, height, rows):
         first, end = max(top - halo, 0), min(top + rows + halo, height)
@@ -297,14 +267,13 @@ def apply_coefficients(
 
 def steepen(alpha: Plane) -> Plane:
     """Steepen a mask around 1/2."""
-    steep = np.float32(CONTRAST) * alpha + np.float32(0.5 - 0.5 * CONTRAST)
-    return np.clip(steep, np.float32(0.0), np.float32(1.0))
+    return np.clip(np.float32(2.0) * alpha - np.float32(0.5), np.float32(0.0), np.float32(1.0))
 
 
 def move_border(image: Channels, alpha: Plane, plate: PlateColors) -> Plane:
     """Change of alpha near a mask's border, by colors between the person's and the background's."""
-    sure = cv2.erode((alpha > SURE_ALPHA).astype(np.uint8), np.ones((3, 3), np.uint8))
-    size_px, window = alpha.shape[::-1], (NEARBY_PX, NEARBY_PX)
+    sure = cv2.erode((alpha > 0.8).astype(np.uint8), np.ones((3, 3), np.uint8))
+    size_px, window = alpha.shape[::-1], (3, 3)
     half_px = (size_px[0] + 1) // 2, (size_px[1] + 1) // 2
     weight, *planes = (
         cv2.resize(each, half_px, interpolation=cv2.INTER_AREA)
@@ -315,7 +284,8 @@ def move_border(image: Channels, alpha: Plane, plate: PlateColors) -> Plane:
     total = planes[0] ** 2 + planes[1] ** 2 + planes[2] ** 2
     spread = cv2.blur(total * weight, window) * inverse
     spread -= front[0] ** 2 + front[1] ** 2 + front[2] ** 2
-    spread = np.sqrt(np.maximum(spread, np.float32(0.0)) / np.float32(3.0) + NEARBY_SPREAD**2)
+    # colors that the window's mean misses deviate by 14 levels
+    spread = np.sqrt(np.maximum(spread, np.float32(0.0)) / np.float32(3.0) + 14.0**2)
     spread[inverse > 1e5] = np.inf
     person = cv2.resize(cv2.merge(front), size_px)
     behind = np.where(plate.known, np.sqrt(plate.variance), np.float32(np.inf))

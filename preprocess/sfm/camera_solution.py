@@ -165,32 +165,17 @@ class CameraSolution:
 
 MIN_REGISTERED_FRACTION = 0.9
 """Fraction of the key frames that must have a camera."""
-MAX_REPROJECTION_PX = 0.6
-"""Largest median reprojection error, pixels."""
-MAX_TURNING_ERROR = 0.0015
-"""Largest mean reprojection error of a camera that only turns: a hand turns it, and takes it along
-by centimetres; a fraction of the longer side."""
 MIN_TURN_DEG = 5.0
 """Smallest turn that tells a focal length."""
-MIN_OBSERVATION_RATIO = 0.4
-"""Fewest observations of a camera, as a fraction of the median camera's: with fewer it may rest on
-a few wrong matches."""
 FOCAL_RANGE = (0.5, 2.0)
 """Plausible focal lengths, as fractions of the image's longer side."""
-MIN_TRIANGULATION_ANGLE_DEG = 1.0
-"""Smallest angle between the views of the median point; below it depth is a guess."""
-MIN_SPARSE_POINTS = 60
-"""Fewest points of a model."""
-JUMP_SIGMAS = 6.0
-"""Deviation of a rotation from its neighbors' mean that counts as a jump; standard deviations."""
-JUMP_DEG = 1.0
-"""Deviation of a rotation from its neighbors' mean that counts as a jump; degrees."""
 
 
 def find_outlier_cameras(model: SparseModel) -> Bool[np.ndarray, "cameras"]:
     """Cameras that see too few points, or turn unlike their neighbors; better placed otherwise."""
     counts = np.bincount(model.observation_camera, minlength=len(model.frames))
-    few = counts < MIN_OBSERVATION_RATIO * np.median(counts)
+    # with fewer, a camera may rest on a few wrong matches
+    few = counts < 0.4 * np.median(counts)
     return few | _rotation_jumps(model)
 
 
@@ -199,7 +184,8 @@ def evaluate_gates(model: SparseModel, keys: int) -> list[QualityGate]:
     registered = len(model.frames) / keys
     residual = float(np.mean(model.reprojection_errors_px())) if len(model.pixels) else np.inf
     focal = model.focal_px / max(model.size_px)
-    largest = MAX_TURNING_ERROR * max(model.size_px) if model.only_turns else MAX_REPROJECTION_PX
+    # a camera that only turns is turned by a hand, which takes it along by centimetres
+    largest = 0.0015 * max(model.size_px) if model.only_turns else 0.6  # px
     if model.only_turns:
         turn = model.turn_deg()
         reason = f"the camera turns by {turn:.1f}° only, which tells no focal length"
@@ -207,14 +193,14 @@ def evaluate_gates(model: SparseModel, keys: int) -> list[QualityGate]:
     else:
         angle = _median_angle(model)
         reason = f"the camera hardly changes its place (points are seen under {angle:.1f}°)"
-        depth = QualityGate.at_least("angle_deg", angle, MIN_TRIANGULATION_ANGLE_DEG, reason)
+        depth = QualityGate.at_least("angle_deg", angle, 1.0, reason)
     return [
         QualityGate.at_least(
             "registered", registered, MIN_REGISTERED_FRACTION,
             f"only {len(model.frames)} of {keys} key frames could be placed with certainty",
         ),
         QualityGate.at_least(
-            "points", float(len(model.points)), float(MIN_SPARSE_POINTS),
+            "points", float(len(model.points)), 60.0,
             f"only {len(model.points)} points of the surroundings were found",
         ),
         QualityGate(
@@ -242,7 +228,7 @@ def _rotation_jumps(model: SparseModel) -> Bool[np.ndarray, "cameras"]:
     way = (after * before.inv()).as_rotvec()
     between = Rotation.from_rotvec(shares[:, None] * way) * before
     off = np.degrees((turns[1:-1] * between.inv()).magnitude())
-    bound = max(JUMP_DEG, JUMP_SIGMAS * 1.4826 * float(np.median(off)))
+    bound = max(1.0, 6.0 * 1.4826 * float(np.median(off)))  # degrees, and standard deviations
     for row in np.argsort(-off):  # a camera that is off drags its neighbours' figures along
         if off[row] > bound and not jumps[row : row + 3].any():
             jumps[row + 1] = True

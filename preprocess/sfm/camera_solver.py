@@ -56,20 +56,10 @@ from preprocess.sfm.turning_camera import (
     solve_turning_camera,
 )
 
-MIN_PARALLAX_FRACTION = 0.02
-"""Fraction of matched image pairs that must show parallax, not one plane or a mere rotation."""
 MAX_TRACKED_POINT_ERROR_PX = 3.0
 """Largest distance of tracked points from their projection by a key frame's own camera, pixels."""
 MIN_TRACKED_KEYFRAMES = 0.5
 """Fraction of the key frames that points must be tracked into."""
-MIN_SOLVED_FRAMES = 0.5
-"""Fraction of the frames that must have a camera in the end."""
-MAX_IGNORED_DISTORTION_PX = 0.3
-"""Distortion of the corners below which a lens counts as free of distortion, pixels."""
-BODY_MARGIN = 0.06
-"""Margin for clothes and hair around the posed body; a fraction of its height in the image."""
-MASK_THRESHOLD = 0.2
-"""Opacity from which a pixel of a mask counts as the person."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,7 +135,7 @@ def _solve(
     cameras, status = _cameras_of_all_frames(source, model, between)
     wanted = [i for i in range(source.frames_in_file) if source.selection.contains(i)]
     share = float((status[wanted] != MISSING).mean())
-    if share < MIN_SOLVED_FRAMES:
+    if share < 0.5:
         raise InputError(
             f"--cameras solve: only {share:.0%} of the frames could be placed. Film without sudden "
             "movements, or give only the part that goes well (--frames START:STOP)."
@@ -181,7 +171,7 @@ def _parallax(workspace: ColmapWorkspace, keys: int) -> QualityGate:
         reason = "the pictures have hardly anything in common"
         return QualityGate.at_least("matched_pairs", float(pairs), least, reason)
     return QualityGate.at_least(
-        "pairs_with_parallax", share, MIN_PARALLAX_FRACTION,
+        "pairs_with_parallax", share, 0.02,
         "nothing shows depth, as before one flat wall, and the camera does not just turn by "
         f"{MIN_TURN_DEG:.0f}° or more",
     )  # fmt: skip
@@ -206,7 +196,7 @@ def _map(
         raise _unsolved_error(failed)
     corner = np.hypot(*model.size_px) / 2.0 / model.focal_px
     shift_px = abs(model.radial_distortion) * corner**3 * model.focal_px
-    if shift_px < MAX_IGNORED_DISTORTION_PX:
+    if shift_px < 0.3:  # of the corners: as good as none
         model = replace(model, radial_distortion=0.0)
     return model, gates
 
@@ -276,7 +266,7 @@ def make_person_mask(capture: Capture) -> PersonMaskFn:
 
         def by_mask(frame: Frame, size_px: tuple[int, int]) -> Bool[np.ndarray, "_ _"] | None:
             try:
-                return capture.masks.read(frame.index, size_px) > MASK_THRESHOLD
+                return capture.masks.read(frame.index, size_px) > 0.2
             except InputError:  # one damaged mask
                 return None
 
@@ -292,7 +282,7 @@ def make_person_mask(capture: Capture) -> PersonMaskFn:
         rows = np.flatnonzero(body.any(axis=1))
         if not len(rows):
             return None
-        side = 2 * max(2, round(BODY_MARGIN * (rows[-1] - rows[0]))) + 1
+        side = 2 * max(2, round(0.06 * (rows[-1] - rows[0]))) + 1  # clothes and hair
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
         return cv2.dilate(body.astype(np.uint8), disc) > 0
 

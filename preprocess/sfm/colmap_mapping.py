@@ -28,17 +28,8 @@ from preprocess.sfm.camera_solution import SparseModel
 
 MAX_KEYFRAMES = 60
 """Most key frames of a video."""
-MIN_TARGET_KEYFRAMES = 24
-"""Number of key frames that is chosen from a short video, if it has that many frames."""
-MIN_KEYFRAME_SPACING = 4
-"""Frames per key frame beyond that number: the frames between are placed as well as key frames, in
-a tenth of the time."""
 MIN_KEYFRAMES = 8
 """Fewest key frames that can be solved."""
-FEATURE_IMAGE_PX = 960
-"""Longer side of the images that features are detected in, pixels."""
-PERSON_MARGIN = 0.015
-"""Width of the ignored border around the person; a fraction of the image's width."""
 PersonMaskFn = Callable[[Frame, tuple[int, int]], Bool[np.ndarray, "height width"] | None]
 """Pixels of the person in a frame, in an image of a given size; None if unknown."""
 
@@ -77,8 +68,9 @@ def select_keyframes(
     are skipped; progress is the fraction of the video that was examined.
     """
     total = source.frame_count or source.frames_in_file
-    stretches = min(max_keyframes, total, max(MIN_TARGET_KEYFRAMES, total // MIN_KEYFRAME_SPACING))
-    size_px = shrink_to_longer_side(source.size_px, FEATURE_IMAGE_PX)
+    # one of four: frames between are placed as well, in a tenth of the time
+    stretches = min(max_keyframes, total, max(24, total // 4))
+    size_px = shrink_to_longer_side(source.size_px, 960)
     best: tuple[float, SfmKeyframe] | None = None
     at = 0
     for frame in source.frames():
@@ -107,7 +99,7 @@ def select_keyframes(
 
 def dilate_person(person: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
     """The person with a margin all round."""
-    side = 2 * max(1, round(PERSON_MARGIN * max(person.shape))) + 1
+    side = 2 * max(1, round(0.015 * max(person.shape))) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
     return cv2.dilate(person.astype(np.uint8), disc) > 0
 
@@ -129,16 +121,8 @@ def write_keyframes(keys: Iterator[SfmKeyframe], images: Path, masks: Path) -> l
     return kept
 
 
-MAX_EXHAUSTIVE_IMAGES = 40
-"""Largest number of key frames of which every pair is matched, which closes loops."""
-MAX_INITIAL_PAIRS = 50
-"""Most pairs that it tries to start with; without parallax it would try for minutes."""
-MIN_MATCHES = 15
-"""Fewest matches of an image pair that is used."""
 STATED_FOCAL_TOLERANCE = 0.02
 """Relative difference to the solved focal length within which the stated one is used."""
-IMAGES_PER_THREAD = 4
-"""Images per thread between two reports of progress."""
 ProgressFn = Callable[[float], None]
 """Called now and then with how much of a stage is done, in [0, 1]."""
 
@@ -188,7 +172,7 @@ def extract_features(workspace: ColmapWorkspace, report_progress: ProgressFn) ->
     options.num_threads, options.use_gpu = workspace.threads, False
     options.max_image_size = max(width, height)
     options.sift.max_num_features = 2048
-    names, step = list(workspace.names), IMAGES_PER_THREAD * workspace.threads
+    names, step = list(workspace.names), 4 * workspace.threads
     with colmap.Database.open(workspace.database):  # makes it
         pass
     colmap.import_images(
@@ -210,7 +194,7 @@ def match_features(workspace: ColmapWorkspace, report_progress: ProgressFn) -> N
     options = colmap.FeatureMatchingOptions()
     options.num_threads, options.use_gpu = 1, False
     report_progress(0.0)
-    if len(workspace.names) <= MAX_EXHAUSTIVE_IMAGES:
+    if len(workspace.names) <= 40:  # of every pair, which closes loops
         colmap.match_exhaustive(
             workspace.database, matching_options=options, device=colmap.Device.cpu
         )
@@ -232,7 +216,7 @@ def parallax_fraction(database: Path) -> tuple[int, float]:
     flat = colmap.TwoViewGeometryConfiguration
     with colmap.Database.open(database) as base:
         found = base.read_two_view_geometries()[1]
-    kinds = [int(pair.config) for pair in found if len(pair.inlier_matches) >= MIN_MATCHES]
+    kinds = [int(pair.config) for pair in found if len(pair.inlier_matches) >= 15]
     plain = {int(flat.PLANAR), int(flat.PANORAMIC), int(flat.PLANAR_OR_PANORAMIC)}
     return len(kinds), sum(kind not in plain for kind in kinds) / max(len(kinds), 1)
 
@@ -245,7 +229,8 @@ def map_incrementally(
     options = colmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = 1, seed
     options.min_model_size, options.max_num_models = 3, 2
-    options.init_num_trials, options.extract_colors = MAX_INITIAL_PAIRS, False
+    # without parallax it would try pairs to start with for minutes
+    options.init_num_trials, options.extract_colors = 50, False
     total, done = len(workspace.names), 0
 
     def next_image() -> None:

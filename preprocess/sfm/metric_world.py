@@ -29,44 +29,16 @@ from preprocess.cameras.camera_file import CameraTrack
 from preprocess.poses.motion_builder import place_in_camera_world, transform_motion
 from preprocess.sfm.camera_solution import KEY, MISSING, PLACED, CameraSolution, SparseModel
 
-MAX_TILT_DEG = 20.0
-"""Largest angle between the floor's normal and the first guess of up, degrees."""
-PLANE_TOLERANCE = 0.01
-"""Distance within which points belong to a plane; a fraction of their median camera distance."""
 MIN_POINTS = 40
 """Fewest points that a floor is fitted to."""
-MIN_INLIER_FRACTION = 0.05
-"""Fraction of the points below the cameras that must lie on the floor."""
-MAX_FRACTION_BELOW = 0.05
-"""Largest fraction of the points that may lie below the floor."""
-RANSAC_ITERATIONS = 2000
-"""Number of planes through three points that are tried."""
-MIN_VIEWS = 3
-"""Fewest cameras that must see a point."""
 SIGMA_GROUND_M = 0.06
 """Standard deviation of a sole's height above the floor by a tracker's depth, metres."""
 SIGMA_PLACE_M = 0.20
 """Standard deviation of a person from its usual place, metres."""
-IRLS_ITERATIONS = 5
-"""Rounds of reweighted least squares."""
-HUBER_THRESHOLD = 1.345
-"""Residual beyond which a cue counts less; standard deviations (95 % efficiency)."""
-MAX_CUE_DIFFERENCE = 0.10
-"""Relative difference of both cues beyond which the person walks and only the ground counts."""
-MAX_GROUND_SPREAD = 0.25
-"""Largest relative spread of the frames' own scales by ground contact (robust deviation)."""
-MAX_WANDER_M = 0.35
-"""Largest r.m.s. distance of the person from its place, if that is the only cue; metres."""
 MIN_FRAMES = 5
 """Fewest frames with a pose and a camera."""
 SOLE_THICKNESS_M = 0.01
 """Usual height of a body's bare sole above the floor, from barefoot to a shoe of 3 cm; metres."""
-MIN_CAMERA_PATH_M = 0.3
-"""Shortest path of the camera for which the second cue counts, metres."""
-FOOT_JOINTS = (7, 8, 10, 11)
-"""Ankles and feet among SMPL's joints."""
-MAX_LEAN_DEG = 30.0
-"""Largest angle between up as the cameras are held and up as the person stands."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -99,27 +71,27 @@ def fit_floor_plane(model: SparseModel, up: Float[np.ndarray, "3"]) -> FloorPlan
     `up` is a first guess.
     """
     views = np.bincount(model.observation_point, minlength=len(model.points))
-    points = model.points[views >= MIN_VIEWS]
+    points = model.points[views >= 3]
     centers = model.camera_centers()
     distance = np.linalg.norm(
         model.points[model.observation_point] - centers[model.observation_camera], axis=1
     )
     if not len(points):
         return None
-    near = PLANE_TOLERANCE * float(np.median(distance))
+    near = 0.01 * float(np.median(distance))  # what is nearer belongs to a plane
     lowest = float((centers @ up).min())
     points = points[points @ up < lowest]
     if len(points) < MIN_POINTS:
         return None
     rng = np.random.default_rng(0)
-    best, most = None, max(MIN_POINTS, MIN_INLIER_FRACTION * len(points))
-    for _ in range(RANSAC_ITERATIONS):
+    best, most = None, max(MIN_POINTS, 0.05 * len(points))
+    for _ in range(2000):
         plane = _plane_through(points[rng.choice(len(points), 3, replace=False)], up)
         if plane is None:
             continue
         heights = points @ plane[0] + plane[1]
         inside = np.abs(heights) < near
-        if inside.sum() > most and (heights < -3.0 * near).mean() < MAX_FRACTION_BELOW:
+        if inside.sum() > most and (heights < -3.0 * near).mean() < 0.05:
             best, most = inside, float(inside.sum())
     return None if best is None else _refine_plane(points, best, up, near)
 
@@ -132,7 +104,7 @@ def _plane_through(
     if length < 1e-12:
         return None
     normal = normal / length * (1.0 if normal @ up > 0.0 else -1.0)
-    if normal @ up < np.cos(np.radians(MAX_TILT_DEG)):
+    if normal @ up < np.cos(np.radians(20.0)):
         return None
     return normal, -float(normal @ three[0])
 
@@ -202,8 +174,8 @@ def estimate_metric_scale(standing: PersonInCameras, floor: FloorPlane | None) -
     moves = (standing.centers - standing.centers.mean(axis=0)).ravel()
     stays = -(seen - seen.mean(axis=0)).ravel()
     place, wander = _scale_from_static_person(moves, stays)
-    if ground is not None and spread <= MAX_GROUND_SPREAD:
-        if place is None or abs(place - ground) > MAX_CUE_DIFFERENCE * ground:
+    if ground is not None and spread <= 0.25:
+        if place is None or abs(place - ground) > 0.1 * ground:  # the person walks
             scale, cues = ground, ("ground",)
         else:
             rows = np.concatenate([heights / SIGMA_GROUND_M, moves / SIGMA_PLACE_M])
@@ -214,7 +186,7 @@ def estimate_metric_scale(standing: PersonInCameras, floor: FloorPlane | None) -
             metres_per_unit=scale, cues=cues, ground=ground, place=place, spread=spread
         )
     refused = None
-    if place is None or wander > MAX_WANDER_M:
+    if place is None or wander > 0.35:  # metres
         refused = (
             "nothing tells how large the room is: "
             + ("the floor was not seen" if ground is None else "the feet are never on the floor")
@@ -247,7 +219,7 @@ def _scale_from_static_person(
     if len(moves) < 3 * MIN_FRAMES or square <= 0.0:
         return None, float("inf")
     scale = float((moves * stays).sum()) / square  # least squares: s = Σ a b / Σ a²
-    if scale <= 0.0 or scale * np.sqrt(3.0 * square / len(moves)) < MIN_CAMERA_PATH_M:
+    if scale <= 0.0 or scale * np.sqrt(3.0 * square / len(moves)) < 0.3:  # metres of path
         return None, float("inf")
     return scale, float(np.sqrt(3.0 * ((moves * scale - stays) ** 2).mean()))
 
@@ -260,9 +232,9 @@ def _fit_scale_huber(
     Iteratively reweighted: s = Σ w a b / Σ w a², w = min(1, threshold / |a s - b|).
     """
     scale = start
-    for _ in range(IRLS_ITERATIONS):
+    for _ in range(5):
         off = np.abs(rows * scale - right)
-        weights = np.minimum(1.0, HUBER_THRESHOLD / np.maximum(off, 1e-12))
+        weights = np.minimum(1.0, 1.345 / np.maximum(off, 1e-12))  # 95 % efficiency
         scale = float((weights * rows * right).sum() / (weights * rows**2).sum())
     return scale
 
@@ -380,7 +352,7 @@ def _person_in_cameras(
     shaped: ShapedBody,
 ) -> PersonInCameras:
     weights = shaped.body.weights
-    feet = np.flatnonzero(weights[:, FOOT_JOINTS].sum(axis=1) > 0.5)
+    feet = np.flatnonzero(weights[:, [7, 8, 10, 11]].sum(axis=1) > 0.5)  # ankles, feet
     rest = np.column_stack([shaped.vertices[feet], np.ones(len(feet))])
     soles = []
     for row in rows.tolist():
@@ -409,7 +381,7 @@ def _estimate_up(
     views = solved.camera_from_solved[frames[usable], :3, :3]
     up = np.median(np.einsum("nba,nb->na", views, backs), axis=0)
     length = float(np.linalg.norm(up))
-    if length < 0.5 or up @ held < length * np.cos(np.radians(MAX_LEAN_DEG)):
+    if length < 0.5 or up @ held < length * np.cos(np.radians(30.0)):
         return held
     return up / length
 

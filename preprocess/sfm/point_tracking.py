@@ -21,14 +21,6 @@ from preprocess.body.kinematics import rigid_transform
 from preprocess.sfm.camera_solution import SparseModel
 from preprocess.sfm.colmap_mapping import SfmKeyframe, to_grayscale
 
-WINDOW = (17, 17)
-"""Size of the patch around a point, pixels."""
-LEVELS = 4
-"""Levels of the pyramid without a guess."""
-LEVELS_WITH_GUESS = 3
-"""Levels of the pyramid with a guess of where a point is."""
-MAX_ROUND_TRIP_PX = 0.7
-"""Largest distance of a point that was tracked there and back, pixels; beyond it is lost."""
 GrayImage = UInt8[np.ndarray, "height width"]
 
 
@@ -44,12 +36,12 @@ def track_points(
     """
     if not len(pixels):
         return pixels.copy(), np.zeros(0, dtype=bool)
-    levels = LEVELS if guess is None else LEVELS_WITH_GUESS
+    levels = 4 if guess is None else 3  # of the pyramid
     there, found = _optical_flow(start, picture, pixels, pixels if guess is None else guess, levels)
     back, again = _optical_flow(picture, start, there, pixels, levels)
     height, width = picture.shape
     inside = ((there > 0.0) & (there < (width, height))).all(axis=1)
-    same = np.linalg.norm(back - pixels, axis=1) < MAX_ROUND_TRIP_PX
+    same = np.linalg.norm(back - pixels, axis=1) < 0.7  # px, there and back
     return there, found & again & same & inside
 
 
@@ -74,7 +66,7 @@ def _optical_flow(
     """OpenCV's, whose first pixel's centre is at (0, 0)."""
     there, status, _ = cv2.calcOpticalFlowPyrLK(
         start, picture, (pixels - 0.5).astype(np.float32)[:, None],
-        (guess - 0.5).astype(np.float32)[:, None].copy(), winSize=WINDOW, maxLevel=levels,
+        (guess - 0.5).astype(np.float32)[:, None].copy(), winSize=(17, 17), maxLevel=levels,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )  # fmt: skip
     return there[:, 0].astype(np.float64) + 0.5, status[:, 0] > 0
@@ -82,14 +74,10 @@ def _optical_flow(
 
 MIN_PNP_POINTS = 20
 """Fewest tracked points that a camera is placed by."""
-MAX_PNP_POINTS = 600
-"""Most points that are tracked from a key frame."""
 INLIER_PX = 2.0
 """Largest reprojection error of an inlier, pixels."""
 MIN_INLIER_FRACTION = 0.5
 """Fraction of the tracked points that must be inliers."""
-RESECTION_ITERATIONS = 10
-"""Rounds of reweighted least squares for the turn of a camera; far points weigh less."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -181,7 +169,7 @@ def resect_turn(
         return None
     rays = replace(lens, camera_from_world=np.eye(4)).ray_directions(pixels)
     far = np.ones(len(rays))
-    for _ in range(RESECTION_ITERATIONS):
+    for _ in range(10):
         turn = Rotation.align_vectors(rays, directions, 1.0 / np.maximum(far, 1.0) ** 2)[0]
         far = np.linalg.norm(rays - turn.apply(directions), axis=1) * lens.focal_px[0] / INLIER_PX
     if (far < 1.0).mean() < MIN_INLIER_FRACTION:
@@ -203,9 +191,7 @@ class _KeyframePoints:
     def of(cls, model: SparseModel, row: int, key: SfmKeyframe) -> "_KeyframePoints":
         seen = model.observations_of_camera(row)
         lengths = np.bincount(model.observation_point, minlength=len(model.points))
-        longest = np.argsort(-lengths[model.observation_point[seen]], kind="stable")[
-            :MAX_PNP_POINTS
-        ]
+        longest = np.argsort(-lengths[model.observation_point[seen]], kind="stable")[:600]
         seen = seen[longest]
         return cls(
             frame=key.index,

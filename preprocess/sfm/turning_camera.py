@@ -20,20 +20,8 @@ from preprocess.sfm.camera_solution import SparseModel
 from preprocess.sfm.colmap_mapping import STATED_FOCAL_TOLERANCE, SfmKeyframe
 from preprocess.sfm.point_tracking import INLIER_PX, detect_corners, track_points
 
-MAX_ANCHORS = 12
-"""Most key frames whose corners are followed into the others."""
-MAX_CORNERS = 200
-"""Most corners of each."""
-MIN_CORNERS = 20
-"""Fewest corners that must be followed from an anchor into another key frame."""
-MIN_PLANE_FRACTION = 0.6
-"""Fraction of the corners that must move by one homography; parallax leaves fewer."""
 MAX_STATIC_MOTION = 0.005
 """Largest shift of a static background; a fraction of the image's longer side (5 px of 960)."""
-FOCAL_RATIOS = np.geomspace(0.4, 2.5, 60)
-"""Focal lengths that are tried first, as fractions of the image's longer side."""
-ITERATIONS = 10
-"""Gauss-Newton iterations."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -67,7 +55,7 @@ def solve_turning_camera(
 
     The points of the model are directions. A stated focal length is used if it fits.
     """
-    tracks = _follow_corners(keys, range(0, len(keys), -(-len(keys) // MAX_ANCHORS)))
+    tracks = _follow_corners(keys, range(0, len(keys), -(-len(keys) // 12)))
     turns = _initial_turns(tracks, len(keys), max(keys[0].gray.shape))
     if turns is None:
         return None
@@ -96,7 +84,7 @@ def _follow_corners(keys: list[SfmKeyframe], anchors: range) -> list[_Track]:
     tracks, middle = [], 0.5 * np.array(keys[0].gray.shape[::-1])
     for anchor in anchors:
         start = keys[anchor]
-        corners = detect_corners(start.gray, ~start.person_mask, MAX_CORNERS)
+        corners = detect_corners(start.gray, ~start.person_mask, 200)
         for views in (range(anchor + 1, len(keys)), range(anchor - 1, -1, -1)):
             rows, last = np.arange(len(corners)), corners
             for view in views:
@@ -104,11 +92,11 @@ def _follow_corners(keys: list[SfmKeyframe], anchors: range) -> list[_Track]:
                 column, row = last[is_same].astype(int).T
                 is_same[is_same] = ~keys[view].person_mask[row, column]
                 rows, last = rows[is_same], last[is_same]
-                if len(rows) < MIN_CORNERS:
+                if len(rows) < 20:
                     break
                 begin, end = corners[rows] - middle, last - middle
                 plane, is_inlier = cv2.findHomography(begin, end, cv2.RANSAC, INLIER_PX)
-                if plane is None or is_inlier.mean() < MIN_PLANE_FRACTION:
+                if plane is None or is_inlier.mean() < 0.6:  # parallax leaves fewer
                     break
                 near = is_inlier[:, 0] > 0
                 rows, last = rows[near], last[near]
@@ -134,7 +122,7 @@ def _initial_turns(tracks: list[_Track], keys: int, longer_px: int) -> _Turns | 
         gram = np.einsum("nba,nbc->nac", turned(focal_px), turned(focal_px))
         return float(np.linalg.norm(gram - np.eye(3), axis=(1, 2)).sum())
 
-    focal_px = float(min(FOCAL_RATIOS * longer_px, key=distance_from_rotations))
+    focal_px = float(min(np.geomspace(0.4, 2.5, 60) * longer_px, key=distance_from_rotations))
     rotations = {0: np.eye(3)}
     for track, matrix in zip(tracks, turned(focal_px), strict=True):
         left, _, right = np.linalg.svd(matrix)
@@ -158,7 +146,7 @@ def _refine(turns: _Turns, tracks: list[_Track], *, holds_focal: bool = False) -
         [3 * view[:, None] + axes, 3 * anchor[:, None] + axes, np.full(len(start), 3 * keys)]
     )
     free = slice(3, 3 * keys + (not holds_focal))
-    for _ in range(ITERATIONS):
+    for _ in range(10):
         relative = turns.rotations[view] @ turns.rotations[anchor].transpose(0, 2, 1)
         rays = turns.rays(start)
         seen_rays = np.einsum("nab,nb->na", relative, rays)
