@@ -54,12 +54,6 @@ def _mismatch_hint(rows: int, count: int) -> str:
     return f" If they are those of the first {rows} frames: --frames 0:{rows}."
 
 
-MAX_TIME_OFFSET_S = 0.05
-"""Largest distance of a pose from its frame, seconds."""
-MIN_MATCHED_FRACTION = 0.1
-"""Fraction of the frames, or of the poses, that must be associated by their times."""
-
-
 def associate_by_time(
     times_s: Float[np.ndarray, "poses"], source: FrameSource
 ) -> Callable[[float], int | None]:
@@ -91,7 +85,7 @@ def _check_time_matches(
     start = source.selection.start * step / source.selection.step
     found = {row_of(start + step * number) for number in range(count)} - {None}
     most = min(count, len(times_s))
-    if len(found) < max(min(2, most), MIN_MATCHED_FRACTION * most):
+    if len(found) < max(min(2, most), 0.1 * most):
         known = times_s[np.isfinite(times_s)]
         said = f"{known.min():.6g} to {known.max():.6g} s" if len(known) else "unknown times"
         raise InputError(
@@ -110,7 +104,7 @@ def _nearest_row(
     times = times_s[rows]
     steps = np.diff(times)
     reach = 0.5 * float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.02
-    reach = min(reach, max(MAX_TIME_OFFSET_S, 0.5 * (frame_step_s or 0.0)))
+    reach = min(reach, max(0.05, 0.5 * (frame_step_s or 0.0)))  # seconds
 
     def row(time_s: float) -> int | None:
         place = int(np.searchsorted(times, time_s))
@@ -175,12 +169,6 @@ def frame_numbers_from_names(names: Iterable[str]) -> list[int]:
     return _unique_numbers(stems) or list(range(len(stems)))
 
 
-MAX_INTERPOLATED_FRAMES = 12
-"""Longest run of frames without a camera that is interpolated."""
-MIN_NUMBERED_COVERAGE = 0.9
-"""Fraction of a video's frames that consecutive numbers must reach to be frame numbers."""
-
-
 def cameras_by_frame(
     found: Sequence[NamedCamera], source: FrameSource, path: Path
 ) -> dict[int, Camera]:
@@ -215,7 +203,7 @@ def interpolate_missing_cameras(
 ) -> tuple[tuple[Camera, ...], frozenset[int]]:
     """A camera for every frame, and the frames whose camera is only a stand-in.
 
-    Short gaps are filled in: rotations turn evenly (slerp) and centres move on a line.
+    Gaps of up to 12 frames are filled: rotations turn evenly (slerp), centres move on a line.
     """
     known = np.array(sorted(number for number in cameras if 0 <= number < frames))
     if not len(known):
@@ -227,7 +215,7 @@ def interpolate_missing_cameras(
             filled.append(cameras[frame])
             continue
         inside = 0 < after < len(known)
-        if inside and known[after] - known[after - 1] <= MAX_INTERPOLATED_FRAMES + 1:
+        if inside and known[after] - known[after - 1] <= 13:
             early, late = int(known[after - 1]), int(known[after])
             share = (frame - early) / (late - early)
             filled.append(_interpolate_camera(cameras[early], cameras[late], share))
@@ -257,5 +245,5 @@ def _frame_numbers(names: Sequence[str | None], frames: int) -> list[int] | None
     numbers = [number - first for number in numbers]
     if max(numbers) >= frames:
         return None
-    chosen = len(numbers) == max(numbers) + 1 and len(numbers) < MIN_NUMBERED_COVERAGE * frames
+    chosen = len(numbers) == max(numbers) + 1 and len(numbers) < 0.9 * frames
     return None if chosen else numbers

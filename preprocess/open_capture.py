@@ -58,11 +58,6 @@ from preprocess.tracked_stream import LiveTracking, TrackedMasks, TrackedObserva
 from preprocess.tracking.keypoints import PersonKeypoints
 from preprocess.tracking.video_tracking import MaskRefinement
 
-HEIGHT_TOLERANCE_M = 0.015
-"""Largest difference between a stated height and the avatar's own, metres."""
-MAX_HEIGHT_DIFFERENCE = 0.08
-"""Relative difference in height beyond which it may not be the same person."""
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ImportedCapture:
@@ -251,7 +246,7 @@ def _find_person(
             "size of its own. Leave one of them out."
         )
     person = read_shaped_body(avatar_body, posed.body)
-    if height_m is not None and abs(height_m - person.height_m) > HEIGHT_TOLERANCE_M:
+    if height_m is not None and abs(height_m - person.height_m) > 0.015:  # metres
         raise InputError(
             f"--height-cm is {100.0 * height_m:.0f}, but the avatar in --out is "
             f"{100.0 * person.height_m:.0f} cm tall, which was settled by its first video. Leave "
@@ -263,7 +258,7 @@ def _find_person(
 def _describe_difference(posed: ShapedBody, person: ShapedBody) -> str:
     """Describe how the poses' body differs from the avatar's."""
     ratio = posed.height_m / person.height_m
-    doubt = " Is it the same person?" if abs(ratio - 1.0) > MAX_HEIGHT_DIFFERENCE else ""
+    doubt = " Is it the same person?" if abs(ratio - 1.0) > 0.08 else ""
     return (
         f"The body of these poses is {100.0 * posed.height_m:.0f} cm tall, the avatar's "
         f"{100.0 * person.height_m:.0f} cm: it keeps its own, and these poses follow.{doubt}"

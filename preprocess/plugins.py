@@ -88,10 +88,6 @@ def make_tracker(name: str = DEFAULT_TRACKER, person: int | None = None) -> Pers
     return _make_registered("tracker", name, person)
 
 
-OPTIONS = {"tracker": "--tracker ", "segmenter": f"--masks {SEGMENTER_PREFIX}"}
-"""The user's option for each kind of part, for messages."""
-
-
 def _make_registered(kind: str, name: str, *arguments: object) -> Any:
     """Make a "segmenter" or "tracker" that an installed package registers, or raise an InputError.
 
@@ -109,9 +105,11 @@ def _find_registered(kind: str, name: str) -> Any:
     group = f"instant_avatar.{kind}s"
     registered = {point.name: point for point in entry_points(group=group)}
     if name not in registered:
-        own = DEFAULT_TRACKER if kind == "tracker" else DEFAULT_SEGMENTER
+        own, option = DEFAULT_TRACKER, "--tracker "
+        if kind == "segmenter":
+            own, option = DEFAULT_SEGMENTER, f"--masks {SEGMENTER_PREFIX}"
         raise InputError(
-            f"{OPTIONS[kind]}{name}: there is no such {kind}; installed are "
+            f"{option}{name}: there is no such {kind}; installed are "
             f"{', '.join([own, *registered])}. Others come with packages that have "
             f"an entry point in the group {group!r} (docs/formats.md)."
         )

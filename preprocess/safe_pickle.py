@@ -15,9 +15,6 @@ from typing import Any, ClassVar, final
 import numpy as np
 from jaxtyping import Shaped
 
-OLD_TORCH_MAGIC = b"\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19."
-"""Number at the start of PyTorch's files before 1.6, as an opcode of a pickle."""
-
 
 class UnsafePickleError(Exception):
     """The pickle names something that is not in `ALLOWED`."""
@@ -230,6 +227,7 @@ def load_safe_pickle(data: bytes) -> Any:
         UnsafePickleError: If it names anything that is not in `ALLOWED`.
         Exception: Of any kind, if it is damaged.
     """
-    if data.startswith(b"PK") or OLD_TORCH_MAGIC in data[:32]:
+    old_torch = b"\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19."  # an opcode; PyTorch's mark before 1.6
+    if data.startswith(b"PK") or old_torch in data[:32]:
         return load_torch(data)
     return _SafeUnpickler(io.BytesIO(data)).load()

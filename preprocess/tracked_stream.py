@@ -47,10 +47,6 @@ jitter, for the frames around a frame would span too short a time."""
 QUEUED_FRAMES = 8
 """Most tracked frames that wait for the fit of their poses; what is tracked meanwhile is only
 looked at, so that advice goes on while a trainer is being prepared."""
-LOOK_INTERVAL_S = 0.3
-"""Interval at which the tracker looks while as many frames wait, seconds."""
-POLL_S = 0.01
-"""Interval at which it looks for room, seconds."""
 KEPT_BYTES = 160 << 20
 """Memory for skipped frames, until enough others are tracked."""
 LEAST_FRAMES = 40
@@ -209,11 +205,11 @@ class TrackedStream(WrappedSource):
 
     def _has_room(self) -> bool:
         """Wait for room for a tracked frame, but not long."""
-        deadline = time.perf_counter() + LOOK_INTERVAL_S
+        deadline = time.perf_counter() + 0.3  # then it looks on, while as many wait
         while self._tracked is not None and self._tracked.pending >= QUEUED_FRAMES:
             if time.perf_counter() > deadline:
                 return False
-            time.sleep(POLL_S)
+            time.sleep(0.01)
         return True
 
 

@@ -20,20 +20,10 @@ from preprocess.poses.plausibility import lost_pose_warnings, plausibility_warni
 
 FULL_WINDOW = (0.0, 0.0, 1.0, 1.0)
 """Window of a video that shows exactly the masks' image."""
-MIN_JUMP_M = 0.25
-"""Least step of the root between frames that is a jump, metres."""
-MIN_JUMP_RAD = np.deg2rad(40.0)
-"""Least turn of the root between frames that is a jump, radians."""
-MIN_JUMP_RATIO = 6.0
-"""Ratio to the median step that a jump must also exceed."""
 VIEW_SECTORS = 12
 """Sectors of directions around the body."""
 MIN_VIEW_COVERAGE = 0.5
 """Fraction of the sectors below which the video shows too few sides."""
-MAX_BETA = 6.0
-"""Largest plausible magnitude of a shape coefficient."""
-MAX_LISTED_FRAMES = 6
-"""Frame numbers that a message lists."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,10 +56,6 @@ class VideoTransform:
 
 IDENTITY_TRANSFORM = VideoTransform()
 """A video whose images masks and poses belong to as they are."""
-
-
-MAX_FRAME_STEP = 6.0
-"""Frames between consecutive poses beyond which the frames between have no pose."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -128,7 +114,8 @@ class CaptureGeometry:
         self, frames: Int[np.ndarray, "frames"]
     ) -> tuple[Int[np.ndarray, "frames"], Bool[np.ndarray, "frames"]]:
         """The valid row nearest to each frame, and whether it belongs to that frame."""
-        reach = 0.5 * min(max(1.0, frame_step(self.row_frames)), MAX_FRAME_STEP) + 1e-6
+        # rows that are more than six frames apart leave frames without a pose
+        reach = 0.5 * min(max(1.0, frame_step(self.row_frames)), 6.0) + 1e-6
         away = np.abs(self.row_frames - frames[:, None])
         away = np.where(self.motion.valid & np.isfinite(away), away, np.inf)
         rows = away.argmin(axis=1)
@@ -222,7 +209,7 @@ def sanity_warnings(geometry: CaptureGeometry, frames: list[int]) -> Iterator[st
     if len(bare) > int((~motion.valid).sum()):
         yield f"{len(bare)} of {len(frames)} frames have no pose{_list_frames(bare)}."
     yield from plausibility_warnings(motion)
-    if len(motion.betas) and np.abs(motion.betas).max() > MAX_BETA:
+    if len(motion.betas) and np.abs(motion.betas).max() > 6.0:
         yield f"A shape coefficient is {np.abs(motion.betas).max():.1f}; people have -3 to 3."
     yield from _jump_warnings(geometry)
     seen = view_coverage(geometry)
@@ -260,7 +247,7 @@ def find_jumps(geometry: CaptureGeometry) -> tuple[list[int], float]:
     moved = np.linalg.norm(np.diff(motion.root_translations[rows], axis=0), axis=1)
     roots = Rotation.from_rotvec(motion.root_rotations[rows])
     turned = (roots[:-1].inv() * roots[1:]).magnitude()
-    jumped = near & (_outliers(moved, MIN_JUMP_M) | _outliers(turned, MIN_JUMP_RAD))
+    jumped = near & (_outliers(moved, least=0.25) | _outliers(turned, least=np.deg2rad(40.0)))
     still = near & (moved == 0.0) & (turned == 0.0)
     after = [int(geometry.row_frames[row]) for row in rows[1:][jumped]]
     return after, float(still.sum() / max(1, near.sum()))
@@ -279,9 +266,9 @@ def _jump_warnings(geometry: CaptureGeometry) -> Iterator[str]:
 
 
 def _outliers(steps: Float[np.ndarray, "steps"], least: float) -> Bool[np.ndarray, "steps"]:
-    return (steps > least) & (steps > MIN_JUMP_RATIO * np.median(steps))
+    return (steps > least) & (steps > 6.0 * np.median(steps))  # least: 25 cm, 40 degrees
 
 
 def _list_frames(frames: list[int]) -> str:
-    shown = ", ".join(str(frame) for frame in frames[:MAX_LISTED_FRAMES])
-    return f" ({shown}{', …' if len(frames) > MAX_LISTED_FRAMES else ''})"
+    shown = ", ".join(str(frame) for frame in frames[:6])
+    return f" ({shown}{', …' if len(frames) > 6 else ''})"

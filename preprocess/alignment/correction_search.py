@@ -33,32 +33,10 @@ from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import JOINT_NAMES, rigid_transform, rotation_matrices
 from preprocess.cameras.camera_formats import OPENCV_FROM_OPENGL
 
-MIN_STANDARD_ERRORS = 3.0
-"""Standard errors, over the frames, by which a gain must exceed 0."""
-MAX_LOST_FRACTION = 0.3
-"""Fraction of the frames with poses that a correction may leave without; more count as score 0."""
-MAX_CORRECTIONS = 3
-"""Corrections that are named at most."""
-COARSE_SAMPLES = 6
-"""Masks in which every candidate is scored where there are no key points."""
 MAX_CANDIDATES = 8
 """Best candidates of the coarse scores that are scored in all frames."""
-TIE_SCORE = 0.004
-"""Scores this close are equal; then the cause that stands first in `CAUSES` is named."""
 MIN_GAIN = 0.02
 """Gain in score that a discrete correction must bring."""
-MIN_FITTED_GAIN = 0.04
-"""Gain in score that a fitted correction must bring: clothes make every body a little larger."""
-MIN_FITTED_CHANGE = 0.06
-"""Relative change of its number that a fitted correction must make."""
-MIN_EXPLAINED_SCORE = 0.5
-"""Score after all corrections below which they explain nothing, and none is named."""
-MIN_WINDOW_CHANGE = 0.02
-"""Fraction of the image that a video must be cropped or padded by."""
-FRAME_OFFSETS = (*range(1, 13), 15, 18, 21, 25, 30, 35, 40, 50, 60)
-"""Frames by which poses or a video may be late or early, on the coarse grid."""
-MAX_UNMATCHED_OFFSETS = 24
-"""Largest number of offsets to try where there are fewer poses than frames."""
 FRAME_RATES = (24.0, 25.0, 30.0, 50.0, 60.0)
 """Frame rates, Hz, that are mistaken for one another."""
 MIRROR_X = np.diag([-1.0, 1.0, 1.0])
@@ -108,14 +86,15 @@ def video_corrections(frames: int, mask_count: int) -> Iterator[Correction]:
 
 def _offsets(frames: int) -> Iterator[int]:
     """Offsets of the coarse grid, late and early."""
-    yield from (k for near in FRAME_OFFSETS if near < frames // 2 for k in (near, -near))
+    grid = (*range(1, 13), 15, 18, 21, 25, 30, 35, 40, 50, 60)
+    yield from (k for near in grid if near < frames // 2 for k in (near, -near))
 
 
 def _spaced_offsets(largest: int) -> list[int]:
-    """At most `MAX_UNMATCHED_OFFSETS` offsets, evenly spaced from 1 to the largest."""
+    """At most 24 offsets, evenly spaced from 1 to the largest."""
     if largest <= 0:
         return []
-    count = min(largest, MAX_UNMATCHED_OFFSETS)
+    count = min(largest, 24)
     return sorted({round(offset) for offset in np.linspace(1, largest, count)})
 
 
@@ -327,7 +306,7 @@ class CaptureObjective:
             return mean_with_missing(self.keypoints.frame_scores(geometry))
         if self.masks is None:
             return 0.0
-        return mean_with_missing(self.masks.subset(COARSE_SAMPLES).frame_scores(geometry))
+        return mean_with_missing(self.masks.subset(6).frame_scores(geometry))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -373,18 +352,19 @@ class CorrectionSearch:
         scores = self.objective.frame_scores(geometry)
         chosen: list[Correction] = []
         first: tuple[CorrectionCandidate, ...] = ()
-        while len(chosen) < MAX_CORRECTIONS:
+        while len(chosen) < 3:
             candidates = self._best_candidates(geometry)
             first = first if chosen else best_per_cause(candidates)
             candidates = [c for c in candidates if is_significant(c, geometry, scores)]
             if not candidates:
                 break
             best = max(candidate.mean_score for candidate in candidates)
-            tied = [each for each in candidates if each.mean_score > best - TIE_SCORE]
+            # of equal scores, the cause that stands first in `CAUSES` is named
+            tied = [each for each in candidates if each.mean_score > best - 0.004]
             winner = min(tied, key=lambda each: CAUSES.index(each.correction.cause))
             chosen.append(winner.correction)
             geometry, scores = winner.correction.apply(geometry), winner.frame_scores
-        if mean_score(scores) < MIN_EXPLAINED_SCORE:
+        if mean_score(scores) < 0.5:  # they explain nothing
             chosen, geometry = [], stored
         return CorrectionResult(corrections=tuple(chosen), candidates=first, corrected=geometry)
 
@@ -448,7 +428,7 @@ def is_significant(
     """Check whether a candidate gains enough, frame by frame, over the current scores."""
     gains = candidate.frame_scores - np.nan_to_num(scores)
     had, has = np.isfinite(scores), np.isfinite(candidate.frame_scores)
-    if had.sum() - has.sum() > MAX_LOST_FRACTION * had.sum():
+    if had.sum() - has.sum() > 0.3 * had.sum():
         # It would explain some frames by giving up others: those count as lost.
         gains = np.where(had & ~has, -np.nan_to_num(scores), gains)
     gains = gains[np.isfinite(gains)]
@@ -456,9 +436,9 @@ def is_significant(
         return False
     correction = candidate.correction
     is_fitted = correction.factor is not None
-    least = MIN_WINDOW_CHANGE if correction.cause == "video_crop" else MIN_FITTED_CHANGE
+    least = 0.02 if correction.cause == "video_crop" else 0.06  # relative change
     if is_fitted and relative_change(geometry, correction.apply(geometry)) < least:
         return False
     error = gains.std(ddof=1) / np.sqrt(len(gains)) if len(gains) > 1 else 0.0
-    needed = MIN_FITTED_GAIN if is_fitted else MIN_GAIN
-    return bool(gains.mean() > max(needed, MIN_STANDARD_ERRORS * error))
+    needed = 0.04 if is_fitted else MIN_GAIN  # clothes make every body a little larger
+    return bool(gains.mean() > max(needed, 3.0 * error))  # standard errors over the frames

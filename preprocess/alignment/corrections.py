@@ -20,10 +20,6 @@ CAUSES = (
 )  # fmt: skip
 """Names of the mistakes in commands and files; of equal candidates the first cause is named."""
 GeometryChange = Callable[[CaptureGeometry], CaptureGeometry]
-MAX_CENTER_OFFSET = 0.45
-"""Largest shift of the principal point, as a fraction of the image's sides."""
-MAX_LOG_WINDOW = 0.7
-"""Largest logarithm of the size of a cropped or padded video relative to the masks' image."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -221,13 +217,13 @@ def fit_to_keypoints(
             yield make(factor)
     design = np.broadcast_to(np.eye(2), (*found.shape, 2))
     right, down = objective.fit(bodies, design, found - bodies.pixels).tolist()
-    if (np.abs([right, down]) < MAX_CENTER_OFFSET * np.array(geometry.size_px)).all():
+    if (np.abs([right, down]) < 0.45 * np.array(geometry.size_px)).all():
         yield shift_principal_point(right, down)
     if geometry.video_transform.window == FULL_WINDOW:
         inside = (found / geometry.size_px)[..., None]
         axes = np.eye(2)
         design = np.concatenate([(1.0 - inside) * axes, inside * axes], axis=-1)
         sides = objective.fit(bodies, design, bodies.pixels / geometry.size_px)
-        if (np.abs(np.log(np.maximum(sides[2:] - sides[:2], 1e-9))) < MAX_LOG_WINDOW).all():
+        if (np.abs(np.log(np.maximum(sides[2:] - sides[:2], 1e-9))) < 0.7).all():
             left, top, right, bottom = sides.tolist()
             yield undo_video_crop((left, top, right, bottom))

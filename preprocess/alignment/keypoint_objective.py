@@ -30,14 +30,8 @@ from preprocess.tracking.keypoints import MIRRORED_POINTS
 
 TRACKED_IMAGES = 16
 """Images in which the person is tracked."""
-MAX_DECODED_FRAMES = 300
-"""Frames at the beginning of a video over which they are spread: all of them are decoded."""
 THUMBNAIL_PX = 300
 """Height of the images that are kept to be shown."""
-HALF_SCORE_HEIGHTS = 0.04
-"""Distance of a key point at which it counts half, in the person's height."""
-ROBUST_STEPS = 8
-"""Steps of a robust linear fit."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -59,7 +53,7 @@ class TrackedImage:
 def track_images(source: FrameSource) -> tuple[TrackedImage, ...]:
     """Find the largest person, upright or not, in images spread over the beginning of a video."""
     chosen = source.selection
-    total = min(source.frame_count or 1, MAX_DECODED_FRAMES)
+    total = min(source.frame_count or 1, 300)  # all of them are decoded
     step = max(1, total // TRACKED_IMAGES)
     first = spaced_indices(total, TRACKED_IMAGES)[0]
     begin, end = (chosen.start + chosen.step * place for place in (first, total))
@@ -118,7 +112,7 @@ class KeypointObjective:
     def frame_scores(self, geometry: CaptureGeometry) -> Float[np.ndarray, "images"]:
         """Mean score of each image's key points, in [0, 1]; NaN where the geometry has no pose.
 
-        A key point scores 1 where the body has it, and half at `HALF_SCORE_HEIGHTS` from there.
+        A key point scores 1 where the body has it, and half at 0.04 person heights from there.
         """
         bodies, found = self.bodies(geometry), self.found_px(geometry)
         if found is None:
@@ -126,7 +120,7 @@ class KeypointObjective:
         left, top, right, bottom = geometry.video_transform.window
         tall = self.person_px * max(geometry.size_px) / max(self.images[0].size_px)
         tall *= 0.5 * (right - left + bottom - top)
-        away = np.linalg.norm(bodies.pixels - found, axis=-1) / (HALF_SCORE_HEIGHTS * tall)
+        away = np.linalg.norm(bodies.pixels - found, axis=-1) / (0.04 * tall)
         scores = np.where(bodies.in_camera_m[..., 2] > NEAR_PLANE_M, 1.0 / (1.0 + away**2), 0.0)
         weights = self.confidence
         if geometry.video_transform.mirrored:
@@ -182,7 +176,7 @@ class KeypointObjective:
         weights = np.broadcast_to(self.confidence[..., None], rows.shape)[rows]
         design, target, robust = design[rows], target[rows], np.float64(1.0)
         numbers = np.zeros(design.shape[-1])
-        for _ in range(ROBUST_STEPS if len(target) else 0):
+        for _ in range(8 if len(target) else 0):
             scaled = np.sqrt(weights * robust)
             numbers = np.linalg.lstsq(scaled[:, None] * design, scaled * target, rcond=None)[0]
             off = np.abs(design @ numbers - target)

@@ -28,16 +28,6 @@ USABLE_IOU = 0.5
 """Mean IoU below which a capture cannot be trained on."""
 SAMPLED_FRAMES = 16
 """Number of frames that are sampled."""
-COARSE_MASK_PX = 256.0
-"""Longer side of the masks in which the person's height is measured, px."""
-MIN_BOX_FILL = 0.95
-"""Fraction of its bounding box that no person's outline fills."""
-MIN_COVERED_FRACTION = 0.1
-"""Fraction of a mask's connected part that the body must cover to be of the same person."""
-MIN_PERSON_PX = 60
-"""Median height of the person below which there is little detail, px."""
-MAX_CACHED_POSES = 256
-"""Posed skins in the cache: 25 MB."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -76,8 +66,8 @@ class SilhouetteObjective:
 
     @property
     def are_boxes(self) -> bool:
-        """True if the masks are boxes, which do not determine the person's size."""
-        return float(np.median([_box_fill(w.alpha > 0.5) for w in self.samples])) > MIN_BOX_FILL
+        """True if masks fill their boxes as no person does: they do not tell the person's size."""
+        return float(np.median([_box_fill(w.alpha > 0.5) for w in self.samples])) > 0.95
 
     def subset(self, count: int) -> "SilhouetteObjective":
         """At most `count` of the frames, evenly spaced."""
@@ -116,7 +106,7 @@ class SilhouetteObjective:
     def posed_points(self, motion: Motion, row: int) -> Float32[np.ndarray, "points 3"]:
         """The skin in one of a motion's poses; cached, as candidates share poses."""
         if (motion, row) not in self._posed_cache:
-            if len(self._posed_cache) >= MAX_CACHED_POSES:
+            if len(self._posed_cache) >= 256:  # 25 MB
                 self._posed_cache.clear()
             self._posed_cache[motion, row] = self.skin.posed(motion[row])
         return self._posed_cache[motion, row]
@@ -143,7 +133,7 @@ def components_touching(alpha: AlphaMask, body: Bool[np.ndarray, "height width"]
     count, labels = cv2.connectedComponents((alpha > 0.1).astype(np.uint8), connectivity=8)
     covered = np.bincount(labels[body], minlength=count)
     areas = np.bincount(labels.ravel(), minlength=count)
-    own = covered > MIN_COVERED_FRACTION * areas
+    own = covered > 0.1 * areas
     own[0] = False
     if not own.any():
         return alpha
@@ -185,10 +175,8 @@ def sample_masks(
         usable = [int(n) for n in track.frames if source.selection.contains(int(n))] or usable
     usable = [frame for frame in usable if frame not in cameras.frames_without_camera] or usable
     frames = [usable[n] for n in spaced_indices(len(usable), count)]
-    size_px, camera_row = (
-        _scaled_size(source.size_px, COARSE_MASK_PX),
-        associate_cameras(cameras, source),
-    )
+    size_px = _scaled_size(source.size_px, longer=256.0)
+    camera_row = associate_cameras(cameras, source)
     masks.check()
     found, refused = _read_masks(masks, frames, size_px)
     found = [(index, alpha) for index, alpha in found if (alpha > 0.5).any()]
@@ -275,5 +263,5 @@ def _framing_warnings(objective: SilhouetteObjective, height_px: int) -> Iterato
         )
     heights = [np.ptp(np.flatnonzero(a.any(axis=1))) + 1 for a in alphas]
     tall = float(np.median(heights)) / alphas[0].shape[0] * height_px
-    if tall < MIN_PERSON_PX:
+    if tall < 60:
         yield f"The person is {tall:.0f} px high; little detail can be learnt from that."

@@ -14,11 +14,6 @@ from capture.source import AlphaMask
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.parametric_body import ShapedBody
 
-LIMB_DEPTH_M = 0.1
-"""Distance behind a point from which another belongs to another limb, metres."""
-MAX_COTANGENT = 10.0
-"""Bound of a corner's cotangent: slivers would dominate."""
-
 
 def vertex_normals(
     vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
@@ -58,7 +53,7 @@ def smooth_over_surface(
     doubled = np.linalg.norm(_doubled_area_vectors(vertices, faces), axis=1)
     before, after = np.roll(edges, 1, axis=1), np.roll(edges, -1, axis=1)
     cotangents = -(before * after).sum(axis=2) / np.maximum(doubled, 1e-12)[:, None]
-    weights = 0.5 * np.clip(cotangents, 0.0, MAX_COTANGENT).ravel()
+    weights = 0.5 * np.clip(cotangents, 0.0, 10.0).ravel()  # slivers would dominate
     one, other = np.roll(faces, -1, axis=1).ravel(), np.roll(faces, 1, axis=1).ravel()
     links = coo_array((weights, (one, other)), shape=(count, count)).tocsc()
     links = links + links.T
@@ -95,7 +90,7 @@ def visible_points(
         cell_m: Edge of a cell: no less than the points' spacing.
         tolerance_m: Largest distance behind the nearest point of its cell, beyond its own slope.
         margin_cells: Cells by which clothes and errors of the pose may widen limbs: a point that
-            lies farther than `LIMB_DEPTH_M` behind another so near in the image is hidden, too.
+            lies farther than 0.1 m behind another so near in the image is hidden, too.
     """
     cell = np.floor((image_points - image_points.min(axis=0)) / cell_m).astype(np.int64)
     columns = int(cell[:, 1].max()) + 1
@@ -109,7 +104,7 @@ def visible_points(
     if margin_cells:
         image = np.append(nearest, np.full(-len(nearest) % columns, np.inf)).reshape(-1, columns)
         around = minimum_filter(image, 2 * margin_cells + 1, mode="constant", cval=np.inf)
-        shown &= depth <= around.reshape(-1)[flat] + LIMB_DEPTH_M
+        shown &= depth <= around.reshape(-1)[flat] + 0.1
     return shown
 
 
@@ -142,10 +137,8 @@ def visible_from_anywhere(
     return shown
 
 
-SKIN_POINTS = 8000
-"""Points sampled on the skin: about three per pixel of a person `SILHOUETTE_PERSON_PX` high."""
 DENSE_SKIN_POINTS = 40_000
-"""As many for a person of 200 px; higher ones get holes."""
+"""Points on the skin for a person of 200 px, three per pixel; higher ones get holes."""
 SILHOUETTE_PERSON_PX = 96
 """Height of a person in small images, px: a pixel is about 2 cm."""
 NEAR_PLANE_M = 0.05
@@ -168,10 +161,11 @@ class SkinPoints:
     shares: Float[np.ndarray, "points 3"]
 
     @classmethod
-    def of(cls, shaped: ShapedBody, count: int = SKIN_POINTS) -> "SkinPoints":
+    def of(cls, shaped: ShapedBody, count: int = 8000) -> "SkinPoints":
         """Sample the surface systematically: one point per equal share of the area.
 
-        Within a triangle points follow the R2 sequence (the plane's golden ratio).
+        Within a triangle points follow the R2 sequence (the plane's golden ratio). 8000 are about
+        three per pixel of a person `SILHOUETTE_PERSON_PX` high.
         """
         corners = shaped.vertices[shaped.body.faces]
         sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -120,10 +120,6 @@ def world_from_body(
     return rigid_transform(rotation, pelvis + root_translation - rotation @ pelvis)
 
 
-SHARED_JOINTS = 22
-"""Root and body joints that SMPL, SMPL+H and SMPL-X have in common, in one order."""
-SMPL_JOINTS = 24
-"""Number of SMPL's joints, the root included."""
 SUPPORTED_JOINT_COUNTS = (22, 24, 52, 55)
 """Numbers of joints that a pose may have: without hands, SMPL, SMPL+H, SMPL-X."""
 
@@ -161,8 +157,8 @@ def stack_axis_angles(parts: list[Any]) -> Float[np.ndarray, "poses 24 3"]:
             f"rotations of {joints.shape[1]} joints, root and hands included; expected one of "
             f"{', '.join(map(str, SUPPORTED_JOINT_COUNTS))}"
         )
-    full = np.zeros((len(joints), SMPL_JOINTS, 3))
-    kept = SMPL_JOINTS if joints.shape[1] == SMPL_JOINTS else SHARED_JOINTS
+    full = np.zeros((len(joints), 24, 3))
+    kept = 24 if joints.shape[1] == 24 else 22  # that the bodies have in common, in one order
     full[:, :kept] = joints[:, :kept]
     return full
 

@@ -52,10 +52,6 @@ class BodyModel:
         return ShapedBody(body=self, vertices=vertices, joints=joints)
 
 
-SAME_SHAPE_M = 5e-4
-"""Largest distance between the resting surfaces of bodies that are the same, metres."""
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ShapedBody:
     """One person's body at rest: vertices and joints in metres.
@@ -84,7 +80,8 @@ class ShapedBody:
         """Check whether two shapes of one body model are the same person."""
         pairs = ((self.vertices, other.vertices), (self.joints, other.joints))
         return self.vertices.shape == other.vertices.shape and all(
-            bool(np.abs(one - another).max() < SAME_SHAPE_M) for one, another in pairs
+            bool(np.abs(one - another).max() < 5e-4)
+            for one, another in pairs  # metres
         )
 
     def with_pose(self, pose: BodyPose) -> "PosedBody":

@@ -33,19 +33,10 @@ GIRTH_GROUPS = {
     "hands": (20, 21, 22, 23), "head": (12, 15),
 }  # fmt: skip
 """Joints whose skin one girth moves outward; that of the head moves the skin under hair alone."""
-GIRTH_SMOOTHING_M = 0.02
-"""Width over which the directions of girths are smoothed, metres. Along each vertex's own normal,
-hair and loose clothes would inflate noses, ears and fingers instead of covering them."""
-FRONT_MIN_NORMAL = 0.2
-"""Least forward component of a normal of the face; ears may lie under hair."""
-HAIRLINE = 0.7
-"""Height of the hairline, as a share of that of the head above its joint."""
 SIGMA_BETA = 0.7
 """Prior standard deviation of a shape coefficient."""
 SIGMA_LOG_LENGTH = 0.05
 """Prior standard deviation of the logarithm of a bone's length."""
-SIGMA_GIRTH_M = 0.02
-"""Prior standard deviation of a girth: a motion of the skin outward, metres."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -68,7 +59,7 @@ class ProportionSpace:
         outward = _outward_directions(shaped)
         lengths = [_lengthen(shaped, joints) for joints in BONE_GROUPS.values()]
         girths = [
-            SIGMA_GIRTH_M * body.weights[:, list(joints)].sum(axis=1)[:, None] * outward
+            0.02 * body.weights[:, list(joints)].sum(axis=1)[:, None] * outward
             for joints in GIRTH_GROUPS.values()
         ]
         still = np.zeros((24, 3))
@@ -103,10 +94,12 @@ def _outward_directions(shaped: ShapedBody) -> Float[np.ndarray, "vertices 3"]:
     body, vertices = shaped.body, shaped.vertices
     normals = vertex_normals(vertices, body.faces)
     low, top = shaped.joints[HEAD_JOINT, 1], vertices[:, 1].max()
-    is_face = (normals[:, 2] > FRONT_MIN_NORMAL) & (vertices[:, 1] < low + HAIRLINE * (top - low))
+    # normals that point forward, below the hairline; ears may lie under hair
+    is_face = (normals[:, 2] > 0.2) & (vertices[:, 1] < low + 0.7 * (top - low))
     face = is_face * body.weights[:, HEAD_JOINT]
     both = np.column_stack([normals, face])
-    *outward, bare = smooth_over_surface(vertices, body.faces, both, GIRTH_SMOOTHING_M).T
+    # along vertices' own normals, hair and loose clothes would inflate noses, ears and fingers
+    *outward, bare = smooth_over_surface(vertices, body.faces, both, sigma_m=0.02).T
     return np.column_stack(outward) * (1.0 - bare[:, None])
 
 

@@ -49,18 +49,6 @@ Lens = tuple[str, tuple[int, int], list[float]]
 """A camera model's name, width and height, and its parameters."""
 ImageRow = tuple[str, str, list[float]]
 """An image's name, its camera's number, and its camera-from-world: qw qx qy qz tx ty tz."""
-SUPPORTED_CAMERA_MODELS = (
-    "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FULL", "perspective",
-)  # fmt: skip
-"""Camera models of transforms.json that OpenCV's distortion can express."""
-MAX_CENTER_OFFSET = 0.1
-"""Largest offset of a principal point from the image's center; a fraction of the image's size."""
-POLYCAM_SUBFOLDERS = (
-    "keyframes/corrected_cameras", "keyframes/cameras", "corrected_cameras", "cameras", ".",
-)  # fmt: skip
-"""Folders of Polycam's cameras, the optimised ones first."""
-POLYCAM_KEYS = tuple(f"t_{row}{column}" for row in range(3) for column in range(4))
-"""Polycam's keys of the upper three rows of world-from-camera."""
 INTRINSICS = "intri.yml"
 """EasyMocap's file of camera matrices and distortions."""
 EXTRINSICS = "extri.yml"
@@ -77,12 +65,8 @@ EASYMOCAP_KEYS = (
     ("H", "H"),
 )  # fmt: skip
 """A camera's parts and their prefixes in EasyMocap's files; the last that is there counts."""
-MAX_PARENT_FOLDERS = 3
-"""Number of folders above an image whose names may be its camera's."""
 StudioCamera = Mapping[str, Float[np.ndarray, "rows columns"]]
 """K, R, T, and perhaps D (distortion), W and H, by these names."""
-JSON_NAMES = ("transforms.json", "transforms_train.json", "metadata", "metadata.json")
-"""Names of files with cameras, of nerfstudio, NeRF and Record3D, in a folder."""
 READABLE_FORMATS = (
     "an .npz (intrinsic, extrinsic, height, width), a COLMAP model (the folder of cameras.bin and "
     "images.bin, or .txt), a transforms.json of nerfstudio or instant-ngp, Record3D's .r3d or its "
@@ -195,9 +179,9 @@ def _read_folder(folder: Path, size_px: tuple[int, int] | None) -> list[NamedCam
     model = find_colmap_model(folder)
     if model is not None:
         return read_colmap_model(model)
-    file = next((folder / name for name in JSON_NAMES if (folder / name).is_file()), None)
-    if file is not None:
-        return read_json_cameras(file, size_px)
+    for name in ("transforms.json", "transforms_train.json", "metadata", "metadata.json"):
+        if (folder / name).is_file():
+            return read_json_cameras(folder / name, size_px)
     polycam = find_polycam(folder)
     return None if polycam is None else read_polycam(polycam)
 
@@ -346,7 +330,10 @@ def _transforms_camera(
 ) -> Camera:
     """One frame's camera; what the frame does not say, the file does."""
     lens = "a fisheye" if numbers.get("is_fisheye") else numbers.get("camera_model", "OPENCV")
-    if lens not in SUPPORTED_CAMERA_MODELS:
+    if lens not in (
+        "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FULL",
+        "perspective",
+    ):  # fmt: skip
         raise ValueError(
             f"camera model {lens}; undistort the images first (cv2.fisheye.undistortImage, or "
             "colmap image_undistorter)"
@@ -373,7 +360,7 @@ def _image_size(numbers: dict[str, Any], size_px: tuple[int, int] | None) -> tup
         if size_px is None:
             return doubled
         shares = np.array(doubled) / 2.0 / size_px
-        if (np.abs(shares - 0.5) > MAX_CENTER_OFFSET).any():
+        if (np.abs(shares - 0.5) > 0.1).any():
             return doubled
     if size_px is None:
         raise ValueError("it states no w and h")
@@ -401,7 +388,10 @@ def _read_record3d(content: dict[str, Any]) -> list[NamedCamera]:
 
 def find_polycam(folder: Path) -> Path | None:
     """The folder of cameras in Polycam's raw data: the optimised ones, if there are any."""
-    for place in (folder / name for name in POLYCAM_SUBFOLDERS):
+    for name in (
+        "keyframes/corrected_cameras", "keyframes/cameras", "corrected_cameras", "cameras", ".",
+    ):  # fmt: skip
+        place = folder / name
         files = sorted(place.glob("*.json")) if place.is_dir() else []
         if files and "t_00" in files[0].read_text(encoding="utf-8", errors="replace")[:4096]:
             return place
@@ -414,7 +404,8 @@ def read_polycam(folder: Path) -> list[NamedCamera]:
     for path in sorted(folder.glob("*.json"), key=natural_sort_key):
         with explain_damage(path, "a camera of Polycam"):
             numbers = json.loads(path.read_text(encoding="utf-8"))
-            world = checked_rigid(np.reshape([numbers[key] for key in POLYCAM_KEYS], (3, 4)))
+            rows = [[numbers[f"t_{row}{column}"] for column in range(4)] for row in range(3)]
+            world = checked_rigid(rows)
             focal, center, size_px = (
                 [numbers[key] for key in keys]
                 for keys in (("fx", "fy"), ("cx", "cy"), ("width", "height"))
@@ -463,7 +454,7 @@ def _camera_named_like(video: Path | None, cameras: Mapping[str, StudioCamera]) 
     if video is None:
         return None
     whole = video.resolve()
-    folders = [folder.name for folder in whole.parents[:MAX_PARENT_FOLDERS]]
+    folders = [folder.name for folder in whole.parents[:3]]
     return next((name for name in (whole.stem, whole.name, *folders) if name in cameras), None)
 
 

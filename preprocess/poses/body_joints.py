@@ -120,20 +120,10 @@ are mirrored. GEM-X writes rotations alone. (Apache-2.0; github.com/NVlabs/SOMA-
 JOINT_KEYS = ("pred_joint_coords", "joint_coords", "joints_mhr", "joint_positions", "bone_poses",
               "bone_heads", "joints", "joints_3d", "joints3d")  # fmt: skip
 """Keys of the places of joints, best first."""
-MIN_NAMED = 12
-"""Fewest joints by whose names a body is recognised."""
 POINT_KEYS = ("pred_keypoints_3d", "keypoints_3d")
 """Keys of the places of key points."""
 POSE_KEYS = {"poses", "pose", "thetas", "smpl_thetas", "global_orient", "body_pose", "Rh"}
 """Keys of rotations: files with these are read by them, whatever joints they hold."""
-FRAME_KEYS, PERSON_KEYS = ("frame_index", "frame_idx", "frame"), ("person_id", "track_id")
-"""Keys of a frame's number and a person's name."""
-UNITS_M = (1.0, 0.01, 0.001)
-"""Units that places may have."""
-USUAL_LEG_M = 0.75
-"""Length of a leg, metres: of units the one is taken that brings a body's nearest to it."""
-MAX_DISTANCE_M = 0.1
-"""Mean distance between our joints and a file's from which they are not those of a person."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -186,7 +176,7 @@ class JointTrack:
         said = (
             f"{1000.0 * mean:.0f} mm from it on average, the {name} {1000.0 * apart[worst]:.0f} mm"
         )
-        if mean > MAX_DISTANCE_M:
+        if mean > 0.1:
             raise ValueError(
                 f"its joints are not {self.body}'s: a person's are {said}. Joints whose names are "
                 "not SMPL's, SOMA's or Anny's are known by their number; other skeletons are read "
@@ -276,9 +266,9 @@ class _Item(NamedTuple):
 def _find_people(node: Any, frame: int | None = None, person: str | None = None) -> Iterator[_Item]:
     """All dictionaries with joints; the outer list or folder holds frames, inner ones people."""
     if isinstance(node, dict):
-        numbers = (node[key] for key in FRAME_KEYS if key in node)
+        numbers = (node[key] for key in ("frame_index", "frame_idx", "frame") if key in node)
         frame = next((int(one) for one in numbers if str(one).isdecimal()), frame)
-        person = next((str(node[key]) for key in PERSON_KEYS if key in node), person)
+        person = next((str(node[key]) for key in ("person_id", "track_id") if key in node), person)
         if any(key in node for key in (*JOINT_KEYS, *POINT_KEYS)) and not POSE_KEYS & node.keys():
             yield from filter(None, [_read_item(node, frame or 0, person)])
             return
@@ -340,7 +330,7 @@ def _known_body(key: str, count: int, names: Any) -> str:
     if names is not None:
         counted = {body: len(_columns(body, list(names))) for body in (*BODIES[2:4], NAMED)}
         best = max(counted, key=lambda body: counted[body])
-        if counted[best] >= MIN_NAMED:
+        if counted[best] >= 12:
             return best
     if count == 127 and key in JOINT_KEYS[:4]:
         return "MHR"
@@ -472,4 +462,5 @@ def _unit_m(places: Float[np.ndarray, "rows points 3"]) -> float:
     length = float(np.median(np.linalg.norm(legs, axis=-1).sum(axis=1)))
     if not length:
         raise ValueError("hips, knees and ankles lie in one place")
-    return min(UNITS_M, key=lambda unit: abs(np.log(max(unit * length, 1e-9) / USUAL_LEG_M)))
+    # the unit that brings the legs nearest to 0.75 m
+    return min((1.0, 0.01, 0.001), key=lambda unit: abs(np.log(max(unit * length, 1e-9) / 0.75)))

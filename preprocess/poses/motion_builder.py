@@ -24,8 +24,6 @@ from preprocess.cameras.camera_formats import invert_rigid
 
 MotionByPerson = dict[str, Motion]
 """By the name that the file gives each, in the file's order."""
-MAX_MAGNITUDE = 1e9
-"""Largest magnitude of an angle or a translation; numbers beyond it mean a damaged file."""
 
 
 def build_motion(
@@ -71,7 +69,7 @@ def build_motion(
         raise ValueError("no poses")
     turned, placed = turned[order], placed[order]
     numbers = np.column_stack([turned.reshape(len(turned), -1), placed])
-    valid = np.asarray((np.abs(numbers) < MAX_MAGNITUDE).all(axis=1))  # none of NaN
+    valid = np.asarray((np.abs(numbers) < 1e9).all(axis=1))  # none of NaN; more is damage
     if lost is not None:
         valid &= ~np.asarray(lost, dtype=bool)[order]
     return Motion(
@@ -193,8 +191,6 @@ def interpolate_rows(
 
 SMPLX_PELVIS = np.array([0.0031, -0.3514, 0.0120])
 """Pelvis of SMPL-X's neutral mean shape at rest, metres (its joint regressor's)."""
-FOCAL_TOLERANCE = 0.01
-"""Focal lengths and principal points nearer than this share are one."""
 
 
 def place_in_camera_world(
@@ -291,7 +287,7 @@ def _refocus_motion(motion: Motion, shaped: ShapedBody, camera: Camera) -> Motio
     if intrinsic is None:
         return motion
     off = np.abs(intrinsic - camera.intrinsic)[:2]
-    if (off <= FOCAL_TOLERANCE * max(camera.focal_px)).all():
+    if (off <= 0.01 * max(camera.focal_px)).all():
         return motion
     shifted = motion.root_translations.copy()
     for row in np.flatnonzero(motion.valid):

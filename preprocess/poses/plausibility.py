@@ -21,23 +21,6 @@ from preprocess.body.kinematics import JOINT_NAMES, axis_angles_from_matrices, r
 
 MAX_JOINT_ANGLE_RAD = 4.0 * np.pi
 """Largest angle of a joint in any pose. An axis-angle needs π; optimizers may leave 2π or 3π."""
-MAX_DISTANCE_M = 500.0
-"""Largest median distance from the origin, metres."""
-SUSPICIOUS_DISTANCE_M = 50.0
-"""Median distance from the origin beyond which the unit is in doubt, metres."""
-FLIP_RAD, FLIP_TIMES = 0.5, 6.0
-"""Rotation between two poses from which it may be a flip: the sum of an angle and of that
-multiple of the median rotation."""
-MAX_TURN_RAD_PER_S = 16.0
-"""Fastest rotation of a person, 2.5 turns a second."""
-MAX_JOINT_RAD_PER_S = 25.0
-"""Fastest rotation of a joint."""
-MAX_FLIP_FRAMES = 8
-"""Most poses in a row that are flipped."""
-MAX_DETOUR_RAD = 0.25
-"""Largest deviation of a rotation from its usual speed between the poses around a flip."""
-MAX_FLIP_SHARE = 0.1
-"""Largest share of flipped poses; if there are more, these are no frames of a video."""
 
 
 def require_plausible(motion: Motion, path: Path | str) -> Motion:
@@ -73,7 +56,7 @@ def find_flips(motion: Motion) -> Bool[np.ndarray, "poses"]:
     """
     flips, rows = np.zeros(len(motion), bool), np.flatnonzero(motion.valid)
     roots = rotation_matrices(motion.root_rotations[rows])
-    for start, end in _flipped_runs(roots, _times_s(motion)[rows], MAX_TURN_RAD_PER_S):
+    for start, end in _flipped_runs(roots, _times_s(motion)[rows], max_rad_per_s=16.0):
         flips[rows[start:end]] = True
     return flips
 
@@ -89,7 +72,7 @@ def _without_joint_flips(motion: Motion) -> Float[np.ndarray, "poses 23 3"]:
     times_s = _times_s(motion)[rows]
     for joint in range(joints.shape[1]):
         rotations = rotation_matrices(joints[rows, joint])
-        for start, end in _flipped_runs(rotations, times_s, MAX_JOINT_RAD_PER_S):
+        for start, end in _flipped_runs(rotations, times_s, max_rad_per_s=25.0):
             before, after = rotations[start - 1], rotations[end]
             way = axis_angles_from_matrices(before.T @ after)
             passed = times_s[start:end] - times_s[start - 1]
@@ -116,19 +99,20 @@ def _flipped_runs(
         return runs
     turned = _angles_between(rotations[:-1], rotations[1:])
     usual = float(np.median(turned))
-    fast = np.maximum(FLIP_RAD + FLIP_TIMES * usual, max_rad_per_s * gaps_s)
+    fast = np.maximum(0.5 + 6.0 * usual, max_rad_per_s * gaps_s)  # from here on it may be a flip
     for jump in np.flatnonzero(turned > fast):
         if runs and jump < runs[-1][1]:
             continue  # the end of a run
-        for length in range(1, MAX_FLIP_FRAMES + 1):
+        for length in range(1, 9):
             starts = np.array([jump + 1, jump + 1 - length])
             starts = starts[(starts > 0) & (starts + length < count)]
             detours = _angles_between(rotations[starts - 1], rotations[starts + length])
-            likely = starts[detours < MAX_DETOUR_RAD + 1.5 * usual * (length + 1)]
+            likely = starts[detours < 0.25 + 1.5 * usual * (length + 1)]
             if len(likely):
                 runs.append((int(likely[0]), int(likely[0]) + length))
                 break
-    return runs if sum(end - start for start, end in runs) <= MAX_FLIP_SHARE * count else []
+    # if there are more, these are no frames of a video
+    return runs if sum(end - start for start, end in runs) <= 0.1 * count else []
 
 
 def implausibility_reason(motion: Motion) -> str | None:
@@ -144,7 +128,7 @@ def implausibility_reason(motion: Motion) -> str | None:
             "pi / 180 (numpy.deg2rad)."
         )
     distance_m = _median_distance_m(motion)
-    if distance_m > MAX_DISTANCE_M:
+    if distance_m > 500.0:  # metres
         return (
             f"The body is {distance_m:,.0f} m from the origin (median); were translations in "
             "metres expected, and millimetres or centimetres given? Divide them by 1000 or 100."
@@ -189,7 +173,7 @@ def plausibility_warnings(motion: Motion) -> Iterator[str]:
             f"just before and after (there the {JOINT_NAMES[joint + 1].replace('_', ' ')})."
         )
     distance_m = _median_distance_m(motion)
-    if distance_m > SUSPICIOUS_DISTANCE_M:
+    if distance_m > 50.0:
         yield f"The poses lie {distance_m:.0f} m from the origin; are they in metres?"
 
 

@@ -36,8 +36,6 @@ POSE_KEY_LAYOUTS = (
 """The keys that may hold the poses, first match wins; one array of 72 starts with the root."""
 CAMERA_KEYS = ("camera_from_world", "w2c", "camera")
 """Keys of camera-from-world, best first."""
-MAX_PROPORTION = 100.0
-"""Largest magnitude of a coefficient of proportions, in prior standard deviations."""
 Arrays = dict[str, Shaped[np.ndarray, "..."]]
 KEY_ALIASES = {
     "global_orient": ("root_orient", "root_pose", "poses_root"),
@@ -54,19 +52,11 @@ SMPLX_KEYS = frozenset(
     {"left_hand_pose", "lhand_pose", "jaw_pose", "leye_pose", "expression", "expr"}
 )
 """Keys of which one is enough to know the body."""
-MODEL_BY_JOINT_COUNT = {52: "smpl", 55: "smplx"}
-"""Bodies by the number of joints of a pose, hands and face included."""
-SIBLING_KEYS = ("frame", "time", "valid", "K", "camera")
-"""Keys that may lie beside `smpl`."""
 RECOGNIZED_KEYS = (
     *{key: None for keys in POSE_KEY_LAYOUTS for key in keys}, *CAMERA_KEYS, "betas", "frame",
     "time", "valid", "K", "model", "space", "scale", "proportions", "program", *KEYPOINT_SHAPES,
 )  # fmt: skip
 """Keys that are read of a file; all others are left there."""
-SCALE_TOLERANCE = 0.01
-"""A stated scale that is nearer to 1 says nothing."""
-ROTATION_MATRIX_SIZES = frozenset(9 * joints for joints in (1, 21, 22, 23, 24, 52, 55))
-"""Numbers in a row of rotation matrices; 63 of body_pose are axis-angles."""
 ROTATION_KEYS = ("global_orient", "body_pose", "thetas", "poses")
 """Keys of rotations."""
 ROW_SHAPES = {"transl": (3,), "K": (3, 3), "camera": (4, 4), "betas": (-1,)}
@@ -178,7 +168,7 @@ def _proportions(arrays: Arrays) -> Float[np.ndarray, "coefficients"] | None:
     if "proportions" not in arrays:
         return None
     proportions = _read_numbers(arrays, "proportions")
-    if proportions.ndim != 1 or not (np.abs(proportions) < MAX_PROPORTION).all():
+    if proportions.ndim != 1 or not (np.abs(proportions) < 100.0).all():
         raise ValueError("`proportions` are no coefficients; expected finite numbers.")
     return proportions
 
@@ -214,7 +204,11 @@ def parse_instant_avatar(content: Any, path: Path) -> MotionByPerson | None:
         if isinstance(content.get("camera"), dict):
             beside |= content["camera"]
         around = normalize_keys(beside)
-        named |= {key: around[key] for key in SIBLING_KEYS if key in around and key not in named}
+        named |= {
+            key: around[key]
+            for key in ("frame", "time", "valid", "K", "camera")
+            if key in around and key not in named
+        }
     if not any(set(keys) <= named.keys() for keys in POSE_KEY_LAYOUTS):
         return None
     motion = motion_from_arrays(collect_arrays(named, path), path)
@@ -262,14 +256,10 @@ def collect_arrays(named: Mapping[str, Any], path: Path) -> Arrays:
     whole = arrays.get("thetas", arrays.get("poses"))
     if "model" not in arrays and whole is not None and whole.ndim >= 2 and whole[0].size:
         joints = whole[0].size // (9 if whole.shape[-2:] == (3, 3) else 3)
-        if joints in MODEL_BY_JOINT_COUNT:
-            arrays["model"] = np.array(MODEL_BY_JOINT_COUNT[joints])
+        if joints in (52, 55):  # hands and face included
+            arrays["model"] = np.array("smpl" if joints == 52 else "smplx")
     scale = arrays.get("scale")
-    if (
-        scale is not None
-        and scale.dtype.kind in "iuf"
-        and (abs(scale - 1.0) > SCALE_TOLERANCE).any()
-    ):
+    if scale is not None and scale.dtype.kind in "iuf" and (abs(scale - 1.0) > 0.01).any():
         raise InputError(
             f"{path} has a `scale` of {np.median(scale):.3g}: its world has a unit of its own "
             "(NeuMan, HUGS), and metres were expected. Divide `transl`, and the shifts of the "
@@ -338,7 +328,9 @@ def _reshape_row(key: str, value: Any) -> Shaped[np.ndarray, "..."]:
     """One row, whatever dimensions of 1 are around it."""
     numbers = np.asarray(value, dtype=np.float64)
     if key in ROTATION_KEYS:
-        return numbers.reshape((-1, 3, 3) if numbers.size in ROTATION_MATRIX_SIZES else -1)
+        # so many numbers are matrices; the 63 of a body_pose are axis-angles
+        is_matrices = numbers.size in [9 * joints for joints in (1, 21, 22, 23, 24, 52, 55)]
+        return numbers.reshape((-1, 3, 3) if is_matrices else -1)
     if key == "camera" and numbers.size == 12:
         return np.vstack([numbers.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
     return numbers.reshape(ROW_SHAPES.get(key, ()))

@@ -18,10 +18,6 @@ from preprocess.poses.body_joints import fit_mhr
 from preprocess.poses.motion_builder import MotionByPerson
 from preprocess.poses.skeleton_motion import SkeletonMotion
 
-BVH_START, GLB_START = b"HIERARCHY", b"glTF"
-"""First bytes by which the content of either file is recognised."""
-MAX_KEY_STEP_S = 0.1
-"""Longest time between two keys that is taken for the motion's own frame rate, seconds."""
 MAX_POSES = 100_000
 """Most poses of a file that are read."""
 MIN_FRAME_TIME_S = 1e-4
@@ -38,7 +34,7 @@ def parse_bvh(content: Any, prefer_world: bool = False) -> MotionByPerson | None
     the ones before it have turned. (Meredith and Maddock 2001, motion capture file formats
     explained.)
     """
-    if not isinstance(content, bytes) or not content.lstrip().startswith(BVH_START):
+    if not isinstance(content, bytes) or not content.lstrip().startswith(b"HIERARCHY"):
         return None
     head, found, tail = content.decode("utf-8", "replace").partition("MOTION")
     if not found:
@@ -133,7 +129,7 @@ def parse_gltf(content: Any, prefer_world: bool = False) -> MotionByPerson | Non
     ignored, as the length of the legs gives the unit. (Khronos' glTF 2.0 specification, appendix
     C; VRMC_vrm_animation-1.0 for the names of its bones.)
     """
-    if not isinstance(content, bytes) or not content.startswith(GLB_START):
+    if not isinstance(content, bytes) or not content.startswith(b"glTF"):
         return None
     text, binary = _glb_chunks(content)
     names = [str(node.get("name", number)) for number, node in enumerate(text.get("nodes", []))]
@@ -223,7 +219,7 @@ def _gltf_motion(
     begin, end = min(each[2][0] for each in keyed), max(each[2][-1] for each in keyed)
     densest = max((each[2] for each in keyed), key=len)
     step = float(np.median(np.diff(densest))) if len(densest) > 1 else 0.0
-    step = step if MIN_FRAME_TIME_S < step <= MAX_KEY_STEP_S else 1.0 / ASSUMED_FPS
+    step = step if MIN_FRAME_TIME_S < step <= 0.1 else 1.0 / ASSUMED_FPS  # keys may be sparse
     count = min(round((end - begin) / step) + 1, MAX_POSES)
     times_s = begin + np.arange(count) * step
     rotations = np.tile(rest, (count, 1, 1, 1))

@@ -33,14 +33,6 @@ LIMB_NAMES = {
     "wrist": ("wrist", "hand"),
 }
 """Names of joints that are needed on either side, without the side, the usual ones first."""
-ROOT_NAMES, HEAD_NAMES = ("hips", "pelvis", "hip", "root"), ("head", "chead", "neck1", "neck")
-"""Names of the joints on the body's axis; those between them are taken by their order."""
-MAX_CANDIDATES = 200
-"""Most poses of a motion that are compared with SMPL's rest pose."""
-MAX_SIDE_RATIO, MAX_LIMB_RATIO = 1.5, 3.0
-"""Largest ratio of a bone's length to that on the other side, and of the two bones of a limb."""
-METRIC_LEGS_M = (0.5, 1.2)
-"""Length of a leg, metres, of a skeleton of SMPL's own joints that is taken to be in metres."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -113,7 +105,7 @@ class SkeletonMotion:
         local = world.copy()
         local[:, 1:] = world[:, PARENTS[1:]].swapaxes(-1, -2) @ world[:, 1:]
         legs = _leg_length(points[-1])
-        in_metres = is_smpl and METRIC_LEGS_M[0] < legs < METRIC_LEGS_M[1]
+        in_metres = is_smpl and 0.5 < legs < 1.2  # a person's legs, in metres
         scale = 1.0 if in_metres else _leg_length(target) / legs
         return build_motion(
             [axis_angles_from_matrices(local)],
@@ -136,7 +128,8 @@ def match_joints(names: Sequence[str], parents: Int[np.ndarray, "joints"]) -> di
         return next((number for number in numbers if number not in taken), None)
 
     matched: dict[str, int | None] = dict.fromkeys(JOINT_NAMES)
-    matched["pelvis"], matched["head"] = find(ROOT_NAMES), find(HEAD_NAMES)
+    matched["pelvis"] = find(("hips", "pelvis", "hip", "root"))
+    matched["head"] = find(("head", "chead", "neck1", "neck"))
     for side in ("left", "right"):
         for joint, known in LIMB_NAMES.items():
             matched[f"{side}_{joint}"] = find([side + name for name in known])
@@ -239,7 +232,7 @@ def _check_limbs(points: Float[np.ndarray, "24 3"]) -> None:
     lengths = np.maximum(lengths, 1e-9)
     sides = np.abs(np.log(lengths[0] / lengths[1]))
     halves = np.abs(np.log(lengths[..., 0] / lengths[..., 1]))
-    if not (sides.max() < np.log(MAX_SIDE_RATIO) and halves.max() < np.log(MAX_LIMB_RATIO)):
+    if not (sides.max() < np.log(1.5) and halves.max() < np.log(3.0)):
         said = ", ".join(
             f"{side} {limb} {length / lengths.max():.2f}"
             for side, legs_and_arms in zip(("left", "right"), lengths, strict=True)
@@ -278,7 +271,7 @@ def _nearest_to_rest(
     points: Float[np.ndarray, "poses 24 3"], target: Float[np.ndarray, "24 3"]
 ) -> int:
     """The pose whose limbs have most nearly the directions of SMPL's at rest."""
-    rows = np.unique(np.linspace(0, len(points) - 1, MAX_CANDIDATES).round().astype(int))
+    rows = np.unique(np.linspace(0, len(points) - 1, 200).round().astype(int))
     start, end = np.array(LIMBS).T
     bones = unit_vectors(points[rows][:, end] - points[rows][:, start])
     trunk = np.einsum("nab,nka->nkb", _frames(points[rows]), bones)

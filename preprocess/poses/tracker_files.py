@@ -19,19 +19,11 @@ from preprocess.body.kinematics import rigid_transform
 from preprocess.frame_association import frame_numbers_from_names
 from preprocess.poses.motion_builder import MotionByPerson, build_motion, stack_rows
 
-VIBE_FOCAL = RelativeFocalLength(ratio=0.85)
-"""Any would do: weak perspective has none, and the depth follows from it. A phone's is taken."""
 GVHMR_VIEWS = ("smpl_params_incam", "smpl_params_global")
 PROMPTHMR_VIEWS = ("smplx_cam", "smplx_world")
 """Keys of the poses in the camera and in the world."""
 TRAM_KEYS = {"pred_rotmat", "pred_trans", "frame"}
 """Keys by which a file of TRAM is recognised."""
-MAX_LINK_STEP_M = 1.0
-"""Largest step of one person between frames, metres; it separates people without track numbers."""
-AIST_FPS = 60.0
-"""Poses per second of all AIST++ motions, by their documentation."""
-SMPLX_ROW_SIZE = 165
-"""Numbers a row that only SMPL-X has: 55 joints."""
 EASYMOCAP_KEYS = {"Rh", "Th", "poses"}
 """Keys by which a file of EasyMocap is recognised."""
 
@@ -82,18 +74,19 @@ def parse_vibe(content: Any, prefer_world: bool = False) -> MotionByPerson | Non
     """
     if not _hold_keys(content, {"pose", "orig_cam", "frame_ids"}):
         return None
-    people = {}
+    # any would do: weak perspective has none, and the depth follows from it
+    people, phone = {}, RelativeFocalLength(ratio=0.85)
     for person, rows in content.items():
         across, down, x, y = np.asarray(rows["orig_cam"], dtype=np.float64).T
         # focal / depth = sx width / 2, and width : height = sy : sx
         longer_per_width = np.maximum(1.0, across / down)
-        depth = 2.0 * VIBE_FOCAL.ratio * longer_per_width / across
+        depth = 2.0 * phone.ratio * longer_per_width / across
         people[str(person)] = build_motion(
             [rows["pose"]],
             np.column_stack([x, y, depth]),
             betas=rows.get("betas"),
             frames=rows["frame_ids"],
-            lens=VIBE_FOCAL,
+            lens=phone,
         )
     return people
 
@@ -312,7 +305,7 @@ def nearest_person(
         if name not in taken
     }
     name = min(gaps, key=lambda known: gaps[known], default=None)
-    return name if name is not None and gaps[name] < MAX_LINK_STEP_M else None
+    return name if name is not None and gaps[name] < 1.0 else None  # metres from frame to frame
 
 
 def parse_amass(content: Any, prefer_world: bool = False) -> MotionByPerson | None:
@@ -337,7 +330,7 @@ def parse_amass(content: Any, prefer_world: bool = False) -> MotionByPerson | No
     rate = _rate(content)
     model = str(content.get("surface_model_type", "smpl"))
     numbers = sum(np.asarray(part).size for part in parts) / max(1, len(content["trans"]))
-    is_smplx = "smplx" in model.replace("-", "").lower() or numbers == SMPLX_ROW_SIZE
+    is_smplx = "smplx" in model.replace("-", "").lower() or numbers == 165  # 55 joints
     motion = build_motion(
         parts,
         content["trans"],
@@ -357,7 +350,7 @@ def _aist_motion(content: dict[str, Any]) -> Motion:
     if not np.isfinite(scaling) or scaling <= 0.0:
         raise ValueError(f"`smpl_scaling` of {scaling}")
     poses = np.asarray(content["smpl_poses"], dtype=np.float64).reshape(len(places), -1)
-    times_s = np.arange(len(places)) / AIST_FPS
+    times_s = np.arange(len(places)) / 60.0  # by their documentation
     return build_motion([poses], places / scaling, times_s=times_s, space="world")
 
 
