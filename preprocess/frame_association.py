@@ -59,9 +59,7 @@ def associate_by_time(
 ) -> Callable[[float], int | None]:
     """Map a frame's time to the row nearest to it, or to None where none is near.
 
-    Args:
-        times_s: Of the poses, in any order; NaN where unknown.
-        source: The frames; the frame rate in its container bounds how near a row must be.
+    Times of poses are in any order, NaN where unknown; the frame rate says how near a row must be.
     """
     row_of = _nearest_row(times_s, _frame_interval_s(source))
     _check_time_matches(times_s, source, row_of)

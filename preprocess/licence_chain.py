@@ -65,11 +65,7 @@ def _mask_licence(capture: Capture, motion: Motion) -> Licence:
 
 
 def licence_chain(parts: Sequence[Mapping[str, str]]) -> dict[str, Any]:
-    """What the parts of all captures of an avatar allow together.
-
-    Returns:
-        {commercial_use: "yes", "no" or "unknown", because, parts, summary for people}.
-    """
+    """What all parts of an avatar allow: {commercial_use, because, parts, summary for people}."""
     worst = next((use for use in ("no", "unknown") if _with(parts, use)), "yes")
     worst = worst if parts else "unknown"
     if worst == "yes":

@@ -95,12 +95,7 @@ def join_frame(
     camera_of: Callable[[int], Camera],
     masks: MaskSource,
 ) -> Observation | DroppedFrame:
-    """Join a frame with its pose, mask and camera.
-
-    Args:
-        pose_of: The frame's pose, or why it has none.
-        camera_of: The camera of a frame's number, of the observation's size.
-    """
+    """Join a frame with its pose, or why it has none, its mask, and its camera, already resized."""
     if "corrupt" in frame.flags:
         return DroppedFrame(index=frame.index, reason="picture damaged")
     pose = pose_of(frame)

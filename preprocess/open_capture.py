@@ -106,11 +106,7 @@ def open_capture(
 
 
 def read_capture(inputs: CaptureInputs) -> ImportedCapture:
-    """Read the parts of a recording with poses.
-
-    Raises:
-        InputError: If a part is missing or unreadable.
-    """
+    """Read the parts of a recording with poses."""
     paths = inputs.find_paths()
     source = open_source(paths.video, frames=inputs.frames, rotate=inputs.rotate)
     body = load_body_model(inputs.body)
@@ -153,9 +149,6 @@ def align_capture(
         size_px: Longer side of the training images; None for the frames' own.
         skip_checks: Takes the parts as they are even if they do not fit together, for ia-check.
         avatar_body: File of a finished avatar's person, to whom the poses belong.
-
-    Raises:
-        InputError: If they do not fit together.
     """
     motion = imported.motion
     warnings: tuple[str, ...] = ()
@@ -307,9 +300,6 @@ def open_tracked_stream(
         longer_side_px: Longer side of the training images for a source.
         avatar_body: File of a finished avatar's person, who is filmed again.
         on_tracked: Receives each frame that was searched, and the person in it.
-
-    Raises:
-        InputError: If it cannot be read, or no person is found in it.
     """
     if inputs.cameras == "solve" or inputs.height_m is not None:
         raise InputError(

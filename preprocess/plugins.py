@@ -37,13 +37,7 @@ class Segmenter(Protocol):
     """Segments the person, frame by frame, in the order of the frames."""
 
     def __call__(self, frame: Frame, pose: BodyPose, camera: Camera) -> AlphaMask:
-        """Estimate how far each pixel is person, in [0, 1].
-
-        Args:
-            frame: The frame, of any size.
-            pose: The tracker's pose of the body.
-            camera: Camera of the frame's size.
-        """
+        """Estimate how far each pixel is person, in [0, 1]; the camera is of the frame's size."""
         ...
 
 

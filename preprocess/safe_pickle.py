@@ -203,12 +203,7 @@ class _SafeUnpickler(_PythonUnpickler):
 
 
 def load_torch(data: bytes) -> Any:
-    """Return the result of `torch.load` for a file that may name nothing but tensors.
-
-    Raises:
-        UnsafePickleError: If it names anything else.
-        Exception: Of any kind, if it is damaged.
-    """
+    """Return the result of `torch.load` for a file that may name nothing but tensors."""
     import torch
 
     try:
@@ -221,12 +216,7 @@ def load_torch(data: bytes) -> Any:
 
 
 def load_safe_pickle(data: bytes) -> Any:
-    """Return the content of a pickle or PyTorch file: containers, arrays, tensors and stand-ins.
-
-    Raises:
-        UnsafePickleError: If it names anything that is not in `ALLOWED`.
-        Exception: Of any kind, if it is damaged.
-    """
+    """Return the content of a pickle or PyTorch file: containers, arrays, tensors and stand-ins."""
     old_torch = b"\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19."  # an opcode; PyTorch's mark before 1.6
     if data.startswith(b"PK") or old_torch in data[:32]:
         return load_torch(data)

@@ -144,12 +144,7 @@ class Motion:
     def select_rows(
         self, rows: Int[np.ndarray, "some"], frames: Int[np.ndarray, "some"] | None = None
     ) -> "Motion":
-        """Some of its rows, for frames of other numbers; without the key points.
-
-        Args:
-            rows: Which ones, in their new order.
-            frames: The frame that each row belongs to; None if unknown.
-        """
+        """Some of its rows in a new order, for frames of other numbers; without the key points."""
         cameras = self.camera_from_world
         return replace(
             self,

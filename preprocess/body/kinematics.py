@@ -144,10 +144,7 @@ def stack_axis_angles(parts: list[Any]) -> Float[np.ndarray, "poses 24 3"]:
 
     Each part holds axis-angles (… or …x3) or matrices (…x3x3) with one row a pose. Of SMPL+H and
     SMPL-X (52 and 55 joints) the first 22 are taken: they are SMPL's; its two hands rest. So do
-    joints that are missing at the end (a body pose of 63 numbers).
-
-    Raises:
-        ValueError: If it is another number of joints, or the rows do not match.
+    joints that are missing at the end (a body pose of 63 numbers). Other counts are a ValueError.
     """
     joints = np.concatenate(
         [_as_axis_angles(np.asarray(part, np.float64)) for part in parts], axis=1

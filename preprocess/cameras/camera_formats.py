@@ -129,11 +129,7 @@ def checked_camera(
     camera_from_world: object,
     distortion: object = (),
 ) -> Camera:
-    """A camera of numbers that may be anything; each argument as in `Camera`.
-
-    Raises:
-        TypeError, ValueError: If they are no camera.
-    """
+    """A camera of numbers that may be anything, as in `Camera`; an error if they are none."""
     focal, center, size, coefficients = (
         np.array(numbers, dtype=np.float64)
         for numbers in (focal_px, center_px, size_px, distortion)
@@ -430,11 +426,8 @@ def read_multi_view_camera(
 ) -> Camera:
     """The camera of a video, or of a folder of images, that is named like it.
 
-    Args:
-        rig: Result of `find_multi_view_cameras`.
-        video: The video or folder; None if there are only poses, and one camera is expected.
-        size_px: Width and height of its frames, for files that state none; None for twice the
-            principal point.
+    Without a video one camera is expected in the `rig` (of `find_multi_view_cameras`). Where files
+    state no size, it is that of the frames, or twice the principal point.
     """
     with explain_damage(rig, "cameras of EasyMocap or ZJU-MoCap"):
         cameras = _read_zju(rig) if rig.name == ZJU else _read_easymocap(rig)

@@ -56,10 +56,8 @@ def start_distances(
     """Divide distances from the cameras and shift the pelvis, so that the body fits the masks.
 
     `own` is the body as it is, whose proportions are taken if they fit better than the capture's:
-    files state SMPL for poses that were fitted to another body.
-
-    Returns:
-        The capture, words for people, and figures for the report.
+    files state SMPL for poses that were fitted to another body. Returns the capture, words for
+    people, and figures for the report.
     """
     samples = read_first_silhouettes(capture)
     if not samples:

@@ -55,11 +55,7 @@ class FittedJoints(NamedTuple):
 
 
 def rows_with_limbs(places: Float[np.ndarray, "rows points 3"]) -> Int[np.ndarray, "some"]:
-    """Rows that have all shoulders, elbows, wrists, hips, knees and ankles.
-
-    Raises:
-        ValueError: If there are none.
-    """
+    """Rows that have all shoulders, elbows, wrists, hips, knees, ankles; a ValueError if none."""
     rows = np.flatnonzero(np.isfinite(places[:, list(PLACED_JOINTS)]).all(axis=(1, 2)))
     if not len(rows):
         raise ValueError("no frame has all shoulders, elbows, wrists, hips, knees and ankles")

@@ -65,13 +65,7 @@ def fit_first_frames(
     fixed: bool = False,
     sigma_log_focal: float = SIGMA_LOG_FOCAL,
 ) -> tuple[Motion, ShapedBody, Camera]:
-    """Fit proportions, focal length and poses to the first frames of a stream.
-
-    Args:
-        shaped: The body's mean shape, or (`fixed`) the person, whose proportions stay.
-        camera: Camera of the frames, whose focal length is not exact.
-        sigma_log_focal: Prior standard deviation of the focal length's logarithm.
-    """
+    """Fit proportions (unless `fixed`), focal length and poses to the first frames of a stream."""
     model, lifted = OutlineModel(ProportionSpace.around(shaped)), _lift(seen, shaped, camera)
     fitter = _fitter(
         seen, ClipPoses.of(lifted, range(len(seen))), model, camera,

@@ -109,11 +109,7 @@ class Masks:
         return (stored > 0.0).astype(np.float32) if self._numbers else stored
 
     def alpha(self, row: int, size_px: tuple[int, int]) -> AlphaMask:
-        """The mask of one row, scaled to an image's size.
-
-        Raises:
-            InputError: If its aspect ratio is not the image's, or it is inverted unlike the others.
-        """
+        """The mask of one row, scaled to an image's size; an InputError if it does not fit."""
         stored = self._binarize_ids(self._read(row))
         height, width = stored.shape
         if not same_aspect_ratio((width, height), size_px):

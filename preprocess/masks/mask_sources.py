@@ -60,9 +60,7 @@ class MaskSource:
     def alpha(self, frame: Frame, scaled: Frame, pose: BodyPose, camera: Camera) -> AlphaMask:
         """The mask of a frame, in [0, 1]; an InputError if there is none.
 
-        Args:
-            frame: The frame as it was filmed.
-            scaled: The same, of the mask's and the camera's size.
+        `scaled` is the frame, as it was filmed, at the mask's and the camera's size.
         """
         raise NotImplementedError
 
@@ -201,12 +199,7 @@ class EstimatedMasks(MaskSource):
 
 
 def associate_masks(masks: Masks, source: FrameSource) -> Callable[[int], int]:
-    """Map a frame's number to its mask's row; the function raises for frames without a mask.
-
-    Raises:
-        InputError: If they are of another shape, or not one per frame and their names do not tell
-            whose they are.
-    """
+    """Map a frame's number to its mask's row; raises where they do not fit, or there is none."""
     if not same_aspect_ratio(masks.size_px, source.size_px):
         raise InputError(
             f"The masks in {masks.path} have {masks.size_px[0]}x{masks.size_px[1]} px, the frames "
@@ -234,11 +227,7 @@ def _row_by_name(named: dict[int, int], path: Path, index: int) -> int:
 
 
 def alpha_channel_mask(frame: Frame, size_px: tuple[int, int]) -> AlphaMask:
-    """The image's own alpha channel, scaled.
-
-    Raises:
-        InputError: If it has none, or an opaque one, which does not cut the person out.
-    """
+    """The image's own alpha channel, scaled; an InputError if it cuts nothing out."""
     if frame.alpha is None:
         raise InputError("the picture has no alpha channel")
     if not has_cutout_alpha(frame.alpha):

@@ -150,14 +150,10 @@ class JointTrack:
     program: str | None = None
 
     def fitted(self, *, upright: bool) -> Motion:
-        """Our body's motion, and a note that says how near its joints are.
+        """Our body's motion, and a note that says how near its joints are; a ValueError if far.
 
-        Args:
-            upright: Turn places in the world so that y is up, for a motion of its own; those of a
-                film stay in the world of its cameras.
-
-        Raises:
-            ValueError: If the joints are not those of a person.
+        With `upright`, for a motion of its own, places in the world are turned so that y is up;
+        those of a film stay in the world of its cameras.
         """
         rows = rows_with_limbs(self.places)
         places, turns = self.places[rows], None if self.turns is None else self.turns[rows]
@@ -228,15 +224,9 @@ def parse_joints(content: Any, prefer_world: bool = False) -> MotionByPerson | N
 def fit_mhr(
     places: Float[np.ndarray, "rows nodes 3"], nodes: Mapping[int, int], fps: float
 ) -> Motion:
-    """Our body's motion by the joints of MHR in the world, in any unit.
+    """Our body's motion by the joints of MHR in the world, in any unit; a ValueError for others'.
 
-    Args:
-        places: Of all nodes of a file.
-        nodes: The node of each of MHR's joints by its number.
-        fps: Rows a second.
-
-    Raises:
-        ValueError: If joints are missing, or are not those of a person.
+    Places are of all nodes of a file; `nodes` holds that of each joint by the joint's number.
     """
     columns = _columns("MHR", None)
     joints = {number: point for point, number in columns.items() if point in JOINT_NAMES}

@@ -49,9 +49,6 @@ def build_motion(
         lost: Rows that the tracker itself calls lost.
         body_model, space, anchor: See `Motion`.
         lens: The camera matrix K, or one per pose; or the focal length that the tracker assumed.
-
-    Raises:
-        ValueError: If the parts do not fit together.
     """
     is_assumed = isinstance(lens, RelativeFocalLength)
     counts = {len(part) for part in (*rotations, translations)}
@@ -247,12 +244,9 @@ def transform_motion(
 def refocus_translation(
     joints: Float[np.ndarray, "24 3"], intrinsic: Float[np.ndarray, "3 3"], camera: Camera
 ) -> Float[np.ndarray, "3"]:
-    """Shift of a body so that another camera sees it where the tracker's saw it.
+    """Shift of a body in the tracker's camera so that the true one sees it where that one did.
 
-    Args:
-        joints: In the tracker's camera, metres.
-        intrinsic: The tracker's K, for images of the camera's size.
-        camera: The true one; its place does not matter.
+    The tracker's K is that for images of the true camera's size.
     """
     pixels = joints[:, :2] / joints[:, 2:] * intrinsic[[0, 1], [0, 1]] + intrinsic[:2, 2]
     return place_by_pixels(joints, pixels, camera)
@@ -263,12 +257,8 @@ def place_by_pixels(
 ) -> Float[np.ndarray, "3"]:
     """Shift of a body so that a camera sees its joints at given pixels.
 
-    Linear least squares over the joints, rows f t_x - (u - c) t_z = (u - c) z - f x.
-
-    Args:
-        joints: In the camera's axes, metres, from any place.
-        pixels: Target of each joint.
-        camera: Without distortion; its place does not matter.
+    Linear least squares over the joints, rows f t_x - (u - c) t_z = (u - c) z - f x. Joints are in
+    the camera's axes, from any place; the camera's own place and distortion do not matter.
     """
     middle = joints.mean(axis=0)
     shape = joints - middle

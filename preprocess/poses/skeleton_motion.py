@@ -62,12 +62,7 @@ class SkeletonMotion:
         return _forward(self.parents, self.rotations, self.translations)[1]
 
     def retarget(self) -> Motion:
-        """The motion as SMPL's: y up, metres by the length of the legs.
-
-        Raises:
-            ValueError: If joints that are needed have no name that is known, or their bones are
-                not those of a person.
-        """
+        """The motion as SMPL's: y up, metres by the length of the legs; a ValueError if unknown."""
         target = load_body_model().joints
         source = match_joints(self.names, self.parents)
         is_smpl = {_plain(name) for name in JOINT_NAMES} <= {_plain(name) for name in self.names}
@@ -116,11 +111,7 @@ class SkeletonMotion:
 
 
 def match_joints(names: Sequence[str], parents: Int[np.ndarray, "joints"]) -> dict[str, int | None]:
-    """The joint of a skeleton for each of SMPL's, in their order; None for one that is missing.
-
-    Raises:
-        ValueError: If a joint that is needed is missing; the message names it.
-    """
+    """The joint of a skeleton for each of SMPL's, in order; None where one may be missing."""
     plain = [_plain(name) for name in names]
 
     def find(candidates: Sequence[str], taken: Sequence[int | None] = ()) -> int | None:

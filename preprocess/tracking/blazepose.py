@@ -129,9 +129,6 @@ class BlazePoseTracker:
 
         `person` is counted from left to right from 1, in the first frame with that many persons;
         None follows the largest one.
-
-        Raises:
-            InputError: If that number is below 1.
         """
         if person is not None and person < 1:
             raise InputError(f"--person {person}: persons are counted from 1, the leftmost one.")
@@ -356,10 +353,7 @@ class PosedPersonFinder:
     ) -> tuple[PersonKeypoints, float]:
         """Look at the square around the posed body; the mask holds nothing far from it.
 
-        Returns the person, and the IoU of its mask with the body.
-
-        Raises:
-            InputError: If the body is outside the image.
+        Returns the person, and the IoU of its mask with the body; an InputError outside the image.
         """
         points = self._skin.posed(pose).astype(np.float64)
         depth = points @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
@@ -390,11 +384,7 @@ class BlazePoseSegmenter:
         self.mask_count, self.agreement = 0, 0.0
 
     def __call__(self, frame: Frame, pose: BodyPose, camera: Camera) -> AlphaMask:
-        """Estimate the mask of a frame; see `Segmenter`.
-
-        Raises:
-            InputError: If the body is outside the image, or the mask disagrees with it.
-        """
+        """Estimate the mask of a frame; an InputError where it disagrees with the body."""
         person, agreement = self._find(frame.rgb, pose, camera)
         if agreement < 0.4:
             raise InputError(

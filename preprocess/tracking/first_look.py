@@ -238,9 +238,7 @@ def camera_motion(
 ) -> tuple[CameraMotion | None, float]:
     """How the camera moves, by corners of the background, and the largest shift of these.
 
-    Args:
-        pairs: Frames at places of a recording, each with one that comes soon after it.
-        backgrounds: 255 where the first of each shows background.
+    Pairs are frames soon after one another; `backgrounds` is 255 where the first shows background.
     """
     grays = [[_reduced_gray(frame.rgb) for frame in pair] for pair in pairs]
     masks = [

@@ -174,10 +174,8 @@ def grade_tracking(
 ) -> TrackingGrade:
     """Grade poses that were made of key points.
 
-    Args:
-        frame_times_s: Time of each frame that was looked at, with a person or without, by its
-            number.
-        iou_of_frame: IoU of posed body and mask of some frames, by their numbers.
+    Times are those of all frames that were looked at, with a person or without; IoUs of posed body
+    and mask those of some. Both are by the frames' numbers.
     """
     numbers = np.array(sorted(frame_times_s))
     disagreeing = _disagreeing(keypoints, iou_of_frame)
