@@ -328,7 +328,7 @@ def _reshape_row(key: str, value: Any) -> Shaped[np.ndarray, "..."]:
     """One row, whatever dimensions of 1 are around it."""
     numbers = np.asarray(value, dtype=np.float64)
     if key in ROTATION_KEYS:
-        # so many numbers are matrices; the 63 of a body_pose are axis-angles
+        # these are matrices; the 63 numbers of a body_pose are axis-angles
         is_matrices = numbers.size in [9 * joints for joints in (1, 21, 22, 23, 24, 52, 55)]
         return numbers.reshape((-1, 3, 3) if is_matrices else -1)
     if key == "camera" and numbers.size == 12:
