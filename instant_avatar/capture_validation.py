@@ -37,8 +37,6 @@ from preprocess.masks.mask_sources import StoredMasks
 from preprocess.open_capture import ImportedCapture, align_capture
 from preprocess.poses.plausibility import implausibility_reason
 
-QUICK_FRAMES = 8
-"""Frames checked before a run starts."""
 GOOD_KEYPOINT_SCORE = 0.5
 """Score of the key points from which poses without masks match the images: half of them are within
 4 % of the person's height."""
@@ -48,10 +46,6 @@ NO_KNOWN_MISTAKE = (
     "touches them, very wide clothes). Recompute them from this video."
 )
 """Diagnosis if no correction helps."""
-QUICK_OFFSETS = (1, -1, 2, -2)
-"""Delays of the poses, in frames, that are tested even if poses and masks match."""
-QUICK_GAIN = 0.75 * MIN_GAIN
-"""Gain in mean IoU of such a delay that is looked into: inexact poses gain 0.01 by chance."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -204,16 +198,17 @@ def passes_quick_check(capture: Capture) -> bool:
     if not capture.masks.is_given:
         return True  # nothing to compare with
     try:
-        masks = _sample_masks(capture, QUICK_FRAMES)
+        masks = _sample_masks(capture, 8)
     except InputError:  # these masks are empty; reading all of them reports that
         return True
     geometry = replace(_stored_geometry(capture), masks_inverted=False)
     now = mean_score(masks.frame_scores(geometry))
     shifts = [
         mean_score(masks.frame_scores(undo_pose_delay(offset).apply(geometry)))
-        for offset in QUICK_OFFSETS
+        for offset in (1, -1, 2, -2)
     ]
-    return now >= GOOD_IOU and now >= max(shifts) - QUICK_GAIN
+    # inexact poses gain 0.01 by chance
+    return now >= GOOD_IOU and now >= max(shifts) - 0.75 * MIN_GAIN
 
 
 def mask_files(capture: Capture) -> Masks | None:

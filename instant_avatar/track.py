@@ -37,8 +37,6 @@ from instant_avatar.run.run_folder import RunFolder, claim_folder
 from preprocess.capture_inputs import CaptureInputs
 
 PROGRAM = "ia-track"
-NOT_GOOD_ENOUGH = 1
-"""Exit code of poses that were written, but are not good enough for an avatar."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,7 +214,8 @@ def track(arguments: TrackArguments, console: Console) -> int:
         console.info(f"  {quote_command(*command)}")
     if tracking.interrupted:
         return INTERRUPTED
-    return DONE if tracking.grade.is_good_enough else NOT_GOOD_ENOUGH
+    # written, but not good enough for an avatar
+    return DONE if tracking.grade.is_good_enough else 1
 
 
 if __name__ == "__main__":

@@ -17,18 +17,12 @@ from preprocess.observation import Observation, shrink_to_longer_side
 
 LONGER_SIDE_PX = 720
 """Longer side of the video, px."""
-SHORTER_SIDE_PX = 320
-"""Least shorter side of the video, px: smaller frames are enlarged, so that text can be read."""
 LETTER_PX, LINE_PX = 7, 16
 """Width of a letter and height of a line of text, px."""
-SILHOUETTE_PX = 256
-"""Longer side of the images in which the body's outline is found, px."""
 MASK_COLOR, BODY_COLOR = (255, 255, 255), (255, 120, 0)
 """RGB colors of the outlines of mask and body."""
 LEFT_COLOR, RIGHT_COLOR, MIDDLE_COLOR = (255, 150, 40), (60, 190, 255), (240, 240, 240)
 """RGB colors of the person's left and right limbs, and of trunk and head."""
-DOUBT_COLOR = (255, 60, 60)
-"""RGB color of doubts."""
 LEFT_JOINTS = frozenset({1, 4, 7, 10, 13, 16, 18, 20, 22})
 """Joints of SMPL's tree on the person's left; the next one is that on the right."""
 
@@ -58,7 +52,7 @@ def _draw_frames(capture: Capture, doubts: Mapping[int, str]) -> Iterator[RgbIma
         size_px = _video_size_px(item.frame.size_px)
         image = cv2.resize(item.frame.rgb, size_px, interpolation=cv2.INTER_AREA)
         camera = item.camera.resize(size_px)
-        small = item.camera.resize(shrink_to_longer_side(item.camera.size_px, SILHOUETTE_PX))
+        small = item.camera.resize(shrink_to_longer_side(item.camera.size_px, 256))
         drawn = skin.draw(item.pose, small).astype(np.float32)
         draw_outline(image, cv2.resize(item.alpha, size_px), MASK_COLOR, width_px=1)
         draw_outline(image, cv2.resize(drawn, size_px), BODY_COLOR, width_px=1)
@@ -73,7 +67,7 @@ def _draw_frames(capture: Capture, doubts: Mapping[int, str]) -> Iterator[RgbIma
 
 def _video_size_px(size_px: tuple[int, int]) -> tuple[int, int]:
     """Size of the video of frames of a size; even numbers, as encoders want."""
-    scale = max(1.0, SHORTER_SIDE_PX / min(size_px))
+    scale = max(1.0, 320 / min(size_px))  # smaller text cannot be read
     scale = min(scale, LONGER_SIDE_PX / max(size_px))
     width, height = (max(2, 2 * round(scale * side / 2)) for side in size_px)
     return width, height
@@ -108,7 +102,7 @@ def _draw_text(image: RgbImage, text: str, doubtful: bool) -> None:
     lines = textwrap.wrap(text, letters)
     ground = image[: 6 + LINE_PX * len(lines)]
     ground[:] = ground // 4
-    color = DOUBT_COLOR if doubtful else MASK_COLOR
+    color = (255, 60, 60) if doubtful else MASK_COLOR
     for row, line in enumerate(lines):
         at = (6, LINE_PX * (row + 1))
         cv2.putText(image, line, at, cv2.FONT_HERSHEY_SIMPLEX, 0.42, color, 1, cv2.LINE_AA)

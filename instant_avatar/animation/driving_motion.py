@@ -87,10 +87,6 @@ def load_driving_motion(
     return motion
 
 
-MAX_FPS = 60.0
-"""Largest default frame rate: of motion capture at 120 Hz every second pose is shown."""
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ResampledMotion:
     """A motion sampled at a constant frame rate.
@@ -115,7 +111,8 @@ class ResampledMotion:
         `speed` is a factor on the speed of the motion; `max_fps` limits the result.
         """
         rows, rate = np.flatnonzero(motion.valid), pose_rate(motion)
-        pace = min(fps or rate / float(np.ceil(rate / MAX_FPS - 1e-6)), max_fps)
+        # of motion capture at 120 Hz every second pose is shown
+        pace = min(fps or rate / float(np.ceil(rate / 60.0 - 1e-6)), max_fps)
         step = speed if motion.times_s is None else speed * rate / pace
         step = 1.0 if abs(step - 1.0) < 1e-3 else step
         count = int((len(rows) - 1) / step + 1e-6) + 1
@@ -146,8 +143,6 @@ class ResampledMotion:
 
 PERSON_HEIGHT_SHARE = 0.8
 """Height of the standing person as a fraction of the image height."""
-MAX_HEIGHT_OVER_WIDTH = 1.5
-"""Aspect ratio beyond which the person is shown smaller, so that arms fit in."""
 DISTANCE_HEIGHTS = 3.5
 """Distance of the camera, in heights of the person."""
 MEASURING_PX = 192
@@ -216,7 +211,8 @@ class FollowingCamera:
         """Return the camera for a pose, `seconds` after the first frame."""
         width, height = self.size_px
         away = DISTANCE_HEIGHTS * self.height_m
-        person_px = PERSON_HEIGHT_SHARE * min(height, MAX_HEIGHT_OVER_WIDTH * width)
+        # smaller in a tall image, so that arms fit in
+        person_px = PERSON_HEIGHT_SHARE * min(height, 1.5 * width)
         zoom = 1.0 if self.viewpoint.joint is None else CLOSE_UP_ZOOM
         # similar triangles: person_px / focal = height_m / away
         focal = person_px * away / self.height_m * zoom

@@ -83,8 +83,6 @@ def verdict_lines(result: dict[str, Any]) -> list[str]:
 
 REFERENCE_GRAPH = Path(__file__).with_name("reference.onnx")
 """Written by test_player_timing.py, which compares it with onnx's."""
-WARM_UP_IMAGES = 3
-"""Images rendered before timing, per worker."""
 MIN_IMAGES = 10
 """Least number of timed images; short motions are repeated."""
 
@@ -130,7 +128,7 @@ def benchmark_player(
 ) -> PlayerTiming:
     """Render a sequence after a warm-up and time it."""
     sequence = list(sequence) * -(-MIN_IMAGES // len(sequence))
-    list(player.render_all(sequence[: WARM_UP_IMAGES * workers], workers=workers))
+    list(player.render_all(sequence[: 3 * workers], workers=workers))
     covered = 0.0
     wall, cpu = time.perf_counter(), time.process_time()
     for picture in player.render_all(sequence, workers=workers):

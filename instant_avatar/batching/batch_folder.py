@@ -46,8 +46,6 @@ RESULTS_NAME = "results.jsonl"
 """A line for each capture that has ended, the newest last."""
 FAILED_NAME = "_failed"
 """Folder with the logs of captures without an avatar."""
-SAVE_INTERVAL_S = 30.0
-"""Interval at which the results are sent to a URL, where nothing can be appended, seconds."""
 STATUSES = ("failed", "refused", "waiting", "done")
 """States of a capture, the worst first."""
 Results = Mapping[str, AttemptRecord | None]
@@ -134,7 +132,7 @@ class BatchFolder:
         if self.path is not None:
             with (self.path / RESULTS_NAME).open("a", encoding="utf-8") as results:
                 results.write(_line(record))
-        elif time.monotonic() - self._saved_at > SAVE_INTERVAL_S:
+        elif time.monotonic() - self._saved_at > 30.0:  # nothing is appended at a URL
             with suppress(RemoteFileError):  # the next time sends it
                 self._save()
         return record

@@ -50,10 +50,6 @@ STATUSES = {DONE: "done", BAD_INPUT: "refused"}
 """Status of a capture by the exit code of ia-ingest; all others are failures."""
 BATCH_FORCE = "the same command with --again, and --force after --"
 """How a batch goes on with poses that are not good enough; what is done is left alone."""
-GRACE_S = 60.0
-"""Time after --limit in which an attempt may end by itself before its process is ended, seconds."""
-OBJECT_STORE_BYTES = 200_000_000
-"""Memory for what attempts bring back (about 5 MB each), where this machine alone is used."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -205,7 +201,8 @@ def _time_limit(seconds: float, log: TextIO) -> Iterator[None]:
         if hasattr(signal, "SIGALRM"):  # not on Windows, where the process is ended instead
             signal.signal(signal.SIGALRM, stop)
             signal.setitimer(signal.ITIMER_REAL, seconds)
-        faulthandler.dump_traceback_later(seconds + GRACE_S, exit=True, file=log)
+        # it may end by itself first
+        faulthandler.dump_traceback_later(seconds + 60.0, exit=True, file=log)
     try:
         yield
     finally:
@@ -282,7 +279,8 @@ def _connect(ray: Any, address: str) -> None:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent anywhere
     own: dict[str, Any] = {}
     if address == RAY_LOCAL:
-        own = {"num_cpus": usable_cores(), "object_store_memory": OBJECT_STORE_BYTES}
+        # attempts bring back about 5 MB each
+        own = {"num_cpus": usable_cores(), "object_store_memory": 200_000_000}
         own["include_dashboard"] = False
     on_sigterm = signal.getsignal(signal.SIGTERM)
     try:

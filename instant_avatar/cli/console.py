@@ -13,12 +13,6 @@ from rich.table import Column
 
 MAX_PRINTED_WARNINGS = 5
 """Warnings, and notes, that are printed; the report lists all of them."""
-LOG_INTERVAL_S = 10.0
-"""Seconds between two progress lines in a log."""
-MIN_ELAPSED_FOR_ESTIMATE_S = 2.0
-"""Elapsed time before which the remaining time is not estimated, seconds."""
-MIN_SHARE_FOR_ESTIMATE = 0.15
-"""Fraction done before which the remaining time is not estimated."""
 
 
 def format_duration(seconds: float) -> str:
@@ -161,7 +155,7 @@ class ProgressBar:
 
     def _remaining_text(self, done: float) -> str:
         took = time.perf_counter() - self._started_at
-        early = done < MIN_SHARE_FOR_ESTIMATE * self._total or took < MIN_ELAPSED_FOR_ESTIMATE_S
+        early = done < 0.15 * self._total or took < 2.0
         if early or done >= self._total:
             return ""
         return f", about {format_duration(took * (self._total - done) / done)} left"
@@ -173,6 +167,6 @@ class ProgressBar:
             if now - self._drawn_at > 0.1:
                 self._drawn_at = now
                 self._progress.update(self._task, completed=done, note=escape(note))
-        elif now - self._logged_at >= LOG_INTERVAL_S:
+        elif now - self._logged_at >= 10.0:
             self._logged_at = now
             self._console.print(f"{self._label}: {escape(note)}", highlight=False)

@@ -34,8 +34,6 @@ from instant_avatar.evaluation.score_table import AvatarEvaluation, ScoreRow
 from instant_avatar.run.run_folder import RunFolder
 from preprocess.observation import Observation
 
-FIT_BATCH_FRAMES = 25
-"""Number of frames whose poses are fitted together."""
 VOLUME_RENDERER = "renderer"
 """Name of the volume renderer in the table."""
 
@@ -103,7 +101,7 @@ class EvaluationSession:
         )
         with self.console.progress(f"scoring {name}", float(frames.count or 0)) as bar:
             done, rest = 0, iter(frames)
-            while group := list(islice(rest, FIT_BATCH_FRAMES)):
+            while group := list(islice(rest, 25)):
                 for observation in group:
                     if self.stop.is_set():
                         break

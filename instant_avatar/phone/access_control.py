@@ -12,9 +12,6 @@ from typing import final
 
 from capture.input_error import InputError
 
-CERTIFICATE_DAYS = 7
-"""Days for which a certificate is valid."""
-
 
 @final
 class AccessControl:
@@ -71,7 +68,7 @@ def made_certificate(address: str) -> ssl.SSLContext:
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
         .not_valid_before(now - datetime.timedelta(hours=1))
-        .not_valid_after(now + datetime.timedelta(days=CERTIFICATE_DAYS))
+        .not_valid_after(now + datetime.timedelta(days=7))
         .add_extension(x509.SubjectAlternativeName(names), critical=False)
         .add_extension(  # Apple's systems refuse a server without it
             x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False

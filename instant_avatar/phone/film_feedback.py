@@ -34,19 +34,11 @@ from preprocess.masks.color_models import DARK_LEVEL
 from preprocess.tracking.blazepose import SEEN_AGO
 from preprocess.tracking.video_tracking import TrackingProblem, touched_borders
 
-LOOKS_TO_SPEAK = 2
-"""Tracked frames in a row that must show the same before the page speaks of it."""
 CROWDED_LOOKS = SEEN_AGO + 1
 """The same for another person, whom the tracker must have seen twice; it looks every few frames."""
 CROWDED = "Two people are in the picture: only one may be."
-MAP_INTERVAL_S = 2.0
-"""Interval between two drawings of the body map, seconds."""
-PREVIEW_TIME_SHARE = 0.08
-"""Share of the training time that drawing the avatar may take."""
 PREVIEW_PX = 180
 """Height of the drawing, pixels."""
-TURN_S = 8.0
-"""Time in which the drawn avatar turns once, seconds."""
 CUT_SENTENCES = {
     TrackingProblem.BOTTOM: "Step back: your feet are cut off.",
     TrackingProblem.TOP: "Step back: your head is cut off.",
@@ -110,7 +102,7 @@ class FilmFeedback:
         self._framing = text
         time_s = round(seen.frame.time_s, 2)
         self._film.tell("seconds", seconds=time_s)
-        if self._repeats >= (CROWDED_LOOKS if text == CROWDED else LOOKS_TO_SPEAK):
+        if self._repeats >= (CROWDED_LOOKS if text == CROWDED else 2):
             coverage = self._started.coverage if self._started is not None else None
             advice = "Good. Now turn round slowly."
             if coverage is not None and coverage.stages.any():  # a frame was learnt from
@@ -126,12 +118,12 @@ class FilmFeedback:
         if self._started is None or self._map is None:
             return
         if now >= self._next_map:
-            self._next_map = now + MAP_INTERVAL_S
+            self._next_map = now + 2.0
             share = self._started.coverage.seen_share
             self._film.tell("map", svg=str(self._map.svg()), seen=round(share, 3))
         if self._started.trainer.steps and now >= self._next_preview:
             self._film.tell("preview", image=self._draw(now))
-            self._next_preview = now + (time.perf_counter() - now) / PREVIEW_TIME_SHARE
+            self._next_preview = now + (time.perf_counter() - now) / 0.08  # of the training time
 
     def _draw(self, now: float) -> str:
         """The avatar as it is, turning, as a data URI."""
@@ -143,7 +135,7 @@ class FilmFeedback:
                 BodyPose.rest(), joint_rotations=canonical_rotations(), root_translation=-pelvis
             )
             self._grid = (pose, CorrespondenceGrid.solve(avatar.rig, pose.joint_rotations))
-        angle = 2.0 * np.pi * (now / TURN_S % 1.0)
+        angle = 2.0 * np.pi * (now / 8.0 % 1.0)
         sine, cosine = np.sin(angle), np.cos(angle)
         axes = np.array([[cosine, 0.0, -sine], [0.0, -1.0, 0.0], [-sine, 0.0, -cosine]])
         position = np.array([sine, 0.0, cosine]) * INITIAL_DISTANCE_M

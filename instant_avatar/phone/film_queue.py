@@ -18,8 +18,6 @@ MAX_FILM_BYTES = 8 << 30
 """Largest film, bytes: ten minutes of 4K."""
 MIN_FREE_BYTES = 1 << 30
 """Space on the disk that films leave free, bytes."""
-MAX_WAITING = 8
-"""Most films that wait for their turn."""
 SUFFIXES = {
     "video/mp4": ".mp4", "video/quicktime": ".mov", "video/webm": ".webm",
     "video/x-matroska": ".mkv", "video/3gpp": ".3gp", "video/x-m4v": ".m4v",
@@ -127,7 +125,7 @@ class FilmQueue:
             raise FilmRefused(507, "The disk of the computer is too full for this film.")
         slug = re.sub(r"[^\w-]+", "-", name).strip("-_")[:40] or "avatar"
         with self._changed:
-            if len(self._films) >= MAX_WAITING:
+            if len(self._films) >= 8:
                 raise FilmRefused(503, "Too many films are waiting. Try again later.")
             place = self.folder / avatar if avatar else unused_path(self.folder / slug)
             if avatar and avatar not in self.avatars():

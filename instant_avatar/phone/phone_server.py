@@ -46,17 +46,11 @@ MAX_REQUESTS_PER_S = 120
 """Requests of one browser in a second, above which it must wait; a player makes twenty."""
 PIECE_TIMEOUT_S = 60.0
 """Longest time that one piece may take, seconds."""
-HEARTBEAT_S = 5.0
-"""Longest time without a message to a page, seconds: proxies cut silent connections."""
 WARM_UP = "-"
 """Name of an avatar of two points, which the page's hidden player draws before a film: the browser
 has then compiled what draws the film's avatar. Names of films do not end in a dash."""
 EXPORTS = ("avatar.glb", "avatar.vrm", "avatar.spz", "avatar.ply", "avatar.obj")
 """Files for other programs that the page offers: meshes, and splats (.spz)."""
-MESH_TRIANGLES = 20_000
-"""Triangles of a mesh."""
-MAX_AUTHOR_LENGTH = 80
-"""Longest author that a VRM names, characters."""
 HEADERS = web_server.HEADERS | {
     "Cross-Origin-Resource-Policy": "same-origin", "Referrer-Policy": "no-referrer",
     "X-Frame-Options": "SAMEORIGIN",
@@ -338,7 +332,7 @@ class PhoneServer:
                     await answer.write(b"event: over\ndata: {}\n\n")
                     return answer
                 try:
-                    await asyncio.wait_for(woken.wait(), HEARTBEAT_S)
+                    await asyncio.wait_for(woken.wait(), 5.0)  # proxies cut silent connections
                 except TimeoutError:
                     await answer.write(b": alive\n\n")
         return answer
@@ -379,7 +373,7 @@ class PhoneServer:
         if file == "poster.png":
             content = await asyncio.to_thread(lambda: read_package(package).preview)
             return web.Response(body=content, content_type="image/png")
-        author = request.query.get("author", "").strip()[:MAX_AUTHOR_LENGTH]
+        author = request.query.get("author", "").strip()[:80]
         async with self._exporting:
             content = await asyncio.to_thread(_exported, package, file, author)
         return web.Response(body=content, headers=saved)
@@ -413,7 +407,7 @@ def _exported(package: Path, file: str, author: str) -> bytes:
         out = Path(folder) / file
         to = "splats" if out.suffix == ".spz" else out.suffix[1:]
         words = [str(package), f"--to={to}", f"--out={out}"]
-        words += [] if to == "splats" else [f"--triangles={MESH_TRIANGLES}"]
+        words += [] if to == "splats" else ["--triangles=20000"]
         words += [f"--author={author}"] if author and to == "vrm" else []
         command = [sys.executable, "-m", "instant_avatar.export", *words]
         done = subprocess.run(command, capture_output=True, encoding="utf-8", check=False)

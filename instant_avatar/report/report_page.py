@@ -95,8 +95,6 @@ VIEW_AXES = {"front": (0, 1.0), "left": (2, -1.0), "back": (0, -1.0), "right": (
 """Axis of the body, and its sign, that points right in each view."""
 DOT_SPACING_CM = 2.7
 """Distance of neighboring dots, centimeters."""
-MAX_PATCH_DISTANCE_CM = 3.2
-"""Distance to the nearest visible patch beyond which a dot lies off the body, centimeters."""
 LEVELS = ("never", "slant", "well")
 """CSS classes of a dot: unseen, seen at a grazing angle, seen frontally."""
 
@@ -129,7 +127,7 @@ class CoverageMap:
             places = 100.0 * (plane[shown] - top_left) * [1.0, -1.0]
             dots = _hexagonal_grid(places.max(axis=0))
             distance_cm, nearest = map(np.asarray, KDTree(places).query(dots))
-            on_body = distance_cm < MAX_PATCH_DISTANCE_CM
+            on_body = distance_cm < 3.2
             self._views[name] = _MapView(
                 positions_cm=(dots[on_body] + [left, 0.0]).round(1), patches=shown[nearest[on_body]]
             )

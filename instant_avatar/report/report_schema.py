@@ -26,8 +26,6 @@ from capture.input_error import counted
 from preprocess.observation import DroppedFrame
 from preprocess.tracking.video_tracking import NOT_FOUND
 
-REPORT_FORMAT = 1
-"""Version of the format of report.json."""
 DROP_REASONS = {
     NOT_FOUND: "without the person",
     "no pose": "without a pose",
@@ -248,7 +246,7 @@ class Report:
 
     def to_json(self) -> str:
         """Return the text of report.json; NaN and infinity become null."""
-        content = {"format": REPORT_FORMAT, "verdict": self.verdict} | dataclasses.asdict(self)
+        content = {"format": 1, "verdict": self.verdict} | dataclasses.asdict(self)
         return json.dumps(to_json_value(content), indent=1, allow_nan=False) + "\n"
 
 

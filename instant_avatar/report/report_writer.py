@@ -42,8 +42,6 @@ from instant_avatar.run.run_folder import RunFolder
 from instant_avatar.run.session_events import Ended, PackageWritten, SessionEvent
 from preprocess.capture_session import Capture
 
-MIN_STEPS_TO_JUDGE = 60
-"""Training steps below which a failed avatar is undertrained: fog clears in about 50."""
 CHECK_OPTIONS = ("poses", "person", "masks", "cameras", "body")
 """Arguments of ia-ingest that ia-check takes for the same capture."""
 
@@ -54,7 +52,8 @@ def diagnose_failure(report: Report) -> str | None:
         return None
     held = report.held_out_refined or report.held_out
     what = f"The result is no usable avatar: {_describe_scores(held)}."
-    if report.training.steps < MIN_STEPS_TO_JUDGE:
+    # fog clears in about 50
+    if report.training.steps < 60:
         return f"{what} Only {counted(report.training.steps, 'step')} of training: {TRAIN_LONGER}."
     return (
         f"{what} The model did not converge to the person. Usual causes: masks that include "
@@ -103,9 +102,6 @@ ANIMATION_PX = 480
 """Width and height of the animation on the page."""
 ANIMATION_FPS = 16.0
 """Images per second of the animation on the page."""
-VISIBLE_GAIN_DB = 1.0
-"""Gain of the fine-tuned package on the one as baked, up to `GOOD_PSNR`, for which the animation is
-drawn again, dB."""
 ANIMATION_FRAMES = 96
 """Largest number of images of an animation."""
 
@@ -152,7 +148,7 @@ class ReportWriter:
                 with self._console.status("drawing the report"):
                     assert result.exported is not None
                     psnr = min(result.exported.psnr_to_renderer["hq"], GOOD_PSNR)
-                    if psnr - self._drawn_psnr > VISIBLE_GAIN_DB:
+                    if psnr - self._drawn_psnr > 1.0:
                         self._animation = demo_animation(Player.load(self._run.package))
                         self._drawn_psnr = psnr
                         with atomic_file(self._run.animation) as part:

@@ -53,8 +53,6 @@ from instant_avatar.run.stream_meter import StreamMeter
 
 SCORING_LIMIT_S = 8.0
 """Wall time that final scoring and pose fitting aim for."""
-WHOLE_IMAGES_SHARE = 0.2
-"""Share of that time after which frames in given poses are no longer scored as whole images."""
 MIN_WHOLE_IMAGES = 3
 """Frames that are scored as whole images, whatever it takes."""
 MAX_WHOLE_IMAGES = 12
@@ -214,7 +212,7 @@ def _score_in_given_poses(
     def score(numbered: tuple[int, HeldOutFrame]) -> _ScoredFrame:
         numba.set_num_threads(1)  # of this frame; others are scored beside it
         count, frame = numbered
-        late = count >= MIN_WHOLE_IMAGES and is_late(WHOLE_IMAGES_SHARE)
+        late = count >= MIN_WHOLE_IMAGES and is_late(0.2)
         if late or count >= MAX_WHOLE_IMAGES:
             sampled = PixelSample.of(frame).score(avatar)
             return _ScoredFrame(frame, score_fine_sample(avatar, frame), sampled, None)

@@ -24,8 +24,6 @@ from preprocess.plugins import segmenter_name
 
 PROGRAM = "ia-ingest"
 """Name of the command."""
-REFERENCE_LONGER_SIDE_PX = 540
-"""Longer side of the images whose detail can be learned in `DEFAULT_SECONDS`, pixels."""
 DEFAULT_SECONDS = 60.0
 """Training time without --seconds, --steps or --realtime."""
 MIN_SECONDS = 0.1
@@ -190,7 +188,7 @@ class IngestArguments(CaptureArguments):
     def longer_side_px(self, source: FrameSource) -> int:
         """Return the longer side of images whose detail can be learned in the time, or --size."""
         minutes = self.training_seconds(source) / DEFAULT_SECONDS
-        return self.size or max(256, round(REFERENCE_LONGER_SIDE_PX * minutes**0.5))
+        return self.size or max(256, round(540 * minutes**0.5))
 
     def training_seconds(self, source: FrameSource) -> float:
         """Return the training time: as given, else the clip's duration, else a minute.

@@ -40,22 +40,10 @@ from preprocess.observation import Observation
 
 NEWEST, DANCE = "Newest frame", "Dance"
 """Labels of the buttons that choose the pose."""
-RENDER_TIME_SHARE = 0.1
-"""Fraction of the time that the page may take during training."""
-MOVING_HEIGHT_PX = 160
-"""Height of the image while camera or pose move."""
-RESTING_HEIGHT_PX = 360
-"""Height of the image at rest, during training."""
-IDLE_HEIGHT_PX = 720
-"""Height of the image at rest while training is paused or done."""
-REST_DELAY_S = 0.4
-"""Time without motion after which the image counts as at rest, seconds."""
 PANEL_INTERVAL_S = 0.5
 """Interval of updates of the panel, seconds."""
 PANEL_PX = 340
 """Width of the panel beside the avatar."""
-FRAME_HEIGHT_PX = 300
-"""Height of the newest frame in the panel."""
 BACKGROUND_RGB = (251, 250, 247)
 """Background color of the page, as in report.html."""
 INITIAL_FOV_RAD, INITIAL_DISTANCE_M = 0.6, 3.7
@@ -312,7 +300,7 @@ class LiveViewer:
             began = time.perf_counter()
             if self._render_next_view(session, idle=idle):
                 took = time.perf_counter() - began
-                self._next_image = began + took / (1.0 if idle else RENDER_TIME_SHARE)
+                self._next_image = began + took / (1.0 if idle else 0.1)
 
     def _render_next_view(self, session: TrainingSession, *, idle: bool) -> bool:
         """Render for the browser that has waited longest; return whether any needed it."""
@@ -323,8 +311,8 @@ class LiveViewer:
         cells = self._correspondence_grid(session, pose, now)
         for browser in [*(looks.keys() - self._shown.keys()), *self._shown]:
             look = looks[browser]
-            moves = choice == DANCE or now - max(look.moved_at, self._posed_at) < REST_DELAY_S
-            height = MOVING_HEIGHT_PX if moves else IDLE_HEIGHT_PX if idle else RESTING_HEIGHT_PX
+            moves = choice == DANCE or now - max(look.moved_at, self._posed_at) < 0.4
+            height = 160 if moves else 720 if idle else 360
             wanted = (look.moved_at, id(cells), session.trainer.steps, height)
             if self._shown.get(browser) == wanted:
                 continue
@@ -379,7 +367,7 @@ def render_preview(
 
 def _thumbnail(rgb: RgbImage) -> UInt8[np.ndarray, "_ _ 3"]:
     """Return a frame as high as the panel shows it, in a strip as wide as the panel."""
-    scale = FRAME_HEIGHT_PX / rgb.shape[0]
+    scale = 300 / rgb.shape[0]
     how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_LINEAR
     small = np.asarray(cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=how))
     beside = max(0, PANEL_PX - small.shape[1]) // 2

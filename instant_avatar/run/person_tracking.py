@@ -41,14 +41,10 @@ from preprocess.tracking.pose_lift import lift_keypoints
 from preprocess.tracking.tracking_grade import TrackingGrade, grade_tracking
 from preprocess.tracking.video_tracking import TrackedVideo, VideoTracking
 
-GRADED_FRAMES = 60
-"""Frames, evenly spread, whose masks are compared with the body."""
 MAX_PRINTED_STRETCHES = 8
 """Doubtful stretches that are printed; reports hold all of them."""
 MAX_FRAMES = 600
 """Most frames that are tracked unless --frames says which; of longer videos every nth."""
-LEARNT_FPS = 14.0
-"""Frames a second that are enough to learn from: those between them are nearly alike."""
 FEW_FRAMES = 120
 """Number of a film's frames below which none is left out, and that are left at least."""
 FitFunction = Callable[[Capture, Console], CaptureFit | None]
@@ -91,7 +87,7 @@ def limit_frames(
     count = source.frame_count or 0
     step = max(1, -(-count // MAX_FRAMES))
     if for_learning and source.duration_s and not source.path.is_dir():
-        enough = max(FEW_FRAMES, LEARNT_FPS * source.duration_s)
+        enough = max(FEW_FRAMES, 14.0 * source.duration_s)  # frames between them are nearly alike
         step = max(step, int(count / enough))
     if inputs.frames is not None or step == 1:
         return inputs
@@ -350,9 +346,7 @@ def _grade(capture: Capture, frame_times_s: Mapping[int, float]) -> TrackingGrad
     source, keypoints = capture.source, capture.motion.keypoints
     assert keypoints is not None
     skin = SkinPoints.of(capture.shaped)
-    sampled = sample_masks(
-        source, capture.masks, capture.cameras, skin, count=GRADED_FRAMES, track=keypoints
-    )
+    sampled = sample_masks(source, capture.masks, capture.cameras, skin, count=60, track=keypoints)
     scores = sampled.frame_scores(capture.geometry())
     return grade_tracking(
         capture.motion,

@@ -49,13 +49,6 @@ def set_threads(requested: int | None) -> int:
 if TYPE_CHECKING:  # viser is an optional extra
     from instant_avatar.run.live_viewer import LiveViewer
 
-EXPECTED_POSES = 60
-"""Poses, evenly spread, that tell what a film will show of the person."""
-WARM_UP_COARSENESS = 3.0
-"""Width of the cells of the rig that kernels are loaded for, in those of one for training."""
-JOINT_TOLERANCE_M = 1e-3
-"""Largest difference of rest joints within one body, meters; more is another body."""
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PreparedTrainer:
@@ -98,7 +91,7 @@ def warm_up_for(capture: Capture, console: Console) -> None:
     """Load the kernels on one core, while another process fits the capture's person."""
     threads = numba.get_num_threads()
     numba.set_num_threads(1)
-    rig = Rig.from_shaped_body(capture.shaped, coarseness=WARM_UP_COARSENESS)
+    rig = Rig.from_shaped_body(capture.shaped, coarseness=3.0)
     _warm_up(Trainer(rig, TrainConfig()), console)
     numba.set_num_threads(threads)
 
@@ -301,7 +294,7 @@ def _extend_budget(
 def _check_same_body(trainer: Trainer, capture: Capture, run: RunFolder) -> None:
     """Refuse poses of another body than the checkpoint's."""
     difference_m = abs(trainer.avatar.rig.rest_joints - capture.shaped.joints).max()
-    if difference_m > JOINT_TOLERANCE_M:
+    if difference_m > 1e-3:
         raise InputError(
             f"The poses use a different body than the avatar in {run.path} (rest joints differ by "
             f"up to {100.0 * difference_m:.1f} cm), and {run.body_file.name} is missing. Retrain "
@@ -317,7 +310,7 @@ def _announce_coverage(capture: Capture, console: Console) -> None:
     streamed = capture.source.paced or capture.source.frame_count is None
     if streamed or not wanted:  # of a stream only the first poses are known
         return
-    some = wanted[:: -(-len(wanted) // EXPECTED_POSES)]
+    some = wanted[:: -(-len(wanted) // 60)]
     views = ((capture.motion[row], capture.camera_of_pose(row)) for row in some)
     expected = expected_coverage(capture.shaped, views)
     if expected.mean_cosine < FILMED.sharp:

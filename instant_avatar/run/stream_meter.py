@@ -16,8 +16,6 @@ Item = TypeVar("Item")
 
 MAX_DROPPED_LISTED = 1000
 """Dropped frames that are listed with their reasons; the rest are only counted."""
-LATENESS_WARNING_S = 0.5
-"""Lateness of playback, 95th percentile in seconds, from which the user is warned."""
 
 
 @final
@@ -128,7 +126,7 @@ class StreamMeter:
             )
         is_playback = self._source.paced and self._source.frame_count is not None
         is_playback = is_playback and not self._source.skippable
-        if is_playback and not dropped and late.p95 > LATENESS_WARNING_S:
+        if is_playback and not dropped and late.p95 > 0.5:
             yield (
                 f"Playback lagged by up to {max(self.lateness_s):.1f} s (median {late.p50:.1f} s): "
                 "preprocessing is slower than the frame rate. No frame was dropped. Reduce --size, "

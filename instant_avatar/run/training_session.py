@@ -64,9 +64,6 @@ from preprocess.capture_session import ObservationSource
 from preprocess.licence_chain import licence_chain
 from preprocess.observation import Observation
 
-FINE_TUNING_CLOCK_RATE = 0.5
-"""Rate of the clock by which scores are limited while the package is fine-tuned beside them."""
-
 
 @final
 class TrainingSession:
@@ -250,7 +247,7 @@ class TrainingSession:
         def read_clock() -> float:
             now = time.perf_counter()
             tuned_at = max(began, self._tuned_at or now)
-            return now - tuned_at + FINE_TUNING_CLOCK_RATE * (tuned_at - began)
+            return now - tuned_at + 0.5 * (tuned_at - began)
 
         return score_finally(
             self.trainer, self.held_out,
