@@ -42,10 +42,6 @@ MIN_NORMAL_LENGTH = 0.5
 """Length of a ray's mean normal below which it has no direction."""
 MEMORY_RAYS = 60_000.0
 """Rays after which an earlier one weighs 1/e."""
-MIN_RAYS = 10_000.0
-"""Rays before the first estimate; the field is fog until about then."""
-RIDGE = 0.02
-"""Weight of the constant factor 1, as a share of the rays."""
 UNEXPLAINED_SHARE, EXPLAINED_SHARE = 0.02, 0.06
 """Share of the squared error that shading has to explain: below the first it is not believed, from
 the second on it is believed in full."""
@@ -53,8 +49,6 @@ MIN_FACTOR, MAX_FACTOR = 0.3, 3.0
 """Bounds of the factor."""
 OBSERVATION_INTERVAL = 4
 """Steps between observations of the light."""
-SOLUTION_INTERVAL = 16
-"""Steps between solutions for the light, a multiple of the steps between observations."""
 
 
 @final
@@ -131,14 +125,15 @@ class OrientationShading:
             MIN_ALPHA, MIN_NORMAL_LENGTH, (MIN_FACTOR, MAX_FACTOR), MEMORY_RAYS, self._sums,
         )  # fmt: skip
         self._rays = math.exp(-rays / MEMORY_RAYS) * self._rays + rays
-        if self._rays > MIN_RAYS and self._steps % SOLUTION_INTERVAL == 1:
+        # fog until about then; 16 is a multiple of the steps between observations
+        if self._rays > 10_000.0 and self._steps % 16 == 1:
             self.restore(torch.from_numpy(self._solve()))
 
     def _solve(self) -> Float32[np.ndarray, "harmonics"]:
         """Coefficients of least squares, drawn to 1; their mean over the rays is 1."""
         gram, moments, power = self._sums[:-1, :-1], self._sums[:-1, -1], self._sums[-1, -1]
         unit = np.eye(HARMONICS)[0]
-        ridge = RIDGE * gram[0, 0] * (np.eye(HARMONICS) - np.outer(unit, unit))
+        ridge = 0.02 * gram[0, 0] * (np.eye(HARMONICS) - np.outer(unit, unit))
         found = np.linalg.solve(gram + ridge, moments)
         constant = power - moments[0] ** 2 / gram[0, 0]
         rest = power - 2.0 * found @ moments + found @ gram @ found

@@ -6,11 +6,6 @@ from dataclasses import dataclass, replace
 
 COARSEST_M = 0.13
 """Cell size of the coarsest hash level, metres: 16 cells along a two-metre box."""
-ESTIMATED_POSE_DETAIL_M = 0.003
-"""Smallest detail that frames agree on where poses are estimates, metres. Finer cells than 6 mm
-neither gain nor lose in new poses, but eyes and mouth become readable."""
-ESTIMATED_POSE_SAMPLING_M = 0.0045
-"""The same for the distance between samples along a ray, which costs time, metres."""
 HEAD_SIDE_M = 0.32
 """Side of the square that holds the head, metres."""
 MAX_HEAD_PX = 256
@@ -23,18 +18,11 @@ ESTIMATED_POSE_PRIORS: Mapping[str, float] = {
 """Priors of firm and smooth surfaces where poses are estimates; they grow with the uncertainty. Fog
 imitates views in poses that are off: together they cost an exact actor 0.8 to 1.4 dB in new poses,
 and give phone-like ones 0.1 to 0.6 dB, half of the samples and whole surfaces."""
-MIN_ESTIMATED_UNCERTAINTY = 0.5
-"""Uncertainty from which every pose is corrected, not only those that their rays agree on."""
-MAX_LOG_DENSITY_STEP = 4.0
-"""Largest unpenalised change of log density across a finest cell."""
 NOMINAL_STEPS_PER_S = 50.0
 """Training steps that stand for one second where steps are counted; two cores make about these."""
 MAX_SAMPLE_STEP_M = 0.015
 """Largest distance between samples along a ray at the beginning of training, metres; limbs are five
 times as thick."""
-MAX_FINAL_STEP_M = 0.01
-"""Largest distance between samples along a ray at its end, metres: samples farther apart leave
-stripes, which show from the sides that were not filmed."""
 HELD_OUT_STRIDE = 10
 """Default stride between held-out frames."""
 
@@ -137,12 +125,12 @@ class TrainConfig:
     @property
     def poses_may_be_exact(self) -> bool:
         """True if a pose is corrected only where its rays agree that it is wrong."""
-        return self.pose_uncertainty < MIN_ESTIMATED_UNCERTAINTY
+        return self.pose_uncertainty < 0.5
 
     @property
     def max_log_density_slope_per_m(self) -> float:
-        """Largest unpenalised slope of the log density, 1/m."""
-        return MAX_LOG_DENSITY_STEP / self.finest_m
+        """Largest unpenalised slope of the log density, 1/m: 4 across a finest cell."""
+        return 4.0 / self.finest_m
 
     def sample_step_at(self, detail_share: float) -> float:
         """Distance between samples along a ray at a progress from fog to detail, in [0, 1], m."""
@@ -169,15 +157,18 @@ class TrainConfig:
         if seconds is None:
             seconds = 60.0 if steps is None else steps / NOMINAL_STEPS_PER_S
         head_m = max(filmed_footprint_m or footprint_m, min(footprint_m, HEAD_SIDE_M / MAX_HEAD_PX))
-        detail_m = math.hypot(head_m, ESTIMATED_POSE_DETAIL_M * pose_uncertainty)
-        sampling_m = math.hypot(footprint_m, ESTIMATED_POSE_SAMPLING_M * pose_uncertainty)
+        # Frames agree on no smaller detail, metres, where poses are estimates. Cells below 6 mm
+        # neither gain nor lose in new poses, but eyes and mouth become readable; samples cost time.
+        detail_m = math.hypot(head_m, 0.003 * pose_uncertainty)
+        sampling_m = math.hypot(footprint_m, 0.0045 * pose_uncertainty)
         finest_m = min(max(detail_m, 0.002), COARSEST_M / 2)
         # about four times as many entries as the skin has cells, within what a cache can hold
         entries = 4.0 * 2.0 / finest_m**2
         config = cls(
             seconds=seconds,
             steps=steps,
-            sample_step_m=min(max(1.2 * sampling_m, 0.004), MAX_FINAL_STEP_M),
+            # metres: samples farther apart leave stripes, seen from sides that were not filmed
+            sample_step_m=min(max(1.2 * sampling_m, 0.004), 0.01),
             finest_m=finest_m,
             table_size=1 << min(max(round(math.log2(entries)), 15), 19 if seconds > 120 else 17),
             pose_uncertainty=pose_uncertainty,

@@ -25,10 +25,6 @@ INITIAL_OCCUPANCY_DECAY = 0.7
 """The factor while the initial fog clears and each update probes half of the band."""
 MIN_STEP_OPACITY = 0.02
 """Opacity of one step through a cell below which the cell is empty."""
-INITIAL_DENSITY = 1e-3
-"""Cached density of the band before the first probe, 1/m."""
-SOLID_DENSITY = 20.0
-"""Density from which a cell is solid when connected components are found, 1/m."""
 NEAR_SKIN_M = 0.03
 """Distance from the skin within which a component's cells count towards its size, metres."""
 INTERIOR_DEPTH_M = 0.015
@@ -39,8 +35,6 @@ MIN_COMPONENT_SHARE = 0.003
 """Size, relative to the largest component, below which a component is a floater."""
 CALLS_PER_DRAW = 16
 """Calls whose random points are drawn at once; the empty cells change every sixteen steps."""
-FLOATER_INTERVAL = 8
-"""Updates of the occupancy between searches for floaters."""
 
 
 @final
@@ -55,7 +49,7 @@ class OccupancyGrid:
         band = torch.from_numpy(rig.skin_distance <= CLOTHING_BAND_M)
         self.density_grid = DensityGrid(
             occupied=band.to(torch.uint8),
-            density=torch.where(band, INITIAL_DENSITY, 0.0),
+            density=torch.where(band, 1e-3, 0.0),
             low=torch.from_numpy(rig.box_low),
             cells_per_m=torch.from_numpy(rig.cells_per_m),
         )
@@ -115,8 +109,8 @@ class OccupancyGrid:
         least = max(self._density_threshold(sample_step_m), min_density)
         occupied = dilate((self.density_grid.density > least).view(torch.uint8)) & self._in_band
         if drop_floaters:
-            if self._updates % FLOATER_INTERVAL == 0:
-                solid = self.density_grid.density > SOLID_DENSITY
+            if self._updates % 8 == 0:
+                solid = self.density_grid.density > 20.0  # 1/m
                 self._floaters = find_floaters(solid, self._near_skin)
             occupied &= 1 - self._floaters
         self._updates += 1

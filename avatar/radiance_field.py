@@ -24,10 +24,6 @@ from avatar.kernels.operands import (
 
 RawPoints = Float32[Tensor, "points 4"]
 """Log density and color of points, before their activations."""
-INITIAL_LOG_DENSITY = 0.0
-"""Raw density of an untrained field: 1 per metre, a fog thin enough to be cleared quickly."""
-POINTS_PER_CHUNK = 1 << 13
-"""Points per chunk, whose features and hidden layer fit into a cache."""
 
 
 @final
@@ -54,7 +50,7 @@ class RadianceField:
         ) * 1e-2
         first = normal(levels.feature_width, HIDDEN_WIDTH, math.sqrt(2.0 / levels.feature_width))
         second = normal(HIDDEN_WIDTH, 4, math.sqrt(1.0 / HIDDEN_WIDTH))
-        bias = torch.tensor([0.0, 0.0, 0.0, INITIAL_LOG_DENSITY])
+        bias = torch.zeros(4)  # density 1 per metre, a fog thin enough to be cleared quickly
         self.table, *self.layers = (
             torch.nn.Parameter(values)
             for values in (table, first, torch.zeros(HIDDEN_WIDTH), second, bias)
@@ -109,15 +105,13 @@ class RadianceField:
         """Raw outputs at any number of canonical points, in chunks."""
         chunks = [
             operations.field_forward(chunk, self.table, self.levels, self.network)[1]
-            for chunk in points.split(POINTS_PER_CHUNK)
+            for chunk in points.split(1 << 13)  # a cache holds their features and hidden layer
         ]
         return torch.cat(chunks) if chunks else points.new_empty(0, 4)
 
 
 TV_PAIR_SIGMA_M = 0.01
 """Standard deviation of the offset within a total-variation pair, metres per axis."""
-SMOOTHNESS_PAIR_SIGMA_CELLS = 0.5
-"""Standard deviation of the offset within a smoothness pair, in finest cells per axis."""
 
 
 def sample_tv_pairs(
@@ -136,7 +130,7 @@ def sample_smoothness_pairs(
 ) -> Float32[Tensor, "points 3"]:
     """Pairs about a finest cell apart, as `sample_tv_pairs`; empty if both weights are zero."""
     count = config.smoothness_pairs if config.density_slope_weight or config.color_tv_weight else 0
-    return _sample_pairs(points, count, SMOOTHNESS_PAIR_SIGMA_CELLS * config.finest_m, seed)
+    return _sample_pairs(points, count, 0.5 * config.finest_m, seed)
 
 
 def _sample_pairs(

@@ -29,12 +29,6 @@ from preprocess.body.body_pose import BodyPose
 
 RAYS_PER_CHUNK = 1 << 15
 """Rays that are traced together; bounds the memory that a large image takes."""
-SAMPLES_PER_CHUNK = 1 << 15
-"""Samples that one pass aims for: the fewer rays are left, the more samples each of them gets."""
-MIN_SAMPLES_PER_PASS = 4
-"""Fewest samples of a ray in one pass over the field."""
-MAX_SAMPLES_PER_PASS = 8
-"""Most samples of a ray in one pass over the field; more would lie behind the surface."""
 MIN_TRANSMITTANCE = 5e-6
 """Transmittance at which a ray ends; it bounds the error of a pixel."""
 EMPTY_LOG_DENSITY = -30.0
@@ -177,7 +171,8 @@ def trace_rays(
     colors = torch.zeros(len(rays.slots), 4)
     alive = torch.arange(len(colors))
     while len(alive):
-        most = min(max(SAMPLES_PER_CHUNK // len(alive), MIN_SAMPLES_PER_PASS), MAX_SAMPLES_PER_PASS)
+        # the fewer rays are left, the more samples each; beyond 8 they lie behind the surface
+        most = min(max((1 << 15) // len(alive), 4), 8)
         how = MarchSettings(sample_step_m, math.inf, most)
         samples, jitter = operations.march_resumable(rays, cells, grid, how)
         nearer = colors[alive]

@@ -24,10 +24,6 @@ PART_OF_JOINT = np.array(
 """Body part, of 14, that each joint moves; root finding starts once in every near part."""
 HEAD_PART = 7
 """The head among those parts."""
-SEED_SPACING_M = 0.02
-"""Edge of the voxels that hold one seed each, metres."""
-SKINNING_CELL_M = 0.023
-"""Spacing of the nodes of the skinning volume, metres."""
 CLOTHING_BAND_M = 0.08
 """Distance from the skin within which clothes and hair lie, metres."""
 BOX_MARGIN_M = 0.17
@@ -70,7 +66,7 @@ class Rig:
         skin_distance: Distance from each occupancy cell's center to the body's skin, metres;
             `inside_skin` where that center lies under it.
         seeds: Canonical points of the skin at which root finding starts, metres; one per voxel of
-            `SEED_SPACING_M` and body part.
+            2 cm and body part.
         seed_normals: Outward unit normals of the skin at the seeds, canonical.
     """
 
@@ -112,7 +108,7 @@ class Rig:
             box_low=low,
             box_high=high,
             weights=skinning_weight_volume(
-                vertices, weights, low, high, coarseness * SKINNING_CELL_M, BOX_MARGIN_M + 0.05
+                vertices, weights, low, high, coarseness * 0.023, BOX_MARGIN_M + 0.05
             ),
             skin_distance=distance,
             inside_skin=inside,
@@ -226,7 +222,7 @@ def _seed_vertices(
     vertices: Float[np.ndarray, "vertices 3"], weights: Float[np.ndarray, "vertices 24"]
 ) -> Int[np.ndarray, "seeds"]:
     """Vertices to start from: the first of each 2-cm voxel and body part."""
-    voxels = np.floor(vertices / SEED_SPACING_M).astype(np.int64)
+    voxels = np.floor(vertices / 0.02).astype(np.int64)
     keys = np.column_stack([voxels, PART_OF_JOINT[weights.argmax(axis=1)]])
     return np.unique(keys, axis=0, return_index=True)[1]
 
@@ -235,9 +231,6 @@ BLENDED_VERTICES = 10
 """Vertices whose weights are blended at each node; 1 is the paper's variant."""
 MIN_VERTEX_DISTANCE_M = 2e-3
 """Smallest vertex distance in the blend, metres, so that one vertex cannot dominate a node."""
-SMOOTHED_BEYOND_M = 0.03
-"""Distance from the skin beyond which weights are smoothed, metres; clothes hang nearer."""
-SMOOTHING_PASSES = 2
 SEARCHED_WITHIN_M = 0.12
 """Distance from the skin within which each cell's own distance is searched, metres."""
 LEAF_VERTICES = 32
@@ -287,7 +280,8 @@ def skinning_weight_volume(
     of_vertex = vertex_weights.astype(np.float32)
     for chunk in np.array_split(near, max(1, len(near) // 8192)):
         distance_m, index = tree.query(nodes[chunk], k=BLENDED_VERTICES, workers=-1)
-        within, far[chunk] = distance_m[:, 0] < reach_m, distance_m[:, 0] > SMOOTHED_BEYOND_M
+        # clothes hang nearer than 3 cm
+        within, far[chunk] = distance_m[:, 0] < reach_m, distance_m[:, 0] > 0.03
         share = 1.0 / np.maximum(distance_m[within], MIN_VERTEX_DISTANCE_M) ** 2
         share /= share.sum(axis=1, keepdims=True)
         mixed = share[:, None].astype(np.float32) @ of_vertex[np.asarray(index)[within]]
@@ -300,7 +294,7 @@ def _smooth_far_weights(
 ) -> Float32[np.ndarray, "x y z 24"]:
     mean = np.empty_like(weights)  # new memory costs more than the sums
     rows = mean.reshape(len(mean), -1)
-    for _ in range(SMOOTHING_PASSES):
+    for _ in range(2):
         for part, smoothed in zip(weights, mean, strict=True):
             cv2.blur(part, (3, 3), dst=smoothed, borderType=cv2.BORDER_REFLECT)
         cv2.blur(rows, (1, 3), dst=rows, borderType=cv2.BORDER_REFLECT)

@@ -16,12 +16,8 @@ from capture.source import ASSUMED_FPS, Frame, FrameSelection, FrameSource, RgbI
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"})
 """File endings of images that are read."""
-ALPHA_SAMPLES = 5
-"""Number of images, evenly spread, whose alpha channel is examined."""
 ALPHA_SUFFIXES = frozenset({".png", ".webp", ".bmp", ".tif", ".tiff"})
 """File endings of images that can have an alpha channel."""
-MIN_TRANSPARENT_FRACTION = 0.01
-"""Fraction of transparent pixels from which an alpha channel is a mask (not rounded corners)."""
 
 
 def natural_sort_key(path: Path) -> list[tuple[int, str]]:
@@ -84,7 +80,7 @@ def write_png(path: Path, picture: UInt8[np.ndarray, "..."]) -> None:
 
 def has_cutout_alpha(alpha: UInt8[np.ndarray, "height width"] | None) -> bool:
     """Return whether an alpha channel cuts the person out: an opaque one does not."""
-    return alpha is not None and float((alpha < 128).mean()) >= MIN_TRANSPARENT_FRACTION
+    return alpha is not None and float((alpha < 128).mean()) >= 0.01  # not rounded corners
 
 
 def any_has_cutout_alpha(images: Sequence[Path]) -> bool:
@@ -93,7 +89,7 @@ def any_has_cutout_alpha(images: Sequence[Path]) -> bool:
     One image proves nothing: matting tools write opaque ones at first, or where nothing is found.
     """
     able = [path for path in images if path.suffix.lower() in ALPHA_SUFFIXES]
-    places = np.linspace(0, len(able) - 1, min(ALPHA_SAMPLES, len(able))).round().astype(int)
+    places = np.linspace(0, len(able) - 1, min(5, len(able))).round().astype(int)
     for path in (able[place] for place in places):
         try:
             alpha = read_image(path)[1]

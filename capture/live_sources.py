@@ -27,8 +27,6 @@ CAMERA_PREFIX = "camera:"
 """Start of an argument that names a camera instead of a file."""
 MAX_QUEUED_FRAMES = 16
 """Most frames that wait, so that one whose pose is late does not cost the next ones."""
-MAX_READ_FAILURES = 16
-"""Consecutive failures that mean the end: the camera was unplugged, or the stream is over."""
 
 
 @cache
@@ -116,7 +114,7 @@ class CameraDevice(FrameSource):
         """Take images as fast as they come; runs on the inbox's thread."""
         yield self._first
         index, failures = 0, 0
-        while failures < MAX_READ_FAILURES and not self._pace.stopped:
+        while failures < 16 and not self._pace.stopped:  # else unplugged, or the stream is over
             if not self._capture.grab():
                 failures += 1
                 continue
@@ -165,10 +163,6 @@ IDLE_TIMEOUT_S = 10.0
 """Time without a new image after which the source ends, seconds."""
 POLL_INTERVAL_S = 0.05
 """Shortest time between two looks at the folder, seconds."""
-DAMAGED_AFTER_S = 2.0
-"""Time without a change after which an unreadable image counts as damaged, seconds."""
-MAX_STEP_S = 1.0
-"""Longest time between two images that is taken from their time stamps, seconds."""
 
 
 class _FileState(NamedTuple):
@@ -233,7 +227,7 @@ class WatchedImageFolder(FrameSource):
             image, state = self._complete(path), _state_of(path)
             if state is not None:  # those that came together were filmed one after the other
                 apart_s = 0.0 if written_s is None else state.written_s - written_s
-                step_s = min(max(apart_s, 1.0 / ASSUMED_FPS), MAX_STEP_S) if index else 0.0
+                step_s = min(max(apart_s, 1.0 / ASSUMED_FPS), 1.0) if index else 0.0
                 time_s, written_s = max(time_s + step_s, seen_s), state.written_s
             if self.selection.contains(index) and image is not None:
                 rgb, alpha = image
@@ -294,7 +288,7 @@ class WatchedImageFolder(FrameSource):
             except InputError as cause:
                 before, state = state, _state_of(path)
                 since = since if state == before else self._pace.now()
-                if state is None or self._pace.now() - since >= DAMAGED_AFTER_S:
+                if state is None or self._pace.now() - since >= 2.0:  # seconds without a change
                     self._warn(f"{cause} It was left out.")
                     return None
                 self._pace.wait_until(self._pace.now() + POLL_INTERVAL_S)

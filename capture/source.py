@@ -18,8 +18,6 @@ AlphaMask = Float32[np.ndarray, "height width"]
 """Opacity of the person at each pixel, in [0, 1]."""
 ASSUMED_FPS = 30.0
 """Frames or poses per second where no file says: folders of images, poses without times."""
-MAX_WARNINGS = 100
-"""Most problems of one source that are reported."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -159,7 +157,7 @@ class FrameSource:
         """End `frames()`, also one that waits on another thread, and release a device."""
 
     def _warn(self, message: str) -> None:
-        if message not in self.warnings and len(self.warnings) < MAX_WARNINGS:
+        if message not in self.warnings and len(self.warnings) < 100:
             self.warnings.append(message)
 
 

@@ -39,8 +39,6 @@ GLANCES = 6
 """Places of a recording, evenly spread, that are looked at before it is read."""
 GLANCE_APART_S = 0.2
 """Time between the two frames of a place, which show how the camera moves, seconds."""
-GLANCE_PX = 960
-"""Longer side of the frames of a glance, px."""
 
 
 def glance(source: FrameSource) -> list[tuple[Frame, Frame]]:
@@ -52,7 +50,7 @@ def glance(source: FrameSource) -> list[tuple[Frame, Frame]]:
     last = max(0.0, span - 1.0 - apart)
     places = np.unique(np.round((np.arange(GLANCES) + 0.5) * last / GLANCES))
     places += source.selection.start
-    pairs = recording.glance((places / rate).tolist(), GLANCE_APART_S, GLANCE_PX)
+    pairs = recording.glance((places / rate).tolist(), GLANCE_APART_S, 960)
     return [(_turn(one, source.rotate), _turn(other, source.rotate)) for one, other in pairs]
 
 

@@ -19,10 +19,6 @@ VIDEO_SUFFIXES = frozenset(
     {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".ts", ".wmv"}
 )
 """File endings of videos that are read."""
-MAX_PIXEL_STRETCH = 0.02
-"""Relative difference of a pixel's width and height from which it is worth a word."""
-MAX_DECODE_FAILURES = 16
-"""Decoding failures in a row that end a video; one damaged packet does not."""
 
 
 class DecodedFrame(NamedTuple):
@@ -191,7 +187,7 @@ class VideoFile(FrameSource):
 
     def _warn_of_wide_pixels(self, aspect: float) -> None:
         """Warn of pixels that players stretch: images are taken as they are stored."""
-        if abs(aspect - 1.0) > MAX_PIXEL_STRETCH:
+        if abs(aspect - 1.0) > 0.02:
             kind = "narrow" if aspect > 1.0 else "broad"
             self._warn(
                 f"{self.path.name} has pixels that are not square ({aspect:.2f}:1): the person is "
@@ -208,7 +204,7 @@ def decode(container: Any, stream: Any, *, at_once: bool = False) -> Iterator[De
     stream.thread_type = "SLICE" if at_once else "AUTO"
     packets, failures = container.demux(stream), 0
     start = stream.start_time or 0
-    while failures < MAX_DECODE_FAILURES:
+    while failures < 16:  # one damaged packet does not end a video
         try:
             frames = next(packets).decode()
         except StopIteration:

@@ -71,17 +71,6 @@ from export.player import (
 from export.player_inputs import fit_camera
 from preprocess.body.kinematics import PARENTS
 
-GRAPH_CHECK_PICTURES = {"hq": 2, "lite": 1}
-"""Golden frames on which each tier's graph is compared with its rays composited here. They test the
-arithmetic of this machine's onnxruntime; further poses would test the same."""
-SCORED_VIEWS = {"hq": None, "lite": 1}
-"""Views on which each tier is compared with the renderer; None for all."""
-MAX_GOLDEN_FRAMES = 4
-"""Golden frames of a package."""
-BAKING_PROGRESS = 0.25
-"""Fraction of an export's time after which baking is done."""
-FINE_TUNING_PROGRESS = 0.55
-"""Fraction of an export's time that fine-tuning takes; the rest are the checks."""
 DRAFT_COARSENESS = 1.5
 """Voxels and surfels of a draft, in those of a checked package: 0.7 core-s instead of 2.1 and half
 the bytes for 0.6 dB to the renderer (37.6 instead of 38.2, where the avatar is 25 dB from the
@@ -232,7 +221,7 @@ def export_field(
                 executor=executor,
             ),
             bake_again, config.fine_tuning_pictures,
-            lambda done: progress(BAKING_PROGRESS + FINE_TUNING_PROGRESS * done),
+            lambda done: progress(0.25 + 0.55 * done),  # the rest are the checks
         )  # fmt: skip
         warnings = [] if tuned.psnr else [INTERRUPTED_WARNING]
         if tuned.psnr or not baked_first:
@@ -346,7 +335,7 @@ def _checked_package(
             checks[tier] = executor.submit(check_graph, player, package, tier)
         scores[tier] = [
             executor.submit(psnr_to_renderer, player, view, truth)
-            for view, truth in list(zip(views, exact, strict=True))[: SCORED_VIEWS[tier]]
+            for view, truth in list(zip(views, exact, strict=True))[: {"hq": None, "lite": 1}[tier]]
         ]
     hq = players["hq"][1]
     shots = [views[0], *((frame.pose, frame.camera) for frame in manifest.golden)]
@@ -379,7 +368,7 @@ def _unchecked_package(
     """Build the package without graphs, scores and pictures."""
     golden = [
         GoldenFrame(pose=pose, camera=fit_camera(camera, MAX_GOLDEN_PX))
-        for pose, camera in views[:MAX_GOLDEN_FRAMES]
+        for pose, camera in views[:4]
     ]
     return AvatarPackage(
         manifest=Manifest(
@@ -442,7 +431,8 @@ def check_graph(player: Player, package: AvatarPackage, tier: str) -> float:
     """Return the largest difference of a tier's graph from its rays composited here, in 1/255."""
     tables, settings = package.tables[tier], package.manifest.tiers[tier].settings
     tracer, largest = RayTracer(tables, settings), 0.0
-    for frame in package.manifest.golden[: GRAPH_CHECK_PICTURES[tier]]:
+    # the arithmetic of this machine's onnxruntime; further poses would test the same
+    for frame in package.manifest.golden[: {"hq": 2, "lite": 1}[tier]]:
         traced = tracer.trace(player.bones(frame.pose, frame.camera), frame.camera)
         drawn = premultiply(player.render(frame.pose, frame.camera))
         difference = PictureDifference.of(

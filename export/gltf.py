@@ -20,14 +20,8 @@ COMPONENT_TYPES = {"float32": 5126, "uint32": 5125, "uint16": 5123, "uint8": 512
 """glTF's codes of the element types."""
 ACCESSOR_TYPES = {(): "SCALAR", (2,): "VEC2", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 """glTF's names of the shapes of elements."""
-ARRAY_BUFFER = 34962
-"""glTF's code of a buffer of vertices."""
-ELEMENT_ARRAY_BUFFER = 34963
-"""glTF's code of a buffer of indices."""
 LINEAR_FILTER, MIPMAP_FILTER, CLAMP_TO_EDGE = 9729, 9987, 33071
 """OpenGL's codes of how a texture is read: magnified, minified, and beyond its edge."""
-JPEG_QUALITY = 95
-"""Quality of the texture's JPEG, of 100."""
 FIRST_JOINT = 2
 """Node of the first joint; 0 is the mesh and 1 the floor."""
 _VRM_AXIS = {"pelvis": "hips", "spine1": "spine", "spine2": "chest", "spine3": "upperChest",
@@ -204,7 +198,7 @@ def _material(draft: "_GltfBuffer", mesh: SkinnedMesh) -> dict[str, Any]:
     if mesh.texture is None:
         return {"materials": [material]}
     surface["baseColorTexture"] = {"index": 0}
-    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    options = [cv2.IMWRITE_JPEG_QUALITY, 95]
     options += [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
     image = np.ascontiguousarray(mesh.texture.image[..., ::-1])
     code = cv2.imencode(".jpg", image, options)[1].tobytes()
@@ -220,7 +214,7 @@ def _material(draft: "_GltfBuffer", mesh: SkinnedMesh) -> dict[str, Any]:
 
 def _primitive(draft: "_GltfBuffer", mesh: SkinnedMesh) -> dict[str, Any]:
     def vertices(array: Shaped[np.ndarray, "vertices _"], **more: Any) -> int:
-        return draft.add(array, target=ARRAY_BUFFER, **more)
+        return draft.add(array, target=34962, **more)  # glTF's code of a buffer of vertices
 
     colors = (
         {"COLOR_0": vertices(_srgb_to_linear(mesh.colors), normalized=True)}
@@ -235,7 +229,7 @@ def _primitive(draft: "_GltfBuffer", mesh: SkinnedMesh) -> dict[str, Any]:
             "JOINTS_0": vertices(mesh.joints),
             "WEIGHTS_0": vertices(mesh.weights, normalized=True),
         },
-        "indices": draft.add(mesh.faces.astype(np.uint32).ravel(), target=ELEMENT_ARRAY_BUFFER),
+        "indices": draft.add(mesh.faces.astype(np.uint32).ravel(), target=34963),  # indices
         "material": 0,
     }
 

@@ -1,7 +1,7 @@
 """Texture of a mesh: charts that xatlas unwraps, with gutters of their own colors between them.
 
 A texture filter reads texels beside a chart's border, and a mipmap averages over several; both read
-the chart's own colors as far as `GUTTER_PX`. Colors along the surface's normals miss what is seen
+the chart's own colors as far as a gutter. Colors along the surface's normals miss what is seen
 from aside (folds, a brow, fog), so pictures of the avatar from around it correct them.
 """
 
@@ -19,23 +19,12 @@ TEXEL_M = 0.002
 """Edge of a texel on the surface, about, metres: as fine as the bricks' voxels."""
 MIN_SIDE_PX, MAX_SIDE_PX = 128, 4096
 """Least and largest side of the image, px; a power of two, from which any engine makes mipmaps."""
-FILLED_SHARE = 0.6
-"""Share of the image that charts cover, about."""
-GUTTER_PX = 12
-"""Distance of two charts when they are packed, px; about 8 in the image, where the charts of the
-first three mipmaps do not mix."""
 SUBPIXEL_BITS = 8
 """Bits of a corner's place within a texel when triangles are drawn."""
 VIEWS = 16
 """Pictures of the avatar that correct a texture."""
 PIXEL_M = 0.003
 """Size of their pixels on the avatar, about, metres."""
-PICTURE_BLUR_PX = 0.75
-"""Standard deviation of a blur that makes a texture as coarse as these pictures, texels."""
-MIN_COSINE = 0.2
-"""Cosine between view and normal below which a texel counts as not seen."""
-MAX_HIDDEN_M = 0.006
-"""Depth behind the nearest surface from which a texel counts as hidden, metres."""
 OWN_WEIGHT = 0.1
 """Weight of a texel's color along its normal, in pictures that see it squarely."""
 ColorAt = Callable[
@@ -84,10 +73,11 @@ def unwrap(
 
     a, b, c = (positions[corner] for corner in faces.T)
     area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-    fine_px = np.sqrt(area / FILLED_SHARE) / TEXEL_M
+    fine_px = np.sqrt(area / 0.6) / TEXEL_M  # charts cover about this much
     side_px = int(np.clip(2 ** np.round(np.log2(fine_px)), MIN_SIDE_PX, MAX_SIDE_PX))
     atlas, packing = xatlas.Atlas(), xatlas.PackOptions()
-    packing.padding, packing.resolution = GUTTER_PX, side_px
+    # about 8 in the image, where charts of the first three mipmaps do not mix
+    packing.padding, packing.resolution = 12, side_px
     atlas.add_mesh(positions, faces.astype(np.uint32))
     atlas.generate(xatlas.ChartOptions(), packing)
     sources, corners, coordinates = atlas[0]
@@ -121,7 +111,7 @@ def draw_texture(
     image[rows, columns] = color_at(points, directions)
     # single texels may see a voxel that no picture shows: in small concave places, lips and eyelids
     image = cv2.medianBlur(_fill_gutters(image, face_at >= 0), 3)
-    coarse = cv2.GaussianBlur(image.astype(np.float32), (0, 0), PICTURE_BLUR_PX)
+    coarse = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.75)  # as these pictures
     total = np.zeros((len(points), 3), dtype=np.float32)
     weight = np.full((len(points), 1), OWN_WEIGHT, dtype=np.float32)
     for camera in cameras_around(positions, views=VIEWS, pixel_m=PIXEL_M):
@@ -170,7 +160,7 @@ def _missing_colors(
     towards = camera.center_world - points
     cosines = (towards * directions).sum(axis=1) / np.linalg.norm(towards, axis=1)
     column, row = np.round(centers).astype(int).T
-    seen = np.flatnonzero((cosines > MIN_COSINE) & (away < nearest[row, column] + MAX_HIDDEN_M))
+    seen = np.flatnonzero((cosines > 0.2) & (away < nearest[row, column] + 0.006))
     return seen, cosines[seen, None].astype(np.float32), _sample(more, centers[seen])
 
 

@@ -23,38 +23,17 @@ from export.package.player_tables import (
     density_code,
 )
 
-VERTEX_SPACING_M = 0.005
-"""Edge of the cells in which the surface is extracted, metres; a crossed cell gives one vertex."""
 SURFACE_DENSITY = 20.0
 """Density of the surface, 1/m: the silhouette is then as wide as the renderer's (at 25 by 0.7 mm
 thinner, measured on three avatars)."""
-HAZE_DENSITY = 15.0
-"""Density of the faint cover that closes regions which no camera saw, 1/m."""
 BORDER_VOXELS = 4
 """Empty voxels around the bricks, so that closing and blurring stay clear of the border."""
-CLOSING_VOXELS = 2
-"""Iterations of closing: holes of twice as many voxels in the cover are closed."""
-SOLID_DEPTH_VOXELS = 3
-"""Depth under the cover from which everything is solid, voxels: bricks hold only visible ones."""
-BLUR_VOXELS = 0.75
-"""Standard deviation of the blur before the level set is extracted, voxels."""
 CODE_CONTRAST = 40.0
 """Density codes above and below the level to which densities are clipped."""
-NORMAL_SMOOTHINGS = 6
-"""Averagings of normals over adjacent vertices, as a trained field is not quite smooth."""
-SIMPLIFICATION_GROWTHS = (2, 3, 7)
-"""How fast the permitted error grows from pass to pass: slowly (where edges go that cost least,
-half of the error is left), then faster if more triangles are left than wanted."""
 COLOR_STEP_M = 0.002
 """Step of the rays that give vertices their colors, metres."""
-COLOR_DEPTH_M = 0.03
-"""Depth under the surface at which these rays end, metres."""
-COLOR_LEAD_M = 0.004
-"""Distance outside the surface at which these rays begin, metres."""
 MIN_COLOR_ALPHA = 0.2
 """Alpha below which a vertex takes the color of the nearest other one."""
-JOINTS_PER_VERTEX = 4
-"""Joints that move a vertex: all importers read this many."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -104,7 +83,7 @@ def extract_mesh(
     tables: PlayerTables,
     level: LevelSet | None = None,
     *,
-    spacing_m: float = VERTEX_SPACING_M,
+    spacing_m: float = 0.005,
     triangles: int | None = None,
     picture_by: PictureBy | None = None,
 ) -> SkinnedMesh:
@@ -166,7 +145,8 @@ def _simplify(
     import fast_simplification  # not needed by the player
 
     found = positions, faces
-    for growth in SIMPLIFICATION_GROWTHS:
+    # the permitted error grows slowly, where edges go that cost least, then faster
+    for growth in (2, 3, 7):
         if len(found[1]) > triangles:
             found = fast_simplification.simplify(*found, target_count=triangles, agg=growth)
     nearest = KDTree(positions).query(found[0])[1]
@@ -177,19 +157,20 @@ def _level_function(
     codes: UInt8[np.ndarray, "x y z"], density: float
 ) -> Float32[np.ndarray, "x y z"]:
     """Return a function that is positive inside: log-density over the level, without floaters."""
-    level, haze = density_code(np.array([density, HAZE_DENSITY])).astype(np.float32)
+    # 1/m, of the faint cover that closes regions which no camera saw
+    level, haze = density_code(np.array([density, 15.0])).astype(np.float32)
     solid = remove_floaters_and_cavities((codes > level) | _solid_interior(codes > haze))
     height = codes.astype(np.float32) - level
     height = np.where(solid, np.maximum(height, 1.0), np.minimum(height, -1.0))
     return ndimage.gaussian_filter(
-        np.clip(height, -CODE_CONTRAST, CODE_CONTRAST), BLUR_VOXELS, truncate=3.0
+        np.clip(height, -CODE_CONTRAST, CODE_CONTRAST), 0.75, truncate=3.0
     )
 
 
 def _solid_interior(cover: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
     """Mark what lies well below a cover with holes."""
-    closed = ndimage.binary_closing(cover, iterations=CLOSING_VOXELS)
-    return np.asarray(ndimage.binary_erosion(fill_cavities(closed), iterations=SOLID_DEPTH_VOXELS))
+    closed = ndimage.binary_closing(cover, iterations=2)
+    return np.asarray(ndimage.binary_erosion(fill_cavities(closed), iterations=3))
 
 
 def skinning_weights(
@@ -244,7 +225,7 @@ def _smooth_normals(
     ).tocsr()
     adjacent = touches @ touches.T
     normals = _normalize(touches @ areas)
-    for _ in range(NORMAL_SMOOTHINGS):
+    for _ in range(6):  # as a trained field is not quite smooth
         normals = _normalize(adjacent @ normals)
     return normals.astype(np.float32)
 
@@ -264,7 +245,7 @@ def _vertex_colors(
     """Composite the color of each vertex along its inward normal, from outside."""
     total = np.zeros((len(nodes), 3), dtype=np.float32)
     passed = np.ones(len(nodes), dtype=np.float32)
-    for depth in np.arange(-COLOR_LEAD_M, COLOR_DEPTH_M, COLOR_STEP_M):
+    for depth in np.arange(-0.004, 0.03, COLOR_STEP_M):
         place = (nodes - normals * np.float32(depth / voxel_m)).T
         sampled = [
             ndimage.map_coordinates(codes[..., channel], place, np.float32, order=1)
@@ -285,7 +266,7 @@ def _strongest_joints(
     weights: Float32[np.ndarray, "vertices 24"],
 ) -> tuple[UInt8[np.ndarray, "vertices 4"], UInt8[np.ndarray, "vertices 4"]]:
     """Return the strongest joints of each vertex and their weights as integers that sum to 255."""
-    joints = np.argsort(-weights, axis=1, kind="stable")[:, :JOINTS_PER_VERTEX]
+    joints = np.argsort(-weights, axis=1, kind="stable")[:, :4]  # all importers read this many
     strongest = np.take_along_axis(weights, joints, axis=1).astype(np.float64)
     scaled = strongest / strongest.sum(axis=1, keepdims=True) * 255.0
     codes = np.floor(scaled).astype(np.int64)

@@ -23,10 +23,6 @@ ITERATIONS = 8
 """Iterations of least squares."""
 OWN_WEIGHT = 0.3
 """Weight of a Gaussian's own color, in pixels that it fills: what no picture shows stays so."""
-VIEWER_BLUR_PX2 = 0.3
-"""Variance by which viewers widen Gaussians, px² (Mip-Splatting, Yu et al. 2024)."""
-MAX_COSINE = 0.4
-"""Cosine between view and normal from which on a Gaussian lies on the side that is not seen."""
 MAX_SQUARED_DISTANCE = 8.0
 """Squared distance from its center, in variances, at which a Gaussian is cut off."""
 MIN_ALPHA = 1.0 / 512.0
@@ -98,14 +94,14 @@ def _shares_of_pixels(
     slopes[:, :, 2] = -points[:, :2] / depth**2 * camera.focal_px
     slopes = slopes @ (turn @ axes[order])
     shape = slopes @ slopes.transpose(0, 2, 1)
-    wide = shape + VIEWER_BLUR_PX2 * np.eye(2)
+    wide = shape + 0.3 * np.eye(2)  # viewers' (Mip-Splatting, Yu et al. 2024)
     thinner = np.sqrt(np.maximum(np.linalg.det(shape), 0.0) / np.linalg.det(wide))
     peaks = (opacities[order] * thinner).astype(np.float32)
     narrow = np.linalg.inv(wide).astype(np.float32)
     reach = np.ceil(np.sqrt(MAX_SQUARED_DISTANCE * wide[:, [0, 1], [0, 1]].max(axis=1))).astype(int)
     normals = axes[order, :, 2] @ turn.T
     lengths = np.linalg.norm(points, axis=1) * np.linalg.norm(normals, axis=1)
-    seen = np.einsum("va,va->v", points, normals) <= MAX_COSINE * lengths
+    seen = np.einsum("va,va->v", points, normals) <= 0.4 * lengths
     width, height = camera.size_px
     parts = []
     for radius in np.unique(reach):

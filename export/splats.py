@@ -53,12 +53,6 @@ FIRM_DENSITY = 25.0
 MAX_CROSSED_M2 = 3.85
 """Area of the voxels' faces between in and out, square metres, from which on Gaussians lie farther
 apart, as in wide clothes: a `.ply` has at most 12 MB."""
-MIN_SCALE_M = 1e-6
-"""Least standard deviation, where a pose flattens one."""
-SPREAD = 0.6
-"""Standard deviation along the surface, in distances of neighbors: less shows gaps."""
-NEAREST = 6
-"""Neighbors whose mean distance sets a Gaussian's size."""
 COARSE_PIXEL_M = 0.0092
 """Size of a film's pixels on the person for which the shells' depths are chosen, metres."""
 DEPTH_PER_PIXEL = 0.37
@@ -119,7 +113,7 @@ def build_splats(package: AvatarPackage, pose: BodyPose | None) -> GaussianSplat
         positions = np.einsum("vab,vb->va", moved[:, :3, :3], positions) + moved[:, :3, 3]
         axes = moved[:, :3, :3] @ axes
     squares, turned = np.linalg.eigh(axes @ axes.swapaxes(1, 2))
-    scales = np.sqrt(np.maximum(squares, MIN_SCALE_M**2))
+    scales = np.sqrt(np.maximum(squares, 1e-6**2))
     turned[np.linalg.det(turned) < 0.0, :, 2] *= -1.0
     rotations = Rotation.from_matrix(turned).as_quat(canonical=True, scalar_first=True)
     return GaussianSplats(
@@ -136,9 +130,9 @@ def _lay_shell(
 ) -> tuple[np.ndarray, ...]:
     """Positions, axes times standard deviations, colors, opacities and skin of its Gaussians."""
     depth_m = shell.depth_m - rise_m
-    distances = np.asarray(KDTree(mesh.positions).query(mesh.positions, 1 + NEAREST)[0])
+    distances = np.asarray(KDTree(mesh.positions).query(mesh.positions, 7)[0])
     axes = _tangents(mesh.normals)
-    axes[..., :2] *= SPREAD * distances[:, 1:].mean(axis=1)[:, None, None]
+    axes[..., :2] *= 0.6 * distances[:, 1:].mean(axis=1)[:, None, None]  # less shows gaps
     axes[..., 2] *= shell.thickness_m
     positions = mesh.positions - depth_m * mesh.normals.astype(np.float64)
     clear = np.asarray(surface.query(positions)[0]) >= shell.clear_share * depth_m

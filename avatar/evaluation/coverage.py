@@ -23,10 +23,6 @@ from preprocess.body.body_surface import (
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.observation import Observation
 
-EXPECTED_PX = 64
-"""Longer side of the images in which the coverage of poses is found, pixels."""
-MIN_SEEN_COSINE = 0.3
-"""Cosine between normal and view direction below which a patch is not seen (72°)."""
 MIN_WELL_SEEN_COSINE = 0.6
 """Cosine from which a patch is well seen (53°)."""
 PART_NAMES = (
@@ -39,9 +35,6 @@ SIDE_NAMES = ("front", "back", "left", "right", "top", "under")
 """Directions of the patches in the T-pose; `under` is the underside."""
 ARM_PARTS, FOOT_PARTS = slice(8, 14), (5, 6)
 PATCH_M = 0.022
-OCCLUSION_TOLERANCE_M = 0.01
-MAX_SOLE_NORMAL_Y = -0.5
-"""Upward component of a foot's normal below which it is a sole and left out."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -88,8 +81,8 @@ class SkinPatches:
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
         points, parts, sides = mean(shaped.vertices), parts[first], sides[first]
         shown = visible_from_anywhere(
-            points, normals, cell_m=PATCH_M, tolerance_m=OCCLUSION_TOLERANCE_M, min_cosine=0.3
-        ) & ~(np.isin(parts, FOOT_PARTS) & (normals[:, 1] < MAX_SOLE_NORMAL_Y))
+            points, normals, cell_m=PATCH_M, tolerance_m=0.01, min_cosine=0.3
+        ) & ~(np.isin(parts, FOOT_PARTS) & (normals[:, 1] < -0.5))
         return cls(
             points=points[shown],
             normals=normals[shown],
@@ -203,7 +196,7 @@ class Coverage:
         width, height = camera.size_px
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         alpha = observation.alpha[row.clip(0, height - 1), column.clip(0, width - 1)]
-        passed = (cosines > MIN_SEEN_COSINE, inside, free, alpha > MASK_THRESHOLD)
+        passed = (cosines > 0.3, inside, free, alpha > MASK_THRESHOLD)  # 72°
         stages = np.cumprod(passed, axis=0, dtype=np.uint8).sum(axis=0, dtype=np.uint8)
         np.maximum(self.stages, stages, out=self.stages)
         shown = np.where(stages == VisibilityStage.SEEN, cosines, 0.0).astype(np.float32)
@@ -261,7 +254,7 @@ def expected_coverage(shaped: ShapedBody, views: Iterable[tuple[BodyPose, Camera
     """Coverage that frames in these poses will reach, before any frame is read."""
     coverage = Coverage(shaped)
     for pose, camera in views:
-        small = camera.resize_longer_side(EXPECTED_PX)
+        small = camera.resize_longer_side(64)
         width, height = small.size_px
         blank = Frame(index=0, time_s=0.0, rgb=np.zeros((height, width, 3), dtype=np.uint8))
         alpha = np.ones((height, width), dtype=np.float32)
@@ -274,18 +267,10 @@ def _area_share(areas: Float32[np.ndarray, "patches"], seen: Any) -> float:
     return float(areas[seen].sum()) / total if total else 0.0
 
 
-MIN_REGION_SHARE = 0.02
-"""Share of the skin below which an unseen region is not mentioned: one hand is 2.3 %."""
-HEAD_WEIGHT = 2.0
-"""Weight of the head's skin relative to other skin, since viewers look at the face."""
 MIN_UNSEEN_OF_SIDE, MIN_UNSEEN_OF_LIMB = 0.5, 0.75
 """Unseen share from which a limb's side, and a whole limb, are called unseen."""
 TURN_SIDES = ("front", "back", "left", "right")
 """Sides of the whole body, which turning shows."""
-MIN_TOP_NORMAL_Y = 0.6
-"""Upward component of the normals on top of head and shoulders."""
-NEARLY_COMPLETE = 0.95
-"""Share of seen skin from which the capture counts as complete."""
 SEEN_COMPLETELY = "It was seen from all sides."
 SEEN_NEARLY = "Nearly everything was seen; only small pieces are missing."
 """It names no share, which changes with each frame: a page that speaks would begin again."""
@@ -342,7 +327,7 @@ def coverage_advice(coverage: Coverage) -> str:
     region = largest_unseen_region(coverage)
     if region is not None:
         return _advice_sentence(region)
-    return SEEN_COMPLETELY if coverage.seen_share >= NEARLY_COMPLETE else SEEN_NEARLY
+    return SEEN_COMPLETELY if coverage.seen_share >= 0.95 else SEEN_NEARLY
 
 
 def largest_unseen_region(coverage: Coverage) -> UnseenRegion | None:
@@ -361,7 +346,8 @@ def largest_unseen_region(coverage: Coverage) -> UnseenRegion | None:
         stage, side = _main_stage(coverage, where), ALL_AROUND if everything else worst
         if stage in (VisibilityStage.FACING_AWAY, VisibilityStage.SELF_OCCLUDED):
             return UnseenRegion(limb="torso", laterality="", side=side, stage=stage)
-    weights = patches.areas * np.where(patches.parts == PART_NAMES.index("head"), HEAD_WEIGHT, 1.0)
+    # viewers look at the face
+    weights = patches.areas * np.where(patches.parts == PART_NAMES.index("head"), 2.0, 1.0)
     regions: dict[tuple[str, str], dict[str, np.ndarray]] = {}
     for limb, whose, side, where in _limb_sides(patches):
         least = MIN_UNSEEN_OF_LIMB if side == ALL_AROUND else MIN_UNSEEN_OF_SIDE
@@ -372,7 +358,7 @@ def largest_unseen_region(coverage: Coverage) -> UnseenRegion | None:
         for key, halves in regions.items()
     }
     largest = max(sizes, key=sizes.__getitem__, default=None)
-    if largest is None or sizes[largest] < MIN_REGION_SHARE * float(patches.areas.sum()):
+    if largest is None or sizes[largest] < 0.02 * float(patches.areas.sum()):  # a hand: 2.3 %
         return None
     halves = regions[largest]
     return UnseenRegion(
@@ -401,7 +387,7 @@ def _limb_sides(
     for (limb, whose), where in limbs.items():
         yield limb, whose, ALL_AROUND, where
         if not whose:
-            yield limb, whose, "top", where & (patches.normals[:, 1] > MIN_TOP_NORMAL_Y)
+            yield limb, whose, "top", where & (patches.normals[:, 1] > 0.6)
         for k, side in enumerate(SIDE_NAMES):
             if limb in ("leg", "foot") and side in ("left", "right"):
                 side = "outer side" if side == whose else "inner side"

@@ -39,8 +39,6 @@ from preprocess.observation import Observation
 
 Item = TypeVar("Item")
 
-MAX_HELD_OUT = 100
-"""Held-out frames that are kept; bounds the memory of a long video."""
 FRAMES_PER_EVALUATION = 12
 """Held-out frames scored at each point of the learning curve; the end scores them all."""
 
@@ -124,9 +122,7 @@ def score_rendering(
     )
 
 
-def add_held_out(
-    frames: list[HeldOutFrame], frame: HeldOutFrame, *, max_frames: int = MAX_HELD_OUT
-) -> None:
+def add_held_out(frames: list[HeldOutFrame], frame: HeldOutFrame, *, max_frames: int = 100) -> None:
     """Adds a held-out frame at its place, in place; above `max_frames` every second is dropped.
 
     The frames that stay are spread evenly over the stream: once half as many are kept, others are
@@ -167,8 +163,6 @@ OUTER_PIXELS = 96
 """Pixels sampled in the rest of the image."""
 PIXELS_PER_FRAME = INSIDE_PIXELS + BORDER_PIXELS + OUTER_PIXELS
 """Pixels sampled of a frame for the learning curve; all of a smaller stratum."""
-FINE_DENSITY = 8
-"""Density of the samples that final scores come from where whole images would take too long."""
 BORDER_SHARE = 0.035
 """Distance from the mask up to which a pixel is near it, in image heights."""
 
@@ -266,4 +260,4 @@ class PixelSample:
 
 def score_fine_sample(avatar: Avatar, frame: HeldOutFrame) -> HeldOutScore:
     """Scores a frame by 4,096 of its pixels: about 0.1 dB off, and SSIM is not measured."""
-    return PixelSample.of(frame, density=FINE_DENSITY).score(avatar)
+    return PixelSample.of(frame, density=8).score(avatar)

@@ -150,8 +150,6 @@ MIN_OVERLAP = 0.5
 """Overlap below which the image does not show the body of the mask."""
 CALIBRATION_BLURS = (0.0025, 0.005, 0.01, 0.02, 0.04, MAX_MEASURABLE_BLUR)
 """Blurs of the calibration, as shares of the person's height."""
-DOWNSAMPLE_SIGMA_PX = 4.0
-"""Blur from which the image is downsampled first, pixels: faster, and without visible loss."""
 
 
 @runtime_checkable
@@ -251,7 +249,7 @@ def _gaussian_blur(
 ) -> Float32[np.ndarray, "height width 3"]:
     """Gaussian blur with mirrored borders."""
     height, width = picture.shape[:2]
-    factor = int(sigma_px / DOWNSAMPLE_SIGMA_PX)
+    factor = int(sigma_px / 4.0)  # downsampled first: faster, and without visible loss
     if factor < 2:
         return np.asarray(cv2.GaussianBlur(picture, (0, 0), sigma_px))
     small = (max(1, width // factor), max(1, height // factor))

@@ -20,8 +20,6 @@ SIDES = 4
 """Directions from which each pose is seen, evenly around the person."""
 VIEW_PX = (320, 480)
 """Width and height of a view, pixels."""
-PERSON_SHARE = 0.8
-"""Height of the standing person in a view, as a share of its height."""
 DISTANCE_HEIGHTS = 2.5
 """Distance of the camera, in heights of the person."""
 LEFT_HIP, RIGHT_HIP, LEFT_KNEE, RIGHT_KNEE = 0, 1, 3, 4
@@ -67,7 +65,7 @@ def _camera_around(
     forward = -np.array([np.sin(angle), 0.0, np.cos(angle)])
     down = np.array([0.0, -1.0, 0.0])
     axes = np.stack([np.cross(down, forward), down, forward])
-    focal_px = PERSON_SHARE * VIEW_PX[1] * distance_m / height_m
+    focal_px = 0.8 * VIEW_PX[1] * distance_m / height_m  # the person fills 0.8 of the height
     return Camera.at(target - distance_m * forward, axes, focal_px, VIEW_PX)
 
 

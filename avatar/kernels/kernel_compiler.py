@@ -20,8 +20,6 @@ from numba.extending import intrinsic, models, register_model
 
 FAST_MATH: dict[str, Any] = {"fastmath": True, "error_model": "numpy", "nogil": True}
 """Kernel options: sums may be reordered, division by zero does not raise, the GIL is released."""
-CALLEE_FOLDER = Path(__file__).resolve().parent
-"""Folder whose kernels and constants kernels in any folder may use."""
 NO_ALLOCATION: dict[str, Any] = {**FAST_MATH, "_nrt": False}
 """Kernel options without allocation: arrays are not reference-counted. The counting is atomic and
 takes half of the time where arrays pass from one small kernel to the next."""
@@ -64,7 +62,8 @@ def compile_kernel(
 def _source_digest(folder: Path) -> str:
     """Digest of every source that a kernel in a folder may be compiled from."""
     digest = hashlib.sha256()
-    for path in sorted({*folder.glob("*.py"), *CALLEE_FOLDER.glob("*.py")}):
+    # kernels in any folder may use those of this one
+    for path in sorted({*folder.glob("*.py"), *Path(__file__).resolve().parent.glob("*.py")}):
         digest.update(path.name.encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()
 

@@ -45,8 +45,6 @@ MIN_SECOND_ORDER_M = 5e-4
 """Deviation from an affine warp, at a cell's faces, from which the cell is bent, metres."""
 SEARCH_MARGIN_M = 0.03
 """Margin about the band within which roots are searched, metres."""
-MAX_PREDICTED_OVERSHOOT_M = 0.015
-"""Distance beyond the band from which a predicted root is not searched, metres."""
 
 
 def solve_correspondences(rig, bones, band_m, cell_m):
@@ -134,7 +132,7 @@ def _search_root(
     if _is_known_root(chains[flat], following, found, x[0], x[1], x[2]):
         return total
     off = _skin_distance(x[0], x[1], x[2], distance, low, cells_per_m)
-    if off > band_m + F32(MAX_PREDICTED_OVERSHOOT_M):
+    if off > band_m + F32(0.015):  # metres
         return total
     p[0] = grid_low[0] + (F32(i) + F32(0.5)) * cell_m
     p[1] = grid_low[1] + (F32(j) + F32(0.5)) * cell_m
@@ -271,10 +269,6 @@ def pack_roots(chains, following, found, bent, index):
     return roots
 
 
-CELL_SCALE_MARGIN = 1.001
-"""Factor by which a cell is enlarged, so that samples on its walls are inside."""
-
-
 @compile_kernel(**INLINED)
 def _cell_span(root, across, low, per_m, cells):
     """First and last canonical cell, on one axis, that a cell's image reaches."""
@@ -317,7 +311,7 @@ def cull_cells(packed_cells, roots, cell_m, occupied, low, cells_per_m, culled_c
     A cell's warp is affine, or of second order in bent cells, so that a box bounds the image of all
     its samples; none is lost.
     """
-    half = F32(0.5 * CELL_SCALE_MARGIN) * cell_m
+    half = F32(0.5 * 1.001) * cell_m  # samples on its walls are inside
     nx, ny, nz = occupied.shape
     for cell in range(packed_cells.shape[0]):
         packed = packed_cells[cell]

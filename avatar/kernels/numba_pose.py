@@ -31,14 +31,9 @@ MAX_ROOT_STEP_M = 0.05
 """A root never moves farther than this at once: where the chord is longer the warp has a fold."""
 ROOTS_AHEAD = 8
 """Cells between one whose root moves and the one whose weights are fetched meanwhile."""
-MIN_PULL_SHARE = 1e-3
-"""Pull on a sample, as a share of its ray's strongest, up to which it is left out."""
 PADDED = 80
 """Length of a row of 75 numbers that is a multiple of a register's; the last five are zero."""
 JOINTS = 24
-MIN_RIDGE = 1e-6
-"""Least stiffness, as a share of the largest curvature. Below, where one ray outweighs all others,
-sums in single precision are not positive definite."""
 
 
 @compile_kernel(**INLINED)
@@ -97,7 +92,7 @@ def write_wrenches(
             strongest = max(strongest, a * a + b * b + c * c)
         for i in range(first[ray], first[ray] + count[ray]):
             a, b, c = grad_points[i, 0], grad_points[i, 1], grad_points[i, 2]
-            if a * a + b * b + c * c <= F32(MIN_PULL_SHARE**2) * strongest:
+            if a * a + b * b + c * c <= F32(1e-3**2) * strongest:
                 continue
             n = rows[i]
             # force at the posed point: f = Aᵀ g, with A = J⁻¹ at the cell's center
@@ -355,7 +350,8 @@ def solve_with_prior(curvature, gradient, stiffness, back, factor, found):
     """
     n, ridge = found.shape[0], stiffness
     for i in range(n):
-        ridge = max(ridge, MIN_RIDGE * curvature[i, i])
+        # below, where one ray outweighs all others, float32 sums are not positive definite
+        ridge = max(ridge, 1e-6 * curvature[i, i])
     # L Lᵀ = curvature + ridge, and L y = gradient + stiffness back
     for i in range(n):
         for j in range(i + 1):

@@ -21,16 +21,10 @@ from avatar.kernels.operands import MAX_LOG_DENSITY
 F32, U32 = np.float32, np.uint32
 OPACITY_LENGTH_M = 0.01
 """Length over which opacity is measured, metres."""
-MIN_OPACITY = 1e-6
-"""Opacity below which the interior loss's logarithm is clamped."""
 MAX_USEFUL_LOG_DENSITY = 6.0
 """Log density above which density is excess (400 per metre: opacity 0.5 in two millimetres)."""
-EXCESS_DENSITY_FACTOR = 0.4
-"""Weight of excess density relative to the slope penalty."""
 SOURCE_STEEPNESS = 3.0
 """Factor of a source's opacity about one half."""
-VISIBLE_LOG_DENSITY = 2.0
-"""Log density from which one point of a pair makes the pair's colors visible."""
 
 
 @compile_kernel(**INLINED)
@@ -72,7 +66,7 @@ def interior(raw, weight, grad):
     share = weight / F32(max(raw.shape[0], 1))
     for i in range(raw.shape[0]):
         value, slope = _opacity(raw[i, 3])
-        grad[i, 3] -= share * slope / max(value, F32(MIN_OPACITY))
+        grad[i, 3] -= share * slope / max(value, F32(1e-6))
 
 
 @compile_kernel(**FAST_MATH)
@@ -131,7 +125,7 @@ def density_slope(raw, points, max_slope_per_m, weight, grad):
     """
     count = raw.shape[0] // 2
     share = weight / F32(max(count, 1))
-    excess = weight * F32(EXCESS_DENSITY_FACTOR) / F32(max(2 * count, 1))
+    excess = weight * F32(0.4) / F32(max(2 * count, 1))
     for i in range(count):
         one, other, square = raw[i, 3], raw[count + i, 3], F32(0)
         for axis in range(3):
@@ -152,7 +146,7 @@ def color_tv(raw, weight, grad):
     count = raw.shape[0] // 2
     share = weight / F32(max(count, 1))
     for i in range(count):
-        if max(raw[i, 3], raw[count + i, 3]) <= F32(VISIBLE_LOG_DENSITY):
+        if max(raw[i, 3], raw[count + i, 3]) <= F32(2.0):  # both invisible
             continue
         for q in range(3):
             one, other = _sigmoid(raw[i, q]), _sigmoid(raw[count + i, q])

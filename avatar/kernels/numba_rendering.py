@@ -22,8 +22,6 @@ ALPHA_DEAD_ZONE = 1e-3
 """Error of alpha up to which the L1 loss on alpha is zero."""
 OPAQUE_DEPTH = 12.0
 """Optical depth, by cached densities, at which a training ray counts as opaque."""
-UNLIMITED_STEPS = 10**9
-"""Opaque margin, in samples, from which a ray does not end at a surface (exact rendering)."""
 RAYS_PER_BLOCK = 16
 """Training rays whose cells are fetched before any of them is marched; they fit the first cache."""
 
@@ -153,7 +151,7 @@ def _march_block(
     """Marches the rays of a block, whose samples lie one after the other from its place on."""
     place = np.int64(block) * RAYS_PER_BLOCK * most_samples
     most = U32(most_samples)
-    ends = opaque_margin_steps < UNLIMITED_STEPS
+    ends = opaque_margin_steps < 10**9  # else exact rendering
     steps_a_m = F32(1) / sample_step_m
     first = block * RAYS_PER_BLOCK
     last = min(first + RAYS_PER_BLOCK, origins.shape[0])

@@ -53,8 +53,6 @@ from avatar.kernels.threads import run_blocks, run_threads
 from avatar.rig import Rig
 
 _SCRATCH = threading.local()
-MAX_REUSED_SAMPLES = 1 << 20
-"""Room for more samples than this is given back at once."""
 
 
 def field_forward(
@@ -289,7 +287,7 @@ def _scratch_samples(
     room = getattr(_SCRATCH, "room", None)
     if room is None or len(room[1]) < most:
         room = np.empty((most, 3), dtype=np.float32), np.empty(most, dtype=np.int32)
-        _SCRATCH.room = room if most <= MAX_REUSED_SAMPLES else None
+        _SCRATCH.room = room if most <= 1 << 20 else None  # more is given back
     return room
 
 

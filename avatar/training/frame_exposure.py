@@ -25,12 +25,6 @@ MIN_PERSON_ALPHA = 0.5
 """Alpha, in the frame and in the rendering, above which a ray counts."""
 MEMORY_RAYS = 1000.0
 """Rays of a frame after which an earlier one weighs 1/e, because the field has changed since."""
-INITIAL_RAYS = 50.0
-"""Rays that a frame's initial gains are worth."""
-INITIAL_COLOR = 0.4
-"""Color of these rays."""
-CONSTANT_EXPOSURE_ERROR = 0.015
-"""Standard deviation of the log gains that are found where exposure is constant."""
 MAX_FRAME_GAP = 30
 """Distance in frames from which a neighbor's gains are no guess."""
 
@@ -76,7 +70,7 @@ class FrameExposures:
         gain = self.expected_gain(frame) if gain is None else gain
         self._frames[slot : slot + 1] = [frame]
         self.gains[slot] = torch.from_numpy(gain)
-        self._rendered[slot] = INITIAL_RAYS * INITIAL_COLOR
+        self._rendered[slot] = 50.0 * 0.4  # initial gains are worth 50 rays of this color
         self._pixels[slot] = self._rendered[slot] * gain
 
     def neutralize(self, batch: TrainingBatch) -> TrainingBatch:
@@ -131,6 +125,7 @@ def _update_gains(slots, target, rendered, avatar_frozen, pixels, renderings, ga
             for slot in range(held):
                 power += (log_gains[slot] - mean) ** 2 / held
             # James and Stein's shrinkage: differences no larger than their error are not believed
-            kept = max(1.0 - CONSTANT_EXPOSURE_ERROR**2 / power, 0.0)
+            # their error: the deviation of log gains where exposure is constant
+            kept = max(1.0 - 0.015**2 / power, 0.0)
         for slot in range(held):
             gains[slot, q] = math.exp(kept * (log_gains[slot] - mean))

@@ -18,17 +18,10 @@ from avatar.training.replay_buffer import ReplayBuffer
 from avatar.training.trainer import Trainer, correct_poses, cosine_decay, resolve_correspondences
 from avatar.training.training_step import OccupancySampler, compute_gradients
 
-COMPARED_DENSITY = 2
-"""Density of the pixels by which the given pose and the fitted one are compared."""
 CORRECTIONS_PER_FRAME = 12
 """Corrections of each frame's pose."""
 RAYS_PER_CORRECTION = 4096
 """Rays per correction of a pose: few corrections by many rays end nearer than many by few."""
-PRIOR_PRECISION = 0.25
-"""Precision of the given poses relative to that in training; the avatar is frozen."""
-COARSE_SHARE = 0.5
-"""Share of the corrections that follow the coarse levels of the hash grid alone; then poses are so
-near that the finer ones, which do not change any more, point to the right place, too."""
 FITTING_SHARE = 0.8
 """Share of fitting in the time that fitting and scoring take, for the progress."""
 
@@ -62,7 +55,7 @@ def fit_test_poses(
 
 def _choose(avatar: Avatar, given: HeldOutFrame, moved: HeldOutFrame) -> HeldOutFrame:
     """The frame as given, in the other's exposure, or moved: where its pixels score best."""
-    sample = PixelSample.of(given, density=COMPARED_DENSITY)
+    sample = PixelSample.of(given, density=2)
     colors = sample.render_colors(avatar)
     options = [
         (given, colors),
@@ -93,7 +86,7 @@ def _fit_frames(
     generator = torch.Generator().manual_seed(config.seed)
     steps = math.ceil(CORRECTIONS_PER_FRAME * len(replay) / at_once)
     for step in range(steps):
-        if step >= COARSE_SHARE * steps:
+        if step >= 0.5 * steps:  # so near now that the finer levels point to the right place, too
             poses.min_gradient_cell_m = 0.0
         batch = replay.sample_rays(config.rays, generator)
         result = compute_gradients(
@@ -116,7 +109,7 @@ def _with_neighboring_corrections(
         len(frames),
         poses_may_be_exact=False,
         rays_per_frame=RAYS_PER_CORRECTION,
-        prior_precision=PRIOR_PRECISION,
+        prior_precision=0.25,  # the avatar is frozen
         equation_decay=0.0,
     )
     for frame in frames:

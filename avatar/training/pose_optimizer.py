@@ -31,32 +31,16 @@ from avatar.training.pose_correction import (
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import body_from_rest, rotation_matrices
 
-MAX_RAYS_PER_FRAME = 512
-"""Rays per frame that are accumulated until its pose is corrected."""
-MIN_RAYS_SHARE = 0.5
-"""Share of these rays from which its pose may be corrected."""
-EQUATION_DECAY = 0.85
-"""Factor of an estimated pose's earlier normal equations at each of its corrections: about seven
-corrections count. The noise of 512 rays alone is as large as the error that is left."""
 MIN_POSE_GRADIENT_CELL_M = 0.0105
 """Smallest cells of the hash levels whose gradient reaches the poses, metres. Finer levels point to
 the right place from a few millimetres away only, and win nothing; without those below 37 mm poses
 drift in long trainings, which costs 2 dB in new poses."""
 EVIDENCE_EMA_DECAY = 0.95
 """Decay of the mean evidence and of the share of corrections that moved a pose."""
-MAX_CORRECTION_INTERVAL = 8
-"""Steps between pose gradients where poses are exact."""
 MAX_ESTIMATED_INTERVAL = 4
 """Most steps between pose gradients of estimated poses, when steps are short."""
-MAX_JOINT_STEP_M = 0.04
-"""Largest motion of a joint in one correction, metres; the roots must be able to follow it."""
 RESOLVE_DISTANCE_M = 0.08
 """Motion of a joint after which the frame's correspondences are solved again, metres."""
-STEP_DAMPING = 0.5
-"""Factor of the Gauss-Newton steps of poses that may be exact. Gradients are up to fifty steps old,
-and steps too long turn the field to fog; estimated poses gain more from whole steps, though."""
-MEAN_CORRECTION_DECAY = 0.2
-"""Share of the mean correction that is removed, at each correction of a pose that may be exact."""
 FIRST_CORRECTION_STEPS = 60
 """Training steps on a frame before its pose is first corrected. Earlier the field does not know the
 view, and new content looks like a pose error."""
@@ -70,8 +54,6 @@ Otherwise noise would move it, the motion would blur the field, and the blurred 
 next pose: at 540 px this diverged after three thousand steps."""
 FREEZE_AFTER_STEPS = 3000
 """Training steps on a frame after which its pose is frozen; by then the field has memorised it."""
-MAX_CORRECTION = 0.35
-"""Largest correction of a parameter, radians or metres; a pose farther off cannot be recovered."""
 
 
 class RootCorrection(NamedTuple):
@@ -104,9 +86,9 @@ class PoseOptimizer:
         capacity: int,
         *,
         poses_may_be_exact: bool = True,
-        rays_per_frame: int = MAX_RAYS_PER_FRAME,
+        rays_per_frame: int = 512,
         prior_precision: float = 1.0,
-        equation_decay: float = EQUATION_DECAY,
+        equation_decay: float = 0.85,  # the noise of 512 rays alone is as large as what is left
     ) -> None:
         """Starts without poses.
 
@@ -233,7 +215,7 @@ class PoseOptimizer:
         Returns its slot, or None if no frame has enough rays or the pose does not move.
         """
         slot = int(self._rays.counts.argmax())
-        if self._rays.counts[slot] < MIN_RAYS_SHARE * self._rays_per_frame:
+        if self._rays.counts[slot] < 0.5 * self._rays_per_frame:
             return None
         evidence = self._evidence if self.poses_may_be_exact else math.inf
         prior = self._temporal_prior.prior_for(slot, self.corrections)
@@ -255,8 +237,10 @@ class PoseOptimizer:
         change *= rate
         if moves and self.poses_may_be_exact:
             mean = self.corrections[self._is_held].mean(axis=0)
-            change *= STEP_DAMPING
-            change -= MEAN_CORRECTION_DECAY * mean
+            # gradients are up to fifty steps old, and steps too long turn the field to fog;
+            # estimated poses gain more from whole steps, though
+            change *= 0.5
+            change -= 0.2 * mean
         if moves:
             self._move_pose(slot, change)
         self._rays.fade(slot, change, self._equation_decay)
@@ -265,7 +249,7 @@ class PoseOptimizer:
     def correction_interval(self, rate: float) -> int:
         """Steps between pose gradients: more where poses prove to be exact, or steps are short."""
         if self.poses_may_be_exact:
-            return min(max(round(0.5 / max(self._moved_share, 1e-3)), 1), MAX_CORRECTION_INTERVAL)
+            return min(max(round(0.5 / max(self._moved_share, 1e-3)), 1), 8)
         return min(max(round(0.5 / max(rate, 1e-3)), 1), MAX_ESTIMATED_INTERVAL)
 
     def needs_resolve(self, slot: int) -> bool:
@@ -288,7 +272,8 @@ class PoseOptimizer:
         """Changes a correction as far as the frame's roots can follow; writes how far it did."""
         turns, places, root_turns = self._joints
         move_pose(
-            self.corrections[slot], change, MAX_CORRECTION, MAX_JOINT_STEP_M,
+            # at most 0.35 rad or m, else it cannot be recovered; a step of 4 cm: roots must follow
+            self.corrections[slot], change, 0.35, 0.04,
             self._given_turns[slot], self.rig.rest_joints, self._parents,
             self._rest_from_canonical, turns[slot], places[slot], self.bones.numpy()[slot],
             root_turns[slot],

@@ -36,9 +36,6 @@ MAX_HEAD_RAY_SHARE = 0.35
 """Largest share of these rays."""
 PICTURES = 2
 """Images of a slot: the whole frame, and the head in the video's own resolution."""
-DRAWS_PER_RAY = 5
-"""Random numbers that decide a ray: its frame, near the person or not, its pixel, the head or not,
-where its samples begin."""
 F32, I32 = np.float32, np.int32
 SIGHT_SPACING_PX = 8
 """Distance of the pixels whose directions are kept, px; others are interpolated: exact but for
@@ -164,7 +161,8 @@ class ReplayBuffer:
 
     def sample_rays(self, count: int, generator: torch.Generator) -> TrainingBatch:
         """Draws rays from the kept frames."""
-        chances = torch.rand(DRAWS_PER_RAY, count, generator=generator)
+        # its frame, near the person or not, its pixel, the head or not, where its samples begin
+        chances = torch.rand(5, count, generator=generator)
         slots = np.empty(count, dtype=np.int32)
         origins, directions = np.empty((2, count, 3), dtype=np.float32)
         targets = np.empty((count, 4), dtype=np.float32)

@@ -51,8 +51,6 @@ from capture.inbox import Inbox
 from preprocess.body.body_pose import BodyPose
 from preprocess.observation import DroppedFrame
 
-READING_FIRST_AFTER_SHARE = 0.5
-"""Share of the time budget after which reading the video takes precedence over training."""
 MIN_STEPS_AFTER_LAST_FRAME = 20
 """Fewest steps after the last frame, whose rays are drawn first."""
 STREAMING_RATE_FACTOR = 0.5
@@ -61,8 +59,6 @@ swings of the parameters leave their mean closer to the optimum."""
 CLOSING_S = 2.0
 """Time after the last frame of a paced source in which rates fall and surfaces become firm,
 seconds: a user waits."""
-PRESENTABLE_PROGRESS = 0.5
-"""Share of that time, or of the steps that are left, after which the avatar can be shown."""
 LATE_FRAMES_S = 0.5
 """Time for which frames are learnt that come while rates are falling, seconds."""
 LEAST_STEPS = 250
@@ -207,7 +203,7 @@ class _FrameIntake:
     def is_presentable(self, now: float) -> bool:
         """True once, where a user waits for the avatar of a paced source."""
         waits = self._inbox.paced and self.is_closing and not self._was_presentable
-        self._was_presentable |= waits and self.progress(now) >= PRESENTABLE_PROGRESS
+        self._was_presentable |= waits and self.progress(now) >= 0.5
         return waits and self._was_presentable
 
     def receive(self, now: float) -> Iterator[FrameArrived | FrameLeftOut]:
@@ -266,7 +262,7 @@ class _FrameIntake:
         if self._one_frame_per_step:
             return False
         began, end = self._began, self._trainer.config.seconds
-        late = now > began + READING_FIRST_AFTER_SHARE * (end - began)
+        late = now > began + 0.5 * (end - began)
         return late and not (self.ended or self._inbox.paced)
 
     def is_done(self, now: float) -> bool:

@@ -40,8 +40,6 @@ from avatar.training.unseen_skin import UnseenSkin
 
 EMA_HORIZON_STEPS = 250
 """Steps that the mean averages over; a longer horizon shows new content later."""
-MAX_HORIZON_SHARE = 1 / 5
-"""Largest horizon as a share of all steps so far, since the first steps were fog."""
 EMA_INTERVAL = 16
 """Steps between updates of the mean."""
 
@@ -55,7 +53,8 @@ def update_ema(average: RadianceField, field: RadianceField, steps: int) -> None
     """Updates the exponential mean of a field, in place, every `EMA_INTERVAL` steps."""
     if steps % EMA_INTERVAL and steps > EMA_INTERVAL:
         return
-    share = min(1.0, EMA_INTERVAL / min(EMA_HORIZON_STEPS, max(steps * MAX_HORIZON_SHARE, 1.0)))
+    # the first steps were fog
+    share = min(1.0, EMA_INTERVAL / min(EMA_HORIZON_STEPS, max(steps * 0.2, 1.0)))
     operations.move_toward(average.parameters(), field.parameters(), share)
 
 
@@ -123,12 +122,6 @@ def _memory_of(optimizer: UncompiledAdam, parameter: torch.nn.Parameter) -> Para
 
 NETWORK_RATE_FACTOR = 0.3
 """The network's learning rate as a share of the table's."""
-INITIAL_OCCUPANCY_STEPS = 300
-"""Initial steps in which fog clears: the occupancy is probed more often and decays faster."""
-SOURCE_INTERVAL = 64
-"""Steps after which new frames change the sources of unseen skin."""
-CORRECTIONS_PER_STEP = 2
-"""Pose corrections that one training step may make."""
 
 
 @final
@@ -242,7 +235,7 @@ class Trainer:
             detail_share: Progress from coarse samples along rays to fine ones, in [0, 1].
         """
         config, field = self._config_at(detail_share), self.field
-        if self.steps % SOURCE_INTERVAL == 0:
+        if self.steps % 64 == 0:
             has_new_frames = self.unseen.update()
             if has_new_frames and config.head_interior_weight:
                 face = self.unseen.face_cells(config.pose_uncertainty)
@@ -295,12 +288,12 @@ class Trainer:
             self.pose_corrections = {i: c for i, c in self.pose_corrections.items() if i in kept}
 
     def _correct_poses(self, rate: float) -> None:
-        for slot in correct_poses(self.replay, self.poses, CORRECTIONS_PER_STEP, rate=rate):
+        for slot in correct_poses(self.replay, self.poses, 2, rate=rate):
             correction = self.poses.corrections[slot].copy()
             self.pose_corrections[self.replay.frame_indices[slot]] = correction
 
     def _update_occupancy(self, surface_share: float) -> None:
-        clearing = self.steps < INITIAL_OCCUPANCY_STEPS
+        clearing = self.steps < 300
         self.avatar.occupancy.update(
             lambda points: self.field.raw_outputs_at(points)[:, 3],
             share=0.5 if clearing else 0.25,

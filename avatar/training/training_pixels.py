@@ -19,15 +19,6 @@ from preprocess.body.kinematics import HEAD_JOINT, body_from_rest
 from preprocess.masks.matting import person_colors
 from preprocess.observation import Observation
 
-NEAR_MASK_SHARE = 0.035
-"""Distance from the mask within which pixels are near the person, in image heights."""
-BOX_MARGIN_SHARE = 0.04
-"""Margin of the training pixels around the near ones, in image heights."""
-HEAD_UP_M = 0.08
-"""Distance of the head's middle above that joint, metres."""
-EDGE_VARIANCE = 100.0
-"""Variance of colors in 8 bits above which the enlarged mask follows an edge."""
-
 
 class RayView(NamedTuple):
     """Camera of a training frame, and the mask of the pixels near the person, packed in bits."""
@@ -111,14 +102,14 @@ def premultiplied_rgba(
 
 def near_person_mask(alpha: AlphaMask) -> Bool[np.ndarray, "height width"]:
     """The pixels near the person."""
-    kernel = np.ones((max(5, int(NEAR_MASK_SHARE * len(alpha)) | 1),) * 2, dtype=np.uint8)
+    kernel = np.ones((max(5, int(0.035 * len(alpha)) | 1),) * 2, dtype=np.uint8)
     return cv2.dilate((alpha > 0).astype(np.uint8), kernel) > 0
 
 
 def around_person(near: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
     """The pixels in a box around those near the person."""
     rows, columns = np.flatnonzero(near.any(axis=1)), np.flatnonzero(near.any(axis=0))
-    margin = int(BOX_MARGIN_SHARE * len(near))
+    margin = int(0.04 * len(near))
     box = np.zeros_like(near)
     box[
         max(0, rows[0] - margin) : rows[-1] + margin + 1,
@@ -172,7 +163,7 @@ def picture_head(observation: Observation, rig: Rig) -> TrainingPixels | None:
         return None
     large, pixels = enlarge(alpha, cv2.INTER_LINEAR), round(float(1.0 / step.min()))
     if pixels > 1:  # as many of the picture lie across one of the mask
-        large = cv2.ximgproc.guidedFilter(part, large, pixels, EDGE_VARIANCE)
+        large = cv2.ximgproc.guidedFilter(part, large, pixels, 100.0)  # variance at an edge
     large = np.clip(large, 0.0, 1.0)
     if observation.frame.alpha is None:  # an image that is cut out shows the person alone
         part = person_colors(part, large)
@@ -189,7 +180,7 @@ def head_pixels(view: RayView, colors: UInt8[np.ndarray, "near 4"]) -> TrainingP
 def head_box(camera: Camera, pose: BodyPose, rig: Rig) -> tuple[int, int, int, int]:
     """Left, upper, right and lower border of the head in the image, pixels."""
     head = body_from_rest(rig.rest_joints, rig.parents, pose.joint_rotations)[HEAD_JOINT]
-    middle = rig.rest_joints[HEAD_JOINT] + np.array([0.0, HEAD_UP_M, 0.0])
+    middle = rig.rest_joints[HEAD_JOINT] + np.array([0.0, 0.08, 0.0])  # metres, above the joint
     placed = camera.camera_from_world @ rig.world_from_body(pose) @ head @ np.append(middle, 1.0)
     if placed[2] < 0.5 * HEAD_SIDE_M:
         return 0, 0, 0, 0

@@ -52,53 +52,16 @@ HEAD, FEET = HEAD_PART, (5, 6)
 NECKLINE_SLOPE, NECKLINE_REACH = 0.4, 0.4
 """Slope by which a neckline falls from back to front at the neck's base (22°), and the share of the
 torso's height below the neck over which the slope falls to 0."""
-MIRROR_COST_M = 0.03
-"""Cost of the mirrored side, as a distance around the limb, metres."""
-REVERSE_COST_M = 0.08
-"""Cost of the limb's other face, metres."""
-FACE_COST_M = 1.0
-"""Cost of a face as the source of anything but a face, metres."""
-OBLIQUE_COST_M = 0.2
-"""Cost of a source that is seen at a right angle to its normal, metres."""
-RARE_COST_M = 0.1
-"""Cost of a source around the limb whose color is e times rarer at the outline, metres."""
-LEVEL_FACTOR = 3.0
-"""Factor, beside that of lengths along the bone, by which such a source keeps its height."""
 ROW_M, COLOR_SPREAD, LEAST_SHARE = 0.08, 0.12, 0.02
 """Standard deviations of height along the bone, metres, and of color within which patches are
 compared, and the least share of a color at the outline."""
-ALONG_BONE_FACTOR = 4.0
-"""Factor of lengths along the bone; none of the head, whose hair comes from above."""
-NECK_SHARE = 0.3
-"""Height of the neck's upper end, share of the head's height."""
-HAIRLINE_SHARES = 0.7, 0.92
-"""Heights from which hair covers the head's sides and the middle of its front, shares of its
-height."""
-HAIRLINE_WIDTH = 0.2
-"""Height below the hairline over which a face begins, share of the head's height."""
 EARS_BACK_SHARE, THROAT_BACK_SHARE = 0.33, 0.5
 """Where ears and throat end, shares of the head's depth from its back."""
-UPWARD_FACTOR = 3.0
-"""Factor of the height by which a source lies below its patch on a head: hair hangs down."""
-MAX_COST_M = 0.6
-"""Cost from which a source counts nothing, metres; its weight falls from half of it on."""
-MIN_SOURCE_SEEN = 0.5
-"""Degree to which a source must have been seen."""
 NEAR_SKIN_M = 0.025
 """Distance from the skin within which most surfaces lie, metres."""
-NEAR_SKIN_FACTOR = 4
-"""Factor by which points that near are drawn more often than others."""
-NEIGHBOR_M = 0.06
-"""Distance within which patches must be unseen, too: rays see the space around a lone one, such as
-the fold of an ear, and know it to be empty."""
 MIN_WEIGHT = 0.02
 """Weight below which a patch is left to its rays."""
 
-FACE_REACH_M = 0.008
-"""Distance from the body's skin within which a face of unknown depth lies, metres; one of known
-depth lies within the clothing band."""
-FACE_THICKNESS_M = 0.005, 0.03
-"""Depths under that skin between which it is solid, metres."""
 
 STEPS_PER_DRAW = 64
 """Steps whose pairs are drawn at once, which takes a tenth of the time."""
@@ -114,11 +77,6 @@ which it counts as seen (66°)."""
 BORDER_PX = 0.5, 3.0
 """Distances from the person's outline up to which a pixel shows the background's color, and from
 which the skin's alone: a video has one color for each 2 x 2 pixels, and smears it."""
-LIMB_MARGIN_CELLS = 1
-"""Cells of 3 cm around a limb in which clothes and errors of the pose may hide what is behind."""
-SEEN_FRAME_SHARE = 0.03
-"""Share of the frames that must show a patch squarely for it to count as seen in full: in a few
-frames a tracker may turn the person round."""
 DEPTH_UNKNOWN_SPREAD, DEPTH_KNOWN_SPREAD = 0.3, 0.8
 """Standard deviations of the directions from which a patch was seen, up to which its depth counts
 as unknown, and from which as known, radians: about those of a sixth of a turn, and of a whole."""
@@ -164,7 +122,8 @@ class SkinEvidence:
         if depths.min() <= 0.0:  # a person behind the camera is not in the image either
             return
         plane = in_camera[:, :2] / depths[:, None] * depths.mean()
-        shown = visible_points(plane, depths, cosines, margin_cells=LIMB_MARGIN_CELLS)
+        # a cell around a limb: clothes and errors of the pose may hide what is behind
+        shown = visible_points(plane, depths, cosines, margin_cells=1)
         within, colors = _pixels_of(in_camera, frame)
         shown &= within > 0.0
         cosines = cosines * _smooth_step(within, *BORDER_PX)
@@ -183,7 +142,8 @@ class SkinEvidence:
         """Degree to which each patch was seen, in [0, 1]: smooth steps of its cosine and share."""
         shares = self.seen_frames / max(self.frame_count, 1)
         squarely = _smooth_step(self.cosines, UNSEEN_COSINE, SEEN_COSINE)
-        return squarely * _smooth_step(shares, 0.0, SEEN_FRAME_SHARE)
+        # of all frames: in a few a tracker may turn the person round
+        return squarely * _smooth_step(shares, 0.0, 0.03)
 
     @property
     def colors(self) -> Float32[np.ndarray, "seeds 3"]:
@@ -310,7 +270,8 @@ class UnseenSkin:
         self._cells, self._shape = rig.clothing_cells, rig.skin_distance.shape
         self._seed_of_cell = np.full(rig.skin_distance.size, -1, dtype=np.int32)
         self._seed_of_cell[self._cells] = rig.seed_of_clothing_cell
-        one, other = KDTree(rig.seeds).query_pairs(NEIGHBOR_M, output_type="ndarray").T
+        # rays see the space around a lone patch, as the fold of an ear, and know it to be empty
+        one, other = KDTree(rig.seeds).query_pairs(0.06, output_type="ndarray").T
         links = np.concatenate([one, other]), np.concatenate([other, one])
         shape = (len(rig.seeds), len(rig.seeds))
         self._neighbors = coo_array((np.ones(len(links[0])), links), shape=shape).tocsr()
@@ -337,7 +298,7 @@ class UnseenSkin:
         weights = self.sources.weight[self._seed_of_cell[self._cells]]
         drawn = self._cells[weights > MIN_WEIGHT]
         near = drawn[self._rig.skin_distance.reshape(-1)[drawn] < NEAR_SKIN_M]
-        self._drawn_from = np.concatenate([drawn, *[near] * (NEAR_SKIN_FACTOR - 1)])
+        self._drawn_from = np.concatenate([drawn, *[near] * 3])  # those four times as often
         self._unseen_share = len(drawn) / len(self._cells)
         self._is_stale, self._steps = False, 0
         return True
@@ -351,8 +312,8 @@ class UnseenSkin:
         unknown = (strength * _faces(self._frames, rig) * (1.0 - self.evidence.depth_known))[seed]
         distance = rig.skin_distance.reshape(-1)[self._cells]
         is_inside = rig.inside_skin.reshape(-1)[self._cells]
-        reach = CLOTHING_BAND_M + (FACE_REACH_M - CLOTHING_BAND_M) * unknown
-        least, most = FACE_THICKNESS_M
+        reach = CLOTHING_BAND_M + (0.008 - CLOTHING_BAND_M) * unknown
+        least, most = 0.005, 0.03  # metres
         is_solid = is_inside & (least < distance) & (distance < most * unknown)
         return FaceCells(
             torch.from_numpy(self._cells[~is_inside & (distance > reach)]),
@@ -471,16 +432,17 @@ def find_sources(rig: Rig, frames: _BoneFrames, evidence: SkinEvidence, middle_x
     kind, around = np.zeros(len(parts), dtype=np.int64), np.full(len(parts), -1, dtype=np.int64)
     face = _faces(frames, rig)
     rarity = _rarity_at_outline(rig, frames, evidence)
-    sources = np.flatnonzero(seen > MIN_SOURCE_SEEN)
+    sources = np.flatnonzero(seen > 0.5)
     for reflection in range(4):
         places = reflect(
             frames, rig.seeds[sources], parts[sources], np.full(len(sources), reflection), middle_x
         )
         landed = MIRRORED_PART[parts[sources]] if reflection & 1 else parts[sources]
-        extra = MIRROR_COST_M * (reflection & 1) + REVERSE_COST_M * (reflection >> 1)
+        # costs in metres around the limb: the mirrored side, the limb's other face, an oblique view
+        extra = 0.03 * (reflection & 1) + 0.08 * (reflection >> 1)
         # hair comes from the crown, which a level camera sees obliquely
         clean = np.where(parts[sources] == HEAD, seen[sources], evidence.cosines[sources])
-        extra = extra + OBLIQUE_COST_M * (1.0 - clean)
+        extra = extra + 0.2 * (1.0 - clean)
         for part in range(len(BONE_OF_PART)):
             here = np.flatnonzero((parts == part) & (seen < 1.0))
             there = np.flatnonzero(landed == part)
@@ -491,14 +453,14 @@ def find_sources(rig: Rig, frames: _BoneFrames, evidence: SkinEvidence, middle_x
             # one array of threes would be slower: sums along its short axis
             away = [np.subtract.outer(to[:, k], come[:, k]) for k in range(3)]
             if part == HEAD:
-                away[2] *= np.where(away[2] > 0.0, UPWARD_FACTOR, 1.0)
+                away[2] *= np.where(away[2] > 0.0, 3.0, 1.0)  # hair hangs down
             else:
-                away[2] *= ALONG_BONE_FACTOR
+                away[2] *= 4.0  # not of the head, whose hair comes from above
             costs = np.sqrt(away[0] ** 2 + away[1] ** 2 + away[2] ** 2) + extra[there]
-            costs += FACE_COST_M * np.maximum(0.0, face[sources[there]] - face[here][:, None])
+            costs += np.maximum(0.0, face[sources[there]] - face[here][:, None])
             if reflection == 0:
-                around_costs = costs + RARE_COST_M * rarity[sources[there]]
-                around_costs += LEVEL_FACTOR * np.abs(away[2])
+                around_costs = costs + 0.1 * rarity[sources[there]]
+                around_costs += 3.0 * np.abs(away[2])
                 around[here] = sources[there[around_costs.argmin(axis=1)]]
             chosen = costs.argmin(axis=1)
             least = costs[np.arange(len(here)), chosen]
@@ -506,7 +468,7 @@ def find_sources(rig: Rig, frames: _BoneFrames, evidence: SkinEvidence, middle_x
             cost[here[better]] = least[better]
             best[here[better]] = sources[there[chosen[better]]]
             kind[here[better]] = reflection
-    trust = np.clip(2.0 - 2.0 * cost / MAX_COST_M, 0.0, 1.0)
+    trust = np.clip(2.0 - 2.0 * cost / 0.6, 0.0, 1.0)
     weight = np.where(np.isfinite(cost), (1.0 - seen) * trust * seen[best], 0.0)
     rarer = np.maximum(rarity[best] - rarity[around], 0.0)
     share = np.where((kind > 1) & (around >= 0), 1.0 - np.exp(-rarer), 0.0)
@@ -543,8 +505,9 @@ def _faces(frames: _BoneFrames, rig: Rig) -> Float[np.ndarray, "seeds"]:
         return np.zeros(len(head))
     forward = (forward - forward[head].min()) / np.ptp(forward[head])
     height = height / height[head].max()
-    behind = np.where(height > NECK_SHARE, EARS_BACK_SHARE, THROAT_BACK_SHARE)
+    behind = np.where(height > 0.3, EARS_BACK_SHARE, THROAT_BACK_SHARE)
     middle = 1.0 - (aside / np.abs(aside[head]).max()) ** 2
-    hairline = np.interp(forward * middle, (0.0, 1.0), HAIRLINE_SHARES)
-    below = np.clip((hairline - height) / HAIRLINE_WIDTH, 0.0, 1.0)
+    # heights as shares of the head's: the neck ends at 0.3; hair covers what is above the line
+    hairline = np.interp(forward * middle, (0.0, 1.0), (0.7, 0.92))
+    below = np.clip((hairline - height) / 0.2, 0.0, 1.0)
     return np.where(head & (forward > behind), below, 0.0)

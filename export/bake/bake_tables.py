@@ -40,8 +40,6 @@ class ExportRefused(RuntimeError):  # noqa: N818 - names what happened
     """The avatar is empty, or its graph does not draw what its rays see; no package is written."""
 
 
-OUTER_MARGIN_M = 0.012
-"""Largest distance outside the surface at which rays begin, about, metres."""
 PROBE_SPACING_M = 0.012
 """Distance between probes along a normal, metres: much less than a cell of the rig's grid."""
 
@@ -50,9 +48,7 @@ def bake_skinning(rig: Rig, surface: ProxySurface) -> SkinningGrid:
     """Keep the cells of the rig's skinning grid in which rays may be marched."""
     shape = np.array(rig.weights.shape[:3])
     step_m = (rig.box_high - rig.box_low) / (shape - 1)
-    depths = np.arange(
-        -OUTER_MARGIN_M, float(surface.thickness.max()) + PROBE_SPACING_M, PROBE_SPACING_M
-    )
+    depths = np.arange(-0.012, float(surface.thickness.max()) + PROBE_SPACING_M, PROBE_SPACING_M)
     within = depths <= surface.thickness[:, None] + PROBE_SPACING_M
     points = surface.positions[:, None] - surface.normals[:, None] * depths[:, None].astype(
         np.float32
@@ -89,27 +85,15 @@ def encode_weights(weights: Float32[np.ndarray, "nodes 24"]) -> UInt16[np.ndarra
 
 THICK_FAINT_FRACTION = 0.04
 """`BakeConfig.faint_fraction` of thick fields: haze of 10/m about a core of 120/m is seen."""
-THICK_SURFACE_DENSITY = 12.0
-"""`BakeConfig.surface_density` of thick fields, 1/m: ten centimetres hide 70 % of what is
-behind."""
-BRICK_MARGIN_M = 0.012
-"""Distance outside the surface that bricks cover, metres."""
-VOXEL_TO_SAMPLE_RATIO = 0.53
-"""Voxel size in units of the distance between samples in training: finer voxels cost bytes and show
-nothing, also where the field's cells are finer for the head's sake."""
 MIN_VOXEL_M = 0.0038
 """Smallest voxel that follows from a field's samples, metres."""
 MAX_VOXEL_M = 0.006
 """Largest voxel, metres."""
 BRICK_BYTES = 2.4e6
 """Deflated size of the bricks of a thick field, about: a package of less than 4 MB."""
-BYTES_EXPONENT = 2.5
-"""Bytes of the bricks grow with this power of the number of voxels along a metre."""
 VOXEL_FACTORS = (0.62, 1.6)
 """Bounds of the factor on voxels of a thick field. Finer ones gain 1 to 1.5 dB on the light avatar
 of few photographs; in fog 0.3 dB for three times the bytes."""
-POSITION_CODE_STEP = 32
-"""Multiple to which position codes are rounded, about a millimetre, so that they deflate well."""
 NORMAL_CODE_STEP = 7
 """Multiple to which normal codes are rounded, about three degrees, so that they deflate well."""
 FINE_TUNING_PICTURES = 10
@@ -143,17 +127,18 @@ class BakeConfig:
     @classmethod
     def for_sample_step(cls, sample_step_m: float) -> "BakeConfig":
         """Choose voxels of about half the distance of samples, within bounds, and fine-tuning."""
-        voxel_m = float(np.clip(VOXEL_TO_SAMPLE_RATIO * sample_step_m, MIN_VOXEL_M, MAX_VOXEL_M))
+        # finer voxels cost bytes and show nothing, also where cells are finer for the head
+        voxel_m = float(np.clip(0.53 * sample_step_m, MIN_VOXEL_M, MAX_VOXEL_M))
         return cls(voxel_m=voxel_m, fine_tuning_pictures=FINE_TUNING_PICTURES)
 
     def for_thick_field(self, brick_bytes: float) -> "BakeConfig":
         """Add haze; scale voxels until bricks, now of `brick_bytes`, take about `BRICK_BYTES`."""
-        factor = (brick_bytes / BRICK_BYTES) ** (1.0 / BYTES_EXPONENT)
+        factor = (brick_bytes / BRICK_BYTES) ** (1.0 / 2.5)  # they grow by this power
         factor = float(np.clip(factor, *VOXEL_FACTORS))
         return replace(
             self,
             voxel_m=factor * self.voxel_m,
-            surface_density=THICK_SURFACE_DENSITY,
+            surface_density=12.0,  # 1/m: ten centimetres hide 70 % of what is behind
             faint_fraction=THICK_FAINT_FRACTION,
         )
 
@@ -225,7 +210,7 @@ def _encode_surfels(surface: ProxySurface) -> SurfelTable:
         low=low,
         extent_m=extent_m,
         spacing_m=surface.spacing_m,
-        position_codes=round_codes(codes[order], POSITION_CODE_STEP, 65535),
+        position_codes=round_codes(codes[order], 32, 65535),  # about a millimetre: deflates well
         normal_codes=np.round(surface.normals[order] * 127.0 / NORMAL_CODE_STEP).astype(np.int8)
         * np.int8(NORMAL_CODE_STEP),
         thickness_codes=np.clip(thickness, 1, 255).astype(np.uint8),
@@ -278,11 +263,11 @@ def _overlapping_blocks(
 
 
 def _visible_nodes(grid: FieldGrid, surface: ProxySurface) -> Bool[np.ndarray, "x y z"]:
-    """Mark the nodes that rays see: from `BRICK_MARGIN_M` outside the surface to its thickness."""
+    """Mark the nodes that rays see: from 12 mm outside the surface to its thickness."""
     reached = np.zeros(grid.density.shape, dtype=bool)
     mark_visible_nodes(
         reached, grid.low, np.float32(grid.voxel_m), surface.positions, surface.normals,
-        surface.thickness, np.float32(BRICK_MARGIN_M),
+        surface.thickness, np.float32(0.012),
     )  # fmt: skip
     gap = 1 + 2 * int(np.ceil(surface.spacing_m / grid.voxel_m))  # between neighboring surfels
     for _ in range(gap // 2):

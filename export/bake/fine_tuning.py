@@ -93,23 +93,10 @@ FREE_ROUNDS = 1
 """SIRT rounds in which each voxel has its own codes; a second gains 0.05 dB."""
 SHARED_ROUNDS = 2
 """SIRT rounds in which the voxels of a cell share a code."""
-MIN_ERROR_SHARE = 3e-7
-"""Share of the pictures' squared error that a color or a density has to save to be stored: a
-million such codes are worth what their bytes are."""
-MAX_LOSS_DB = 0.1
-"""Loss, dB, above which bricks are left as they were baked."""
-COLOR_DAMPING = 0.5
-"""Added to color normalizers, in rays: a voxel seen by less than half a ray hardly changes."""
-DENSITY_DAMPING = 1e-3
-"""Added to density normalizers: ten rays whose colors change by 0.01 with every code."""
 MAX_DENSITY_CODE_CHANGE = 24
 """Largest change of a density code: twice or half as dense as the field."""
 POSE_NOISE_RAD = 0.05
 """Standard deviation of joint rotations about a view's pose in training pictures, radians."""
-NOVEL_POSE_NOISE_RAD = 0.3
-"""Standard deviation of joint rotations about a view's pose in novel poses, radians."""
-CAMERA_TILT_RAD = 0.2
-"""Standard deviation of the cameras' elevation about the pelvis, radians."""
 NOVEL_POSES = 2
 """Novel poses that judge besides the views."""
 TARGET_DB = 39.0
@@ -202,7 +189,7 @@ class FineTuningInputs:
             pelvis = root[:3, :3] @ self.rig.rest_joints[0] + root[:3, 3]
             azimuth = Rotation.from_rotvec(root[:3, 1] * generator.uniform(-np.pi, np.pi))
             across = camera.camera_from_world[0, :3]
-            orbit = azimuth * Rotation.from_rotvec(across * generator.normal() * CAMERA_TILT_RAD)
+            orbit = azimuth * Rotation.from_rotvec(across * generator.normal() * 0.2)
             moved = np.eye(4)
             moved[:3, :3] = orbit.as_matrix()
             moved[:3, 3] = pelvis - moved[:3, :3] @ pelvis
@@ -216,7 +203,7 @@ class FineTuningResult:
     """Outcome of fine-tuning.
 
     Attributes:
-        tables: Tuned; the given ones if tuning would lose more than `MAX_LOSS_DB`.
+        tables: Tuned; the given ones if tuning would lose more than 0.1 dB.
         psnr: To the renderer before and after, dB, on pictures that were not trained on; None if
             nothing was tuned. The mean over the tiers.
     """
@@ -246,7 +233,7 @@ def fine_tune(
     """
     tables, generator = inputs.tables, np.random.default_rng(0)
     training = inputs.perturbed_views(max_pictures, POSE_NOISE_RAD, generator, TRAINING_PX)
-    novel = inputs.perturbed_views(NOVEL_POSES, NOVEL_POSE_NOISE_RAD, generator, VALIDATION_PX)
+    novel = inputs.perturbed_views(NOVEL_POSES, 0.3, generator, VALIDATION_PX)
     asked = [
         (pose, fit_camera(camera, VALIDATION_PX, max_upscale=MAX_UPSCALE))
         for pose, camera in inputs.views
@@ -275,7 +262,7 @@ def fine_tune(
         update = solver.descend(codes, cells)
         if turn == FREE_ROUNDS - 1:
             squared_error = 3.0 * pixels * 255.0**2 * 10.0 ** (-0.1 * first)  # of channels, 1/255²
-            price = MIN_ERROR_SHARE * squared_error
+            price = 3e-7 * squared_error  # a million such codes are worth what their bytes are
             cells = share_codes_within_budget(
                 tables.bricks, codes, update, baked, price, executor=inputs.executor
             )
@@ -283,7 +270,7 @@ def fine_tune(
         progress(next(steps) / total)
     tuned = quantize_bricks(tables.bricks, codes, baked)
     reached = judge(VoxelCodes.of(tuned))
-    if reached < first - MAX_LOSS_DB:
+    if reached < first - 0.1:
         return FineTuningResult(tables=tables, settings=inputs.settings, psnr=(first, first))
     tables = replace(tables, bricks=tuned)
     return FineTuningResult(tables=tables, settings=inputs.settings, psnr=(first, reached))
@@ -328,8 +315,10 @@ def _take_step(
     codes: VoxelCodes, update: SirtUpdate, middle: Float32[np.ndarray, "voxels"]
 ) -> None:
     """Change codes, in place; densities stay within `MAX_DENSITY_CODE_CHANGE` about `middle`."""
-    color_step = update.color / (update.color_normalizer + np.float32(COLOR_DAMPING))[:, None]
-    density_step = update.density / (update.density_normalizer + np.float32(DENSITY_DAMPING))
+    # a voxel seen by less than half a ray hardly changes
+    color_step = update.color / (update.color_normalizer + np.float32(0.5))[:, None]
+    # ten rays whose colors change by 0.01 with every code
+    density_step = update.density / (update.density_normalizer + np.float32(1e-3))
     low, high = middle - MAX_DENSITY_CODE_CHANGE, middle + MAX_DENSITY_CODE_CHANGE
     codes.color[:] = np.clip(codes.color - color_step, 0.0, 255.0)
     codes.density[:] = np.clip(np.clip(codes.density - density_step, low, high), 0.0, 255.0)

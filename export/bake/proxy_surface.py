@@ -177,14 +177,10 @@ def _occupied_nodes(
 
 DENSITY_CONTRAST = 16.0
 """Factor about the level to which densities are clipped, as emptiness has no logarithm."""
-SMOOTHING_M = 0.004
-"""Standard deviation of the blur before the level set is extracted, metres."""
 OPAQUE_OPTICAL_DEPTH = 7.0
 """Optical depth behind which nothing is visible (0.1 %)."""
 THICKNESS_MARGIN_M = 0.004
 """Added to the thickness, metres, for what lies deeper beside the normal than along it."""
-MAX_THICKNESS_M = 0.1
-"""Depth under the surface beyond which density is ignored, metres."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -209,7 +205,7 @@ def extract_proxy_surface(grid: FieldGrid, *, level: float, spacing_m: float) ->
     field. Surfels lie on the edges of cells of `spacing_m`.
     """
     logs = resample_grid(_log_density(grid, level), spacing_m / grid.voxel_m)
-    logs = blur_grid(logs, SMOOTHING_M / spacing_m)
+    logs = blur_grid(logs, 0.004 / spacing_m)
     inside = remove_floaters_and_cavities(logs > 0.0)
     nothing = np.float32(1e-3)
     logs = np.where(inside, np.maximum(logs, nothing), np.minimum(logs, -nothing))
@@ -276,11 +272,11 @@ def _visible_thickness(
 ) -> Float32[np.ndarray, "surfels"]:
     """Return the visible depth under each point, metres, plus `THICKNESS_MARGIN_M`.
 
-    There the optical depth is `OPAQUE_OPTICAL_DEPTH`, or 99.9 % of that at `MAX_THICKNESS_M`.
+    There the optical depth is `OPAQUE_OPTICAL_DEPTH`, or 99.9 % of that in a depth of 10 cm.
     """
     step = np.float32(0.5 * grid.voxel_m)
     ends = visible_depth_steps(
         grid.density, grid.low, np.float32(grid.voxel_m), positions, normals, step,
-        int(MAX_THICKNESS_M / step), OPAQUE_OPTICAL_DEPTH, 0.999,
+        int(0.1 / step), OPAQUE_OPTICAL_DEPTH, 0.999,
     )  # fmt: skip
     return ((ends + 1) * step + THICKNESS_MARGIN_M).astype(np.float32)

@@ -18,20 +18,8 @@ from export.bake.compositor import SirtUpdate, VoxelCodes
 from export.package.player_tables import BRICK_SIZE, BrickTable, round_codes
 from export.package.table_codec import add_border_voxels, estimate_brick_bytes
 
-MAX_BRICK_BYTES = 3.2e6
-"""Estimated deflated size of bricks, bytes, that leaves a package of at most 4 MB."""
-PRICE_FACTOR = 1.5
-"""Factor by which the price is raised where bricks do not fit."""
-MAX_PRICES = 24
-"""Most prices that are tried; the last is 10,000 times the first."""
-COLOR_STEP = 5
-"""Multiple to which tuned colors are rounded."""
 DENSITY_STEP = 6
 """Multiple to which tuned densities are rounded: steps of 23 %."""
-WEIGHT_FLOOR = 1e-3
-"""Weight of a visible voxel that no ray has seen, in rays."""
-SEPARATE_CODE = -1e4
-"""Density code by which empty voxels are kept apart from visible ones."""
 CHUNK_BRICKS = 64
 """Bricks in a chunk; temporary arrays of their 32,768 voxels fit into the processor's caches."""
 
@@ -126,7 +114,7 @@ def choose_cells(
     (`baked`) remain apart. `price`: the squared error, 1/255², that one code more has to save.
     """
     weights = _error_weights(update, baked)
-    apart = np.where(baked > 0, codes.density, np.float32(SEPARATE_CODE))
+    apart = np.where(baked > 0, codes.density, np.float32(-1e4))
     return VoxelCells(
         density=prune_octrees(apart[:, None], weights.density, price),
         color=prune_octrees(codes.color, weights.color, price),
@@ -156,7 +144,7 @@ class _ErrorWeights(NamedTuple):
 def _error_weights(update: SirtUpdate, baked: Float32[np.ndarray, "voxels"]) -> _ErrorWeights:
     """Return the squared error, 1/255², for a change of each voxel's codes by 1."""
     visible = baked > 0
-    floor = np.where(visible, np.float32(WEIGHT_FLOOR), np.float32(0.0))
+    floor = np.where(visible, np.float32(1e-3), np.float32(0.0))  # rays
     # normalizers of densities hold the squares on black and on white, of colors in [0, 1]
     density = update.density_normalizer * np.float32(0.5 * 255.0**2)
     return _ErrorWeights(
@@ -174,7 +162,7 @@ def share_codes_within_budget(
     *,
     executor: Executor,
 ) -> list[VoxelCells]:
-    """Share codes, in place, at higher prices until bricks fit into `MAX_BRICK_BYTES`.
+    """Share codes, in place, at higher prices until the package has at most 4 MB.
 
     Returns the cells of each of the `brick_chunks`; arguments as of `choose_cells`, for all bricks.
     """
@@ -186,9 +174,9 @@ def share_codes_within_budget(
         shared.density[chunk], shared.color[chunk] = share_codes(*known, cells)
         return cells
 
-    for raised in price * PRICE_FACTOR ** np.arange(MAX_PRICES):
+    for raised in price * 1.5 ** np.arange(24):  # the last is 10,000 times the first
         cells = list(executor.map(share, brick_chunks(len(baked)), repeat(float(raised))))
-        if estimate_brick_bytes(quantize_bricks(bricks, shared, baked)) <= MAX_BRICK_BYTES:
+        if estimate_brick_bytes(quantize_bricks(bricks, shared, baked)) <= 3.2e6:
             break
     codes.density[:], codes.color[:] = shared
     return cells
@@ -204,7 +192,7 @@ def quantize_bricks(
         density = np.round(codes.density[chunk]).astype(np.uint8)
         density = round_codes(density, DENSITY_STEP, 255)
         visible = np.maximum(density, np.uint8(DENSITY_STEP))
-        core[chunk, :3] = round_codes(color, COLOR_STEP, 255)
+        core[chunk, :3] = round_codes(color, 5, 255)
         core[chunk, 3] = np.where(baked[chunk] > 0, visible, density)
     shape = (len(bricks.voxels), BRICK_SIZE, BRICK_SIZE, BRICK_SIZE, 4)
     return replace(bricks, voxels=add_border_voxels(bricks.index, core.reshape(shape)))

@@ -21,8 +21,6 @@ COLOR_WEIGHT_SCALE = 256
 """Sum of the integer weights of colors, so that two channels share a multiplication."""
 VOXEL_OFFSET_BITS = 10
 """Low bits of a packed address, for the voxel in its brick; the others number the block."""
-MIN_REMAINING_M = 1e-5
-"""Length below which the rest of a ray is dropped, metres."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -231,7 +229,7 @@ def _unfinished_rays(
     """Return numbers, transmittances and remainders (`_unpack_segment`) of unfinished rays."""
     graph = context.graph
     on = (block.transmittance > context.settings.min_transmittance) & (
-        block.end < segment.end - MIN_REMAINING_M
+        block.end < segment.end - 1e-5
     )
     chosen = graph.range(graph.size(on).cast(np.int32)).compress(on)
     vectors = chosen.repeat_rows(3)

@@ -50,8 +50,6 @@ class GraphContext:
 # Vectors are values of three rows, x, y and z, and a column a point.
 NEXT, AFTER_NEXT = (1, 2, 0), (2, 0, 1)
 """Axes that follow x, y and z, and those that follow these."""
-MAX_EXACT = 1 << 24
-"""Integers below are exact as float32."""
 
 
 def dot(a: GraphValue, b: GraphValue) -> GraphValue:
@@ -113,7 +111,7 @@ def locate_skinning_cell(context: GraphContext, canonical: GraphValue) -> Skinni
     place = place.maximum(0.0).minimum(column(counts - 1 - 1e-3))
     below = place.floor()
     strides = np.array([counts[1] * counts[2], counts[2], 1])
-    assert np.prod(counts) < MAX_EXACT
+    assert np.prod(counts) < 1 << 24  # integers below are exact as float32
     number = below.weighted_sum(strides).cast(np.int32)
     steps = (0, strides[1], strides[0], strides[0] + strides[1])
     table, fraction = context.table_values["node"], place - below

@@ -25,8 +25,6 @@ PREVIEW_ENTRY = "preview.png"
 COARSE_GRAPH = "coarse"
 """Name of the graph that draws one depth layer in one block: a page's session of it is made in half
 the time, and draws the first picture. Older packages lack it."""
-MAX_UNPACKED_BYTES = 512 << 20
-"""Most bytes that the entries of a package hold together; those of an avatar hold 20 MB."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -152,7 +150,7 @@ def read_package(path: Path, *, tier: str | None = "hq") -> AvatarPackage:
             raise InputError(_not_a_file_message(path))
         with zipfile.ZipFile(path) as archive:
             unpacked = sum(info.file_size for info in archive.infolist())
-            if unpacked > MAX_UNPACKED_BYTES:
+            if unpacked > 512 << 20:  # those of an avatar hold 20 MB
                 raise InputError(f"{path} unpacks to {unpacked >> 20} MB; no package does.")
             return _read_archive(archive, path, tier)
     except FileNotFoundError:
