@@ -42,12 +42,7 @@ from export.bake.proxy_surface import FieldFunction
 from export.bake.traced_rays import RayTracer
 from export.graph.player_graph import build_graph
 from export.package.manifest import LICENCE_NOTE, MAX_GOLDEN_PX, GoldenFrame, Manifest, TierInfo
-from export.package.package_file import (
-    COARSE_GRAPH,
-    AvatarPackage,
-    PackageWriter,
-    write_package,
-)
+from export.package.package_file import COARSE_GRAPH, AvatarPackage, PackageWriter, write_package
 from export.package.player_tables import (
     BRICK_NODES,
     QUALITY_TIERS,

@@ -11,12 +11,7 @@ import math
 import numpy as np
 from jaxtyping import Float32
 
-from avatar.kernels.kernel_compiler import (
-    FAST_MATH,
-    INLINED,
-    NO_ALLOCATION,
-    compile_kernel,
-)
+from avatar.kernels.kernel_compiler import FAST_MATH, INLINED, NO_ALLOCATION, compile_kernel
 from avatar.kernels.numba_rendering import canonical_point
 from avatar.kernels.numba_skinning import (
     MATRIX_LANES,

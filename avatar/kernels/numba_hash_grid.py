@@ -131,10 +131,7 @@ def encode_backward(
     """
     places, within = np.empty((3, POINTS_PER_BLOCK), F32), np.empty((3, POINTS_PER_BLOCK), F32)
     cells = np.empty((3, POINTS_PER_BLOCK), I32)
-    entries, weights = (
-        np.empty((8, POINTS_PER_BLOCK), I32),
-        np.empty((8, POINTS_PER_BLOCK), F32),
-    )
+    entries, weights = (np.empty((8, POINTS_PER_BLOCK), I32), np.empty((8, POINTS_PER_BLOCK), F32))
     for run in range(runs.shape[0]):
         stop = runs[run, 0] + runs[run, 1]
         for start in range(runs[run, 0], stop, POINTS_PER_BLOCK):

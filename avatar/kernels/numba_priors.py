@@ -11,11 +11,7 @@ import math
 
 import numpy as np
 
-from avatar.kernels.kernel_compiler import (
-    FAST_MATH,
-    INLINED,
-    compile_kernel,
-)
+from avatar.kernels.kernel_compiler import FAST_MATH, INLINED, compile_kernel
 from avatar.kernels.operands import MAX_LOG_DENSITY
 
 F32, U32 = np.float32, np.uint32

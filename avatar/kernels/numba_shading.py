@@ -4,12 +4,7 @@ import math
 
 import numpy as np
 
-from avatar.kernels.kernel_compiler import (
-    FAST_MATH,
-    INLINED,
-    NO_ALLOCATION,
-    compile_kernel,
-)
+from avatar.kernels.kernel_compiler import FAST_MATH, INLINED, NO_ALLOCATION, compile_kernel
 from avatar.kernels.operands import MAX_LOG_DENSITY
 
 F32, I32, U32 = np.float32, np.int32, np.uint32

@@ -4,11 +4,7 @@ import math
 
 import numpy as np
 
-from avatar.kernels.kernel_compiler import (
-    INLINED,
-    NO_ALLOCATION,
-    compile_kernel,
-)
+from avatar.kernels.kernel_compiler import INLINED, NO_ALLOCATION, compile_kernel
 
 F32, U32 = np.float32, np.uint32
 MATRIX_LANES = 16

@@ -277,9 +277,7 @@ def _march(
     return RaySamples(points, first, count, rows), reached
 
 
-def _scratch_samples(
-    most: int,
-) -> tuple[Float32[np.ndarray, "most 3"], Int32[np.ndarray, "most"]]:
+def _scratch_samples(most: int) -> tuple[Float32[np.ndarray, "most 3"], Int32[np.ndarray, "most"]]:
     """Room for samples before they are packed; what a thread asked for last, if small.
 
     Fresh memory costs a page fault for every 4 KiB: a third of a march of one-sample rays.

@@ -33,13 +33,7 @@ from avatar.events import (
     Warned,
 )
 from avatar.kernels import operations
-from avatar.kernels.operands import (
-    LossSettings,
-    PosedBones,
-    PriorPoints,
-    RayBatch,
-    RaySamples,
-)
+from avatar.kernels.operands import LossSettings, PosedBones, PriorPoints, RayBatch, RaySamples
 from avatar.render import render
 from avatar.rig import Rig
 from avatar.training.frame_stream import RedundantFrame, StreamItem, TrainingFrame, rebuild_frame

@@ -405,9 +405,7 @@ def reflect(
 
 
 def _neckline_lift(
-    frames: _BoneFrames,
-    local: Float[np.ndarray, "points 3"],
-    parts: Int[np.ndarray, "points"],
+    frames: _BoneFrames, local: Float[np.ndarray, "points 3"], parts: Int[np.ndarray, "points"]
 ) -> Float[np.ndarray, "points"]:
     """How much higher a point of the torso lies once it is on the other face, metres.
 

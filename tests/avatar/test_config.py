@@ -3,13 +3,7 @@
 import numpy as np
 import pytest
 
-from avatar.config import (
-    COARSEST_M,
-    ESTIMATED_POSE_PRIORS,
-    HEAD_SIDE_M,
-    MAX_HEAD_PX,
-    TrainConfig,
-)
+from avatar.config import COARSEST_M, ESTIMATED_POSE_PRIORS, HEAD_SIDE_M, MAX_HEAD_PX, TrainConfig
 
 
 @pytest.mark.parametrize("footprint_m", [1e-4, 0.004, 0.009, 0.02, 0.5])

@@ -5,12 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from avatar.rig import (
-    BLENDED_VERTICES,
-    MIN_VERTEX_DISTANCE_M,
-    skinning_weight_volume,
-    volume_shape,
-)
+from avatar.rig import BLENDED_VERTICES, MIN_VERTEX_DISTANCE_M, skinning_weight_volume, volume_shape
 
 LOW, HIGH = np.array([-0.5, -0.3, -0.2]), np.array([0.5, 0.3, 0.2])
 CELL_M = 0.05

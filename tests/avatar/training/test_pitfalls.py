@@ -18,12 +18,7 @@ from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.evaluation.image_metrics import soft_iou
 from avatar.kernels import operations
 from avatar.kernels.numba_rendering import OPAQUE_DEPTH
-from avatar.kernels.operands import (
-    CorrespondenceTables,
-    DensityGrid,
-    MarchSettings,
-    RayBatch,
-)
+from avatar.kernels.operands import CorrespondenceTables, DensityGrid, MarchSettings, RayBatch
 from avatar.render import render
 from avatar.rig import Rig
 from avatar.training.frame_stream import TrainingFrame, prepare_stream

@@ -11,12 +11,7 @@ from avatar.config import COARSEST_M, TrainConfig
 from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.evaluation.held_out import HeldOutFrame, score_frame
 from avatar.kernels import numba_hash_grid, numba_pose, operations
-from avatar.kernels.operands import (
-    FEATURES_PER_LEVEL,
-    CorrespondenceTables,
-    HashLevels,
-    RaySamples,
-)
+from avatar.kernels.operands import FEATURES_PER_LEVEL, CorrespondenceTables, HashLevels, RaySamples
 from avatar.render import correspondence_tables
 from avatar.training import checkpoint
 from avatar.training.frame_stream import prepare_stream

@@ -24,10 +24,7 @@ def test_a_frame_is_expected_to_err_as_those_around_it_do_the_nearest_most(rng):
     frames = np.delete(np.arange(41), 20)
     held = np.ones(41, dtype=bool)
     told = prior_from_neighbors(
-        20,
-        np.append(frames, 19),
-        np.append(errors, errors[:1], axis=0),
-        np.append(held[1:], False),
+        20, np.append(frames, 19), np.append(errors, errors[:1], axis=0), np.append(held[1:], False)
     )
     distances = np.abs(frames - 20)
     weights = np.where(distances <= MAX_FRAME_GAP, 1.0 / distances, 0.0)

@@ -10,14 +10,7 @@ from avatar.kernels.numba_priors import OPACITY_LENGTH_M
 from avatar.training import checkpoint
 from avatar.training.frame_stream import prepare_frame
 from avatar.training.trainer import Trainer, cosine_decay
-from avatar.training.unseen_skin import (
-    HEAD,
-    MIN_WEIGHT,
-    TORSO,
-    SkinEvidence,
-    UnseenSkin,
-    reflect,
-)
+from avatar.training.unseen_skin import HEAD, MIN_WEIGHT, TORSO, SkinEvidence, UnseenSkin, reflect
 from preprocess.body.kinematics import HEAD_JOINT
 
 LEFT_THIGH, LEFT_FOREARM, RIGHT_FOREARM = 1, 10, 11

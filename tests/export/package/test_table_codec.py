@@ -107,9 +107,7 @@ def test_places_that_do_not_match_what_is_there_are_refused(stream):
         decode_tables(streams, TableLayout.of(tables))
 
 
-@given(
-    st.lists(st.floats(0, 1), min_size=24, max_size=24).filter(lambda w: sum(w) > 1e-3),
-)
+@given(st.lists(st.floats(0, 1), min_size=24, max_size=24).filter(lambda w: sum(w) > 1e-3))
 def test_weight_codes_sum_to_one_and_stay_close(weights):
     weights = np.array([weights], dtype=np.float32) / np.float32(sum(weights))
     codes = encode_weights(weights).astype(int)
