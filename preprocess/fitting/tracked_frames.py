@@ -34,8 +34,6 @@ from preprocess.tracking.pose_lift import lift_keypoints
 CHUNK_FRAMES = 8
 """Frames whose poses are fitted at once, together with as many before and after them: without later
 ones, poses jitter three times as much."""
-FIRST_ITERATIONS = (5, 5)
-"""Iterations over the first frames, with key points alone and then with outlines."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -71,7 +69,7 @@ def fit_first_frames(
         seen, ClipPoses.of(lifted, range(len(seen))), model, camera,
         settled=False, sigma_log_focal=sigma_log_focal, weights=USUAL_WEIGHTS,
     )  # fmt: skip
-    fitter.iterate_stages(FitParameters(proportions=not fixed), *FIRST_ITERATIONS)
+    fitter.iterate_stages(FitParameters(proportions=not fixed), keypoint_count=5, outline_count=5)
     fitted = camera.scale_focal(float(np.exp(fitter.log_focal)))
     return fitter.poses.replace_in(lifted), model.space.shape(fitter.coefficients), fitted
 

@@ -1,6 +1,5 @@
 """A short film of the actor and a short run on it, shared by all tests of the commands."""
 
-import functools
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ from instant_avatar.run import final_scoring, snapshot_writer, training_session
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.open_capture import open_capture
-from preprocess.tracking.blazepose_networks import OnnxNetwork
+from tests.cached_networks import networks_run_once as networks_run_once
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,29 +84,6 @@ def pytest_runtest_setup():
 def pytest_runtest_teardown():
     """Undo it."""
     BRIEF.undo()
-
-
-@pytest.fixture(scope="session", autouse=True)
-def networks_run_once():
-    """The same outputs of a network for the same image, of which these tests track many twice."""
-    run = OnnxNetwork.run
-
-    @functools.lru_cache(maxsize=500)
-    def run_once(network: tuple[str, ...], content: bytes, size: int, low: float, high: float):
-        image = np.frombuffer(content, dtype=np.uint8).reshape(size, size, 3)
-        return run(networks[network], image, low, high)
-
-    networks: dict[tuple[str, ...], OnnxNetwork] = {}
-
-    def cached(network: OnnxNetwork, image: np.ndarray, low: float, high: float):
-        key = tuple(network._outputs)
-        networks[key] = network
-        outputs = run_once(key, image.tobytes(), len(image), low, high)
-        return {name: output.copy() for name, output in outputs.items()}
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(OnnxNetwork, "run", cached)
-        yield
 
 
 @pytest.fixture(scope="session")

@@ -20,6 +20,7 @@ from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.fitting.keypoint_rows import KEYPOINT_JOINTS, KeypointModel
 from preprocess.tracking.keypoints import KeypointTrack
+from tests.cached_networks import networks_run_once as networks_run_once
 from tests.motions import make_motion, make_track
 
 

@@ -18,7 +18,7 @@ from preprocess.body.parametric_body import load_body_model
 from preprocess.cameras.camera_file import CameraTrack, assume_camera, write_cameras
 from preprocess.capture_inputs import CaptureInputs, CapturePaths
 from preprocess.capture_session import Capture
-from preprocess.fitting import tracked_frames
+from preprocess.fitting.clip_fitting import ClipFitter
 from preprocess.fitting.tracked_frames import CHUNK_FRAMES
 from preprocess.observation import DroppedFrame, Observation
 from preprocess.open_capture import open_tracked_stream
@@ -75,7 +75,9 @@ def standing():
 @pytest.fixture(autouse=True)
 def few_iterations(monkeypatch):
     """Key points and masks here are exact."""
-    monkeypatch.setattr(tracked_frames, "FIRST_ITERATIONS", (2, 2))
+    stages = ClipFitter.iterate_stages
+    once = lambda fitter, fitted, *counts, **named: stages(fitter, fitted, 1, 1)  # noqa: E731
+    monkeypatch.setattr(ClipFitter, "iterate_stages", once)
 
 
 class Tracker:
