@@ -34,11 +34,8 @@ def associate_by_order(rows: int, source: FrameSource, things: str) -> Callable[
             return int
         if rows == source.selection.count(count):
             return source.selection.position
-    hint = (
-        "; or say which frame each belongs to (the keys `frame` or `time`)"
-        if things.startswith("poses")
-        else ""
-    )
+    or_say = "; or say which frame each belongs to (the keys `frame` or `time`)"
+    hint = or_say if things.startswith("poses") else ""
     raise InputError(
         f"There are {rows} {things}, but {count} frames in {source.path}. Expected one for every "
         f"frame, in order{hint}.{_mismatch_hint(rows, count)}"

@@ -65,10 +65,8 @@ def observation_builder(
 ) -> Callable[[Frame], Observation | DroppedFrame]:
     """Check that the parts fit together, and return a function from a frame to its observation.
 
-    Args:
-        motion: Poses; matched by their frame numbers, by their times, or by order.
-        cameras: Cameras of the frames' size.
-        size_px: Longer side of the observations; images are never enlarged.
+    Poses are matched by their frame numbers, their times, or order. `size_px` is the longer side of
+    the observations; images are never enlarged.
     """
     row_of, camera_row = associate_poses(motion, source), associate_cameras(cameras, source)
     masks.check()

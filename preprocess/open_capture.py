@@ -145,10 +145,9 @@ def align_capture(
 ) -> Capture:
     """Align frames, poses, masks and cameras with each other.
 
-    Args:
-        size_px: Longer side of the training images; None for the frames' own.
-        skip_checks: Takes the parts as they are even if they do not fit together, for ia-check.
-        avatar_body: File of a finished avatar's person, to whom the poses belong.
+    `size_px` is the longer side of the training images, None the frames' own; `skip_checks` takes
+    the parts even if they do not fit together, for ia-check. `avatar_body` is the file of a
+    finished avatar's person, to whom the poses belong.
     """
     motion = imported.motion
     warnings: tuple[str, ...] = ()
@@ -181,11 +180,9 @@ def _place(
     Poses of another body model have another size, and those of an added video another person's.
     """
     source, named = imported.source, imported.paths.cameras
-    cameras = (
-        assume_static_camera(motion, source.size_px)
-        if named is None
-        else read_cameras(named, source.size_px, source)
-    )
+    cameras = assume_static_camera(motion, source.size_px)
+    if named is not None:
+        cameras = read_cameras(named, source.size_px, source)
     if motion.is_fitted and not cameras.is_moving:  # with the focal length, at its distances
         intrinsic = tracker_intrinsic_matrix(motion, source.size_px)
         if intrinsic is not None:
@@ -291,15 +288,10 @@ def open_tracked_stream(
     """Open a live source, or a recording at its own speed, and find the person.
 
     Masks of a recording that are named or lie beside it, an installed segmenter's, and the images'
-    alpha channel are learnt from; only without any are the tracker's.
-
-    Args:
-        inputs: The inputs of the user; without poses.
-        make_refinement: Makes the refinement of the tracker's masks for a width and height.
-        poses: File to which the poses will be written in the end.
-        longer_side_px: Longer side of the training images for a source.
-        avatar_body: File of a finished avatar's person, who is filmed again.
-        on_tracked: Receives each frame that was searched, and the person in it.
+    alpha channel are learnt from; only without any are the tracker's, refined for a width and
+    height by `make_refinement`. To `poses` the poses will be written in the end, `avatar_body` is
+    the file of a finished avatar's person who is filmed again, and `on_tracked` receives each frame
+    that was searched, and the person in it.
     """
     if inputs.cameras == "solve" or inputs.height_m is not None:
         raise InputError(

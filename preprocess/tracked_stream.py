@@ -256,11 +256,8 @@ class LiveTracking:
     ) -> tuple[Motion, ShapedBody, CameraTrack]:
         """Track the first frames, and fit them, the person and a static camera to each other.
 
-        Args:
-            shaped: The body's mean shape, or the person of a finished avatar.
-            camera: Its focal length is not exact.
-            fixed_body: Whether `shaped` is the person.
-            stated_focal: Whether the focal length comes from a file and is no guess.
+        With `fixed_body`, `shaped` is a finished avatar's person, else the mean shape; with
+        `stated_focal` the focal length comes from a file and is no guess, if not exact.
         """
         while len(self._seen) < START_FRAMES and self.stream.take_next():
             pass

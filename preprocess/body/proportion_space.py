@@ -148,8 +148,5 @@ def shape_for_motion(body: BodyModel, motion: Motion) -> ShapedBody:
             )
         return space.shape(motion.proportions)
     shaped = body.with_shape(betas_for_motion(body, motion))
-    return (
-        shaped
-        if body.family == "smpl" or motion.body_model == body.family
-        else with_smpl_joints(shaped)
-    )
+    is_own = body.family == "smpl" or motion.body_model == body.family
+    return shaped if is_own else with_smpl_joints(shaped)

@@ -71,10 +71,8 @@ def read_cameras(
     coefficients), valid (N: whether a frame has a camera of its own). Cameras of another size and
     the same shape are scaled to `size_px`.
 
-    Args:
-        size_px: Width and height of the frames; None for those of the file's own images.
-        source: The frames, whose names or number tell which camera is whose. Without it cameras
-            of other programs are taken in order.
+    Without the frames' size that of the file's own images counts; without `source`, whose names or
+    number tell which camera is whose, cameras of other programs are taken in order.
     """
     own = path / "cameras.npz"
     path = own if own.is_file() else path

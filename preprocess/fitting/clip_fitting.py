@@ -102,16 +102,11 @@ class ClipFitter:
         weights: EvidenceWeights = USUAL_WEIGHTS,
         model: OutlineModel | None = None,
     ) -> None:
-        """Starts with the poses, the proportions and the focal length as they are.
+        """Starts with a pose of each frame, the proportions and the focal length as they are.
 
-        Args:
-            given: A pose of each frame.
-            frames: The frames to fit, in time order.
-            track: Key points, as further evidence. With them the poses are merely human; without,
-                they are near the given ones.
-            settled: Whether these poses were fitted to key points before.
-            sigma_log_focal: Prior standard deviation of the focal length's logarithm.
-            model: The person at the space's origin, where several clips share it.
+        Frames are in time order. With key points (`track`) the poses are merely human, without
+        near the given ones. `settled` tells that they were fitted to key points before; several
+        clips may share a `model`, the person at the space's origin.
         """
         self.frames = tuple(frames)
         self.model = model or OutlineModel(space)

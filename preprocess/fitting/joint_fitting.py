@@ -70,10 +70,8 @@ def fit_joints(
 ) -> FittedJoints:
     """Fit the embedded body to the joints of another one over time.
 
-    Args:
-        places: Of `POINT_NAMES`, metres; NaN where unknown, but not of limbs.
-        turns: World rotations since SMPL's T-pose, if known: the fit stays near them.
-        offsets_m: Where the other body has its joints, from ours in our rest pose.
+    Places are those of `POINT_NAMES`, NaN where unknown, but not of limbs. The fit stays near world
+    rotations since SMPL's T-pose, if known; offsets are those of the other body's joints from ours.
     """
     fitter = _JointFitter(places, times_s, turns, offsets_m)
     count = len(places)
@@ -129,11 +127,9 @@ class _JointFitter:
         weights = np.repeat(known * self._precision, 3, axis=1)
         wanted = np.nan_to_num(places)
         still = np.broadcast_to(np.eye(3), (len(poses.rotations), 3, 3))
-        prior = (
-            HumanPosePrior(still, times_s, settled=True)
-            if self._turns is None
-            else GivenPosePrior(poses, still, ASSUMED_FPS * times_s)
-        )
+        prior = HumanPosePrior(still, times_s, settled=True)
+        if self._turns is not None:
+            prior = GivenPosePrior(poses, still, ASSUMED_FPS * times_s)
         for _ in range(12 if proportions else 6):
             fitted = self.space.count if proportions else 0
             equations = ChainEquations.empty(len(places), 75, fitted)

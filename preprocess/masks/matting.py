@@ -83,10 +83,8 @@ def refine_border(
 ) -> Plane:
     """Move a mask's border to where the colors change from person to background, as softly.
 
-    Args:
-        rgb: The image, in levels of any type.
-        background: Expected background color of each pixel and its standard deviation, in levels.
-        foreground: The same of the person. Where either deviation is infinite the mask stays.
+    Of background and person the expected color of each pixel and its standard deviation are given,
+    in levels; where either deviation is infinite the mask stays.
     """
     outside = border_distance_px(alpha)
     spread = background[1] + foreground[1]
@@ -197,10 +195,8 @@ def guided_coefficients(
     The averages may be enlarged and applied to a larger image: that is the fast guided filter (He
     and Sun 2015, arXiv:1505.00996).
 
-    Args:
-        guide: The image's three channels, in levels.
-        radius_px: Half the window's edge, px; the edge is `2 * radius_px + 1`.
-        tolerance: Standard deviation of colors, in levels, below which a window counts as one.
+    A window's edge is `2 * radius_px + 1`; the tolerance is the standard deviation of colors, in
+    levels, below which it counts as one.
     """
     height, width = alpha.shape
     # strips whose planes stay in the cache are twice as fast

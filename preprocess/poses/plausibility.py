@@ -201,8 +201,6 @@ def _median_distance_m(motion: Motion) -> float:
     has_own_focal = motion.assumed_focal is not None or (
         motion.space == "camera" and motion.intrinsic is not None
     )
-    return (
-        0.0
-        if has_own_focal or not len(places)
-        else float(np.median(np.linalg.norm(places, axis=1)))
-    )
+    if has_own_focal or not len(places):
+        return 0.0
+    return float(np.median(np.linalg.norm(places, axis=1)))

@@ -99,11 +99,11 @@ def _motion(arrays: Arrays) -> Motion:
         lens=_read_numbers(arrays, "K") if "K" in arrays else None,
     )  # fmt: skip
     cameras = _cameras(arrays, count)
+    if cameras is not None and frames is not None:
+        cameras = cameras[frames.argsort()]
     return replace(
         motion,
-        camera_from_world=cameras
-        if cameras is None or frames is None
-        else cameras[frames.argsort()],
+        camera_from_world=cameras,
         proportions=_proportions(arrays),
         keypoints=KeypointTrack.from_arrays(arrays),
         program=str(arrays["program"]) if "program" in arrays else None,

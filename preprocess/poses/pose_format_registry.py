@@ -41,10 +41,8 @@ def read_poses(path: Path, *, person: str | None = None, prefer_world: bool = Fa
     of the tracker are interpolated. The poses keep the file's anchor and space;
     `preprocess.poses.motion_builder` converts them for a body and its cameras.
 
-    Args:
-        path: The file or folder; of a capture folder the poses in it.
-        person: Whose poses, by the file's own number or name.
-        prefer_world: Reads poses in the world rather than in a camera, to drive an avatar.
+    A person is named by the file's own number or name; `prefer_world` reads poses in the world
+    rather than in a camera, to drive an avatar.
     """
     path = resolve_pose_path(path)
     refuse_pipe(path)

@@ -74,10 +74,8 @@ class SkeletonMotion:
         at_rest = np.broadcast_to(np.eye(3), (len(self.names), 3, 3))
         at_rest = at_rest if is_smpl else self.rest_rotations
         rest_turned, rest_places = _forward(self.parents, at_rest[None], self.offsets[None])
-        turned, places = (
-            np.concatenate([turned, rest_turned]),
-            np.concatenate([places, rest_places]),
-        )
+        turned = np.concatenate([turned, rest_turned])
+        places = np.concatenate([places, rest_places])
         columns = [-1 if column is None else column for column in source.values()]
         up = find_upright(places[:-1, columns])
         turned, places = up @ turned, places @ up.T

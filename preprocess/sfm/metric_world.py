@@ -290,13 +290,10 @@ def place_in_metric_world(
     shaped: ShapedBody,
     source: FrameSource,
 ) -> MetricPlacement:
-    """Cameras in metres and the poses in their world.
+    """Cameras in metres and the poses in their world; before, each is in its frame's camera.
 
-    Args:
-        solved: Cameras of unknown scale.
-        motion: Each row in the camera of its frame, metres.
-        tracker_camera: Camera that the poses were made for, at its world's origin; None if unknown:
-            then they are taken to be right for the solved focal length.
+    Poses were made for the tracker's camera, at its world's origin; where that is unknown (None)
+    they are taken to be right for the solved focal length.
     """
     lens = solved.lens(source.size_px)
     one = CameraTrack(cameras=(lens,), source="")

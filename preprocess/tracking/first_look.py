@@ -100,11 +100,9 @@ class FirstLook:
                 f"turned, add --rotate {self.rotation}: else the avatar is turned, too."
             )
         if self.crowded:
-            followed = (
-                "The larger one is followed, or the one that --person names"
-                if tracks
-                else "The one whom the poses follow is learnt"
-            )
+            followed = "The one whom the poses follow is learnt"
+            if tracks:
+                followed = "The larger one is followed, or the one that --person names"
             yield (
                 f"Another person is in {self.crowded} {of}. {followed}; frames in which they are "
                 "near each other may be lost."

@@ -124,11 +124,8 @@ class TrackingGrade:
 
     def describe(self) -> str:
         """The verdict, for people."""
-        jitter = (
-            ""
-            if np.isnan(self.jitter_mm)
-            else f"jitter {self.jitter_mm:.1f} mm per frame squared; "
-        )
+        shakes = f"jitter {self.jitter_mm:.1f} mm per frame squared; "
+        jitter = "" if np.isnan(self.jitter_mm) else shakes
         scores = (
             f"found in {self.found_share:.0%} of {self.frames} frames; IoU of body and masks "
             f"{self.iou_mean:.2f} (worst frame {self.iou_worst:.2f}); {jitter}seen from "

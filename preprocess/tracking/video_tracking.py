@@ -30,8 +30,6 @@ MIN_FRAMES = 4
 FRAMES_REFINED_AGAIN = 60
 """First frames of a film, of which those that are used have their masks made again in the end, when
 the background behind them is known."""
-RETURN_FRAMES = 20
-"""Frames around those with another person in which a jump of the hips is from or to that one."""
 
 
 class TrackingProblem(Enum):
@@ -157,12 +155,9 @@ class VideoTracking:
         mask_folder: Path | None,
         before: TrackedVideo | None = None,
     ) -> None:
-        """Read nothing yet.
+        """Read nothing yet; the result for frames `before` those of the source is returned, too.
 
-        Args:
-            mask_folder: Existing folder for a mask of every frame, an empty one where the person
-                was not found; None writes none.
-            before: Result for the frames before those of `source`; it is returned with the rest.
+        The folder, if any, exists, for a mask of every frame: an empty one without the person.
         """
         self._source, self._tracker, self._refine = source, tracker, refine
         self._mask_folder, self._before = mask_folder, before
@@ -247,8 +242,8 @@ def mark_passers_by(track: KeypointTrack) -> KeypointTrack:
     marked = crowded.copy()
     edges = np.flatnonzero(np.diff(np.concatenate([[False], crowded, [False]])))
     for first, last in frames[edges.reshape(-1, 2) - [0, 1]]:
-        before = landings[(landings >= first - RETURN_FRAMES) & (landings <= first)]
-        after = landings[(landings > last) & (landings <= last + RETURN_FRAMES)]
+        before = landings[(landings >= first - 20) & (landings <= first)]
+        after = landings[(landings > last) & (landings <= last + 20)]
         start, end = min(before, default=first), max(after, default=last + 1)
         marked |= (frames >= start) & (frames < end)
     return replace(track, problems=track.problems | marked * bit)
