@@ -42,9 +42,6 @@ MIN_NORMAL_LENGTH = 0.5
 """Length of a ray's mean normal below which it has no direction."""
 MEMORY_RAYS = 60_000.0
 """Rays after which an earlier one weighs 1/e."""
-UNEXPLAINED_SHARE, EXPLAINED_SHARE = 0.02, 0.06
-"""Share of the squared error that shading has to explain: below the first it is not believed, from
-the second on it is believed in full."""
 MIN_FACTOR, MAX_FACTOR = 0.3, 3.0
 """Bounds of the factor."""
 OBSERVATION_INTERVAL = 4
@@ -138,7 +135,8 @@ class OrientationShading:
         constant = power - moments[0] ** 2 / gram[0, 0]
         rest = power - 2.0 * found @ moments + found @ gram @ found
         explained = 1.0 - rest / max(constant, 1e-12)
-        belief = (explained - UNEXPLAINED_SHARE) / (EXPLAINED_SHARE - UNEXPLAINED_SHARE)
+        # shading that explains 2 % of the squared error is not believed, 6 % in full
+        belief = (explained - 0.02) / (0.06 - 0.02)
         found /= (gram[0] @ found) / gram[0, 0]
         return (unit + min(max(belief, 0.0), 1.0) * (found - unit)).astype(np.float32)
 

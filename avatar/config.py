@@ -20,9 +20,6 @@ imitates views in poses that are off: together they cost an exact actor 0.8 to 1
 and give phone-like ones 0.1 to 0.6 dB, half of the samples and whole surfaces."""
 NOMINAL_STEPS_PER_S = 50.0
 """Training steps that stand for one second where steps are counted; two cores make about these."""
-MAX_SAMPLE_STEP_M = 0.015
-"""Largest distance between samples along a ray at the beginning of training, metres; limbs are five
-times as thick."""
 HELD_OUT_STRIDE = 10
 """Default stride between held-out frames."""
 
@@ -135,7 +132,8 @@ class TrainConfig:
     def sample_step_at(self, detail_share: float) -> float:
         """Distance between samples along a ray at a progress from fog to detail, in [0, 1], m."""
         factor = 1.0 + (self.initial_step_factor - 1.0) * (1.0 - detail_share)
-        return max(min(factor * self.sample_step_m, MAX_SAMPLE_STEP_M), self.sample_step_m)
+        # at most 1.5 cm: limbs are five times as thick
+        return max(min(factor * self.sample_step_m, 0.015), self.sample_step_m)
 
     @classmethod
     def for_budget(

@@ -27,10 +27,6 @@ MIN_STEP_OPACITY = 0.02
 """Opacity of one step through a cell below which the cell is empty."""
 NEAR_SKIN_M = 0.03
 """Distance from the skin within which a component's cells count towards its size, metres."""
-INTERIOR_DEPTH_M = 0.015
-"""Depth under the skin from which the body is solid even if its shape fits badly, metres."""
-OFF_SKIN_M = 0.03
-"""Distance from the skin within which clothes are spared, metres."""
 MIN_COMPONENT_SHARE = 0.003
 """Size, relative to the largest component, below which a component is a floater."""
 CALLS_PER_DRAW = 16
@@ -55,13 +51,14 @@ class OccupancyGrid:
         )
         self.band_cells: Int64[Tensor, " band"] = band.flatten().nonzero()[:, 0]
         self._band = self._in_band = band.to(torch.uint8)
-        interior = np.argwhere(rig.inside_skin & (rig.skin_distance > INTERIOR_DEPTH_M))
+        # metres: solid even if its shape fits badly
+        interior = np.argwhere(rig.inside_skin & (rig.skin_distance > 0.015))
         weights = rig.weights_at(rig.box_low + (interior + 0.5) / rig.cells_per_m)
         flat = np.ravel_multi_index(tuple(interior.T), band.shape)
         self._interior_cells = torch.from_numpy(flat)
         self._deep_head_cells = torch.from_numpy(flat[weights[:, HEAD_JOINT] > 0.5])
         self._head_cells = self._deep_head_cells
-        off_skin = torch.from_numpy(~rig.inside_skin & (rig.skin_distance > OFF_SKIN_M))
+        off_skin = torch.from_numpy(~rig.inside_skin & (rig.skin_distance > 0.03))  # off clothes
         self._off_skin_cells = (band & off_skin).flatten().nonzero()[:, 0]
         self._near_skin = rig.skin_distance <= NEAR_SKIN_M
         self._cached_empty_cells: tuple[int, Tensor] | None = None

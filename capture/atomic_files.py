@@ -272,11 +272,8 @@ def _temporary_name(kind: str, suffix: str = "") -> str:
     return f"{RESERVED_PREFIX}{os.getpid()}-{secrets.token_hex(8)}.{kind}{suffix}"
 
 
-STREAM_PATH = re.compile(r"/dev/(stdin|stdout|stderr|fd/\d+)|/proc/(self|\d+)/fd/\d+")
-"""Paths of open streams, which are never replaced."""
-
-
 def is_stream(path: Path) -> bool:
     """Return whether a name is that of a device or a pipe; stdout is one wherever it leads."""
-    named = STREAM_PATH.fullmatch(str(path.absolute())) is not None
+    streams = r"/dev/(stdin|stdout|stderr|fd/\d+)|/proc/(self|\d+)/fd/\d+"
+    named = re.fullmatch(streams, str(path.absolute())) is not None
     return named or (path.exists() and not (path.is_file() or path.is_dir()))

@@ -16,8 +16,6 @@ from capture.source import ASSUMED_FPS, Frame, FrameSelection, FrameSource, RgbI
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"})
 """File endings of images that are read."""
-ALPHA_SUFFIXES = frozenset({".png", ".webp", ".bmp", ".tif", ".tiff"})
-"""File endings of images that can have an alpha channel."""
 
 
 def natural_sort_key(path: Path) -> list[tuple[int, str]]:
@@ -88,7 +86,7 @@ def any_has_cutout_alpha(images: Sequence[Path]) -> bool:
 
     One image proves nothing: matting tools write opaque ones at first, or where nothing is found.
     """
-    able = [path for path in images if path.suffix.lower() in ALPHA_SUFFIXES]
+    able = [path for path in images if path.suffix.lower() not in (".jpg", ".jpeg")]
     places = np.linspace(0, len(able) - 1, min(5, len(able))).round().astype(int)
     for path in (able[place] for place in places):
         try:

@@ -25,8 +25,6 @@ from capture.source import ASSUMED_FPS, Frame, FrameSelection, FrameSource, Paci
 
 CAMERA_PREFIX = "camera:"
 """Start of an argument that names a camera instead of a file."""
-MAX_QUEUED_FRAMES = 16
-"""Most frames that wait, so that one whose pose is late does not cost the next ones."""
 
 
 @cache
@@ -91,7 +89,8 @@ class CameraDevice(FrameSource):
 
     def frames(self) -> Iterator[Frame]:
         """The images as they come; to be read once."""
-        self._inbox = inbox = Inbox(self._read(), capacity=MAX_QUEUED_FRAMES, live=True)
+        # as many may wait: one whose pose is late does not cost the next ones
+        self._inbox = inbox = Inbox(self._read(), capacity=16, live=True)
         while not (inbox.finished or self._pace.stopped):
             began = time.perf_counter()
             taken = inbox.take(timeout_s=0.1, max_items=1)

@@ -30,8 +30,6 @@ from export.player_inputs import (
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import body_from_rest, world_from_body
 
-MAX_CLOSE_DIFFERENCE = 2
-"""Largest difference of a premultiplied channel between pixels that count as close, in 1/255."""
 MIN_SAME_PSNR = 48.0
 """Least PSNR between pictures that count as the same, dB.
 
@@ -45,7 +43,7 @@ class PictureDifference:
 
     Attributes:
         largest_difference: Over all pixels and channels, in 1/255.
-        close_fraction: Fraction of the pixels that differ by at most `MAX_CLOSE_DIFFERENCE`.
+        close_fraction: Fraction of the pixels that differ by at most 2/255.
         psnr: Over all pixels and channels, dB; at most 90.
     """
 
@@ -61,7 +59,7 @@ class PictureDifference:
         difference = np.abs(a - b).max(axis=-1) * 255.0
         return cls(
             largest_difference=float(difference.max()),
-            close_fraction=float((difference <= MAX_CLOSE_DIFFERENCE).mean()),
+            close_fraction=float((difference <= 2).mean()),
             psnr=float(-10.0 * np.log10(max(np.mean((a - b) ** 2), 1e-9))),
         )
 
@@ -95,8 +93,6 @@ def picture_on_white(
     return np.clip(premultiplied[..., :3] + (1.0 - premultiplied[..., 3:]), 0.0, 1.0)
 
 
-MIN_ORT_VERSION = "1.24"
-"""Oldest release of onnxruntime that the player runs on."""
 IN_MEMORY_TABLES = "add_external_initializers_from_files_in_memory"
 """Method of `SessionOptions` that older releases lack."""
 
@@ -322,7 +318,7 @@ def create_session(
     names, buffers = list(tables), list(tables.values())
     if not hasattr(options, IN_MEMORY_TABLES):
         raise InputError(
-            f"onnxruntime {onnxruntime.__version__} is too old for the player; {MIN_ORT_VERSION} "
+            f"onnxruntime {onnxruntime.__version__} is too old for the player; 1.24 "
             "or newer is needed: pip install --upgrade onnxruntime (or the build that you use)."
         )
     getattr(options, IN_MEMORY_TABLES)(names, buffers, [len(buffer) for buffer in buffers])

@@ -51,11 +51,6 @@ TARBALL_MEMBERS = {
 """Stored files by name, and the tarball's members they come from."""
 LICENCE_FILES = ("LICENSE", "ThirdPartyNotices.txt")
 """Notices, from the Python package of the same project, as the npm package has none."""
-MISSING_MESSAGE = (
-    "The browser page needs onnxruntime-web, which is not in {folder}. Fetch it once with npm, "
-    "which comes with Node.js (33 MB): {command}"
-)
-"""Message of `runtime_files` for a missing file."""
 
 
 def install_runtime(tarball: bytes) -> None:
@@ -89,7 +84,10 @@ def runtime_files() -> dict[str, bytes]:
     missing = [name for name in wanted if not (RUNTIME_FOLDER / name).is_file()]
     if missing:
         command = quote_command(sys.executable, "-m", "instant_avatar.animation.web_server")
-        raise InputError(MISSING_MESSAGE.format(folder=RUNTIME_FOLDER, command=command))
+        raise InputError(
+            f"The browser page needs onnxruntime-web, which is not in {RUNTIME_FOLDER}. Fetch it "
+            f"once with npm, which comes with Node.js (33 MB): {command}"
+        )
     return {name: (RUNTIME_FOLDER / name).read_bytes() for name in wanted}
 
 

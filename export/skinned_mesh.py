@@ -32,8 +32,6 @@ CODE_CONTRAST = 40.0
 """Density codes above and below the level to which densities are clipped."""
 COLOR_STEP_M = 0.002
 """Step of the rays that give vertices their colors, metres."""
-MIN_COLOR_ALPHA = 0.2
-"""Alpha below which a vertex takes the color of the nearest other one."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -256,7 +254,7 @@ def _vertex_colors(
         passed = left
     opaque = 1.0 - passed
     colors = np.clip(np.round(total / np.maximum(opaque, 1e-3)[:, None]), 0, 255).astype(np.uint8)
-    blank, known = opaque < MIN_COLOR_ALPHA, np.flatnonzero(opaque >= MIN_COLOR_ALPHA)
+    blank, known = opaque < 0.2, np.flatnonzero(opaque >= 0.2)
     if blank.any() and len(known):
         colors[blank] = colors[known[KDTree(nodes[known]).query(nodes[blank])[1]]]
     return colors

@@ -13,10 +13,6 @@ from scipy.spatial.transform import Rotation
 
 from capture.camera import Camera
 
-ELEVATION_RAD = 0.3
-"""Angle by which every second one looks down, and the others up."""
-DISTANCE_SIZES = 1.5
-"""Distance of the cameras from the avatar's middle, in widths of what they see."""
 MARGIN = 1.15
 """Width of what they see, in diagonals of the avatar's box."""
 ITERATIONS = 8
@@ -36,11 +32,11 @@ def cameras_around(
     low, high = positions.min(axis=0), positions.max(axis=0)
     middle, size_m = 0.5 * (low + high), MARGIN * float(np.linalg.norm(high - low))
     side = int(np.ceil(size_m / pixel_m))
-    focal, distance_m = side * DISTANCE_SIZES, DISTANCE_SIZES * size_m
+    focal, distance_m = side * 1.5, 1.5 * size_m
     found = []
     for number in range(views):
         turn = 2.0 * np.pi * number / views
-        tilt = ELEVATION_RAD if number % 2 else -ELEVATION_RAD
+        tilt = 0.3 if number % 2 else -0.3  # radians, down and up
         # the first camera, before the body, looks along -z with y down
         right_up = Rotation.from_euler("YX", [np.pi + turn, tilt]).as_matrix().T
         axes = np.diag([-1.0, -1.0, 1.0]) @ right_up

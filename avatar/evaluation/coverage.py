@@ -269,11 +269,7 @@ def _area_share(areas: Float32[np.ndarray, "patches"], seen: Any) -> float:
 
 MIN_UNSEEN_OF_SIDE, MIN_UNSEEN_OF_LIMB = 0.5, 0.75
 """Unseen share from which a limb's side, and a whole limb, are called unseen."""
-TURN_SIDES = ("front", "back", "left", "right")
-"""Sides of the whole body, which turning shows."""
 SEEN_COMPLETELY = "It was seen from all sides."
-SEEN_NEARLY = "Nearly everything was seen; only small pieces are missing."
-"""It names no share, which changes with each frame: a page that speaks would begin again."""
 PARTS_OF_LIMB = {
     "hand": ("hand",),
     "foot": ("foot",),
@@ -327,7 +323,10 @@ def coverage_advice(coverage: Coverage) -> str:
     region = largest_unseen_region(coverage)
     if region is not None:
         return _advice_sentence(region)
-    return SEEN_COMPLETELY if coverage.seen_share >= 0.95 else SEEN_NEARLY
+    if coverage.seen_share >= 0.95:
+        return SEEN_COMPLETELY
+    # no share, which changes with each frame: a page that speaks would begin again
+    return "Nearly everything was seen; only small pieces are missing."
 
 
 def largest_unseen_region(coverage: Coverage) -> UnseenRegion | None:
@@ -337,9 +336,10 @@ def largest_unseen_region(coverage: Coverage) -> UnseenRegion | None:
     limb grows by the same region of the other one if that is unseen as well.
     """
     patches, unseen = coverage.patches, coverage.stages < VisibilityStage.SEEN
-    sides = {side: patches.sides == SIDE_NAMES.index(side) for side in TURN_SIDES}
+    turns = SIDE_NAMES[:4]  # which turning shows
+    sides = {side: patches.sides == SIDE_NAMES.index(side) for side in turns}
     shares = {side: _area_share(patches.areas[at], unseen[at]) for side, at in sides.items()}
-    worst = max(TURN_SIDES, key=shares.__getitem__)
+    worst = max(turns, key=shares.__getitem__)
     everything = min(shares.values()) >= MIN_UNSEEN_OF_LIMB
     where = unseen if everything else unseen & sides[worst]
     if shares[worst] >= MIN_UNSEEN_OF_SIDE:

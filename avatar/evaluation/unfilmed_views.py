@@ -39,8 +39,6 @@ UNFILMED_POSES: tuple[dict[int, tuple[float, float, float]], ...] = (
 )  # fmt: skip
 """Axis-angle rotations, radians, of the joints that each pose moves: a lifted knee with one arm
 raised, and a step with one arm forward."""
-MIN_SEEN_ALPHA, MIN_OPAQUE_ALPHA = 0.1, 0.9
-"""Alphas between which a pixel is half transparent."""
 
 
 def unfilmed_views(rig: Rig) -> Iterator[tuple[BodyPose, Camera]]:
@@ -90,7 +88,7 @@ def half_transparent_share(pictures: Sequence[Float32[np.ndarray, "height width 
     as wholly transparent.
     """
     alphas = np.concatenate([picture[..., 3].ravel() for picture in pictures])
-    seen = alphas > MIN_SEEN_ALPHA
+    seen = alphas > 0.1
     if not seen.any():
         return 1.0
-    return float((alphas[seen] < MIN_OPAQUE_ALPHA).mean())
+    return float((alphas[seen] < 0.9).mean())

@@ -37,21 +37,13 @@ the right place from a few millimetres away only, and win nothing; without those
 drift in long trainings, which costs 2 dB in new poses."""
 EVIDENCE_EMA_DECAY = 0.95
 """Decay of the mean evidence and of the share of corrections that moved a pose."""
-MAX_ESTIMATED_INTERVAL = 4
-"""Most steps between pose gradients of estimated poses, when steps are short."""
 RESOLVE_DISTANCE_M = 0.08
 """Motion of a joint after which the frame's correspondences are solved again, metres."""
 FIRST_CORRECTION_STEPS = 60
 """Training steps on a frame before its pose is first corrected. Earlier the field does not know the
 view, and new content looks like a pose error."""
-MIN_STEPS_BEFORE_FREEZE = 300
-"""Training steps on a frame before its pose may be frozen as exact."""
 MIN_ESTIMATES_BEFORE_FREEZE = 3
 """Gauss-Newton estimates of a pose before it may be frozen as exact."""
-MAX_EXACT_EVIDENCE = 1.3
-"""Evidence, averaged over the frame and all frames, below which a pose is exact and is frozen.
-Otherwise noise would move it, the motion would blur the field, and the blurred field would move the
-next pose: at 540 px this diverged after three thousand steps."""
 FREEZE_AFTER_STEPS = 3000
 """Training steps on a frame after which its pose is frozen; by then the field has memorised it."""
 
@@ -185,11 +177,12 @@ class PoseOptimizer:
         long enough, are frozen.
         """
         age = step - self._added_at_step
-        self._can_freeze = age >= MIN_STEPS_BEFORE_FREEZE
+        self._can_freeze = age >= 300
         if self.poses_may_be_exact:
             evidence = self._evidence_sum / self._estimate_count.clip(min=1)
+            # frozen, as noise would move it, that blur the field, and the field the next pose
             exact = (self._estimate_count >= MIN_ESTIMATES_BEFORE_FREEZE) & (
-                0.5 * (evidence + self._evidence) < MAX_EXACT_EVIDENCE
+                0.5 * (evidence + self._evidence) < 1.3
             )
             self._is_frozen |= exact | (age >= FREEZE_AFTER_STEPS)
         open_now = self._is_held & ~self._is_frozen & (age >= FIRST_CORRECTION_STEPS)
@@ -250,7 +243,7 @@ class PoseOptimizer:
         """Steps between pose gradients: more where poses prove to be exact, or steps are short."""
         if self.poses_may_be_exact:
             return min(max(round(0.5 / max(self._moved_share, 1e-3)), 1), 8)
-        return min(max(round(0.5 / max(rate, 1e-3)), 1), MAX_ESTIMATED_INTERVAL)
+        return min(max(round(0.5 / max(rate, 1e-3)), 1), 4)
 
     def needs_resolve(self, slot: int) -> bool:
         """Checks if the slot's pose is too far from the one its correspondences were solved for.

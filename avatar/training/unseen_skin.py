@@ -49,14 +49,6 @@ MIRRORED_PART = np.array([0, 2, 1, 4, 3, 6, 5, 7, 9, 8, 11, 10, 13, 12])
 TORSO = 0
 HEAD, FEET = HEAD_PART, (5, 6)
 """Parts whose front and back are not alike."""
-NECKLINE_SLOPE, NECKLINE_REACH = 0.4, 0.4
-"""Slope by which a neckline falls from back to front at the neck's base (22°), and the share of the
-torso's height below the neck over which the slope falls to 0."""
-ROW_M, COLOR_SPREAD, LEAST_SHARE = 0.08, 0.12, 0.02
-"""Standard deviations of height along the bone, metres, and of color within which patches are
-compared, and the least share of a color at the outline."""
-EARS_BACK_SHARE, THROAT_BACK_SHARE = 0.33, 0.5
-"""Where ears and throat end, shares of the head's depth from its back."""
 NEAR_SKIN_M = 0.025
 """Distance from the skin within which most surfaces lie, metres."""
 MIN_WEIGHT = 0.02
@@ -74,17 +66,11 @@ MIN_PERSON_ALPHA = 127
 UNSEEN_COSINE, SEEN_COSINE = 0.1, 0.4
 """Cosines between normal and view direction up to which a patch counts as not seen (84°), and from
 which it counts as seen (66°)."""
-BORDER_PX = 0.5, 3.0
-"""Distances from the person's outline up to which a pixel shows the background's color, and from
-which the skin's alone: a video has one color for each 2 x 2 pixels, and smears it."""
-DEPTH_UNKNOWN_SPREAD, DEPTH_KNOWN_SPREAD = 0.3, 0.8
-"""Standard deviations of the directions from which a patch was seen, up to which its depth counts
-as unknown, and from which as known, radians: about those of a sixth of a turn, and of a whole."""
 
 
 @final
 class SkinEvidence:
-    """How each patch of a rig's skin was seen; less near the person's outline (`BORDER_PX`).
+    """How each patch of a rig's skin was seen; less near the person's outline.
 
     Attributes:
         cosines: Largest cosine at which it was seen, in [0, 1]; 0 if it never was.
@@ -126,7 +112,8 @@ class SkinEvidence:
         shown = visible_points(plane, depths, cosines, margin_cells=1)
         within, colors = _pixels_of(in_camera, frame)
         shown &= within > 0.0
-        cosines = cosines * _smooth_step(within, *BORDER_PX)
+        # a video has one color for each 2 x 2 pixels, and smears it: the background's up to 0.5
+        cosines = cosines * _smooth_step(within, 0.5, 3.0)
         cosines = np.where(shown, cosines, 0.0)
         np.maximum(self.cosines, cosines, out=self.cosines)
         self.seen_frames += _smooth_step(cosines, UNSEEN_COSINE, SEEN_COSINE)
@@ -158,7 +145,7 @@ class SkinEvidence:
         """
         length = np.linalg.norm(self._direction_sums, axis=1) / np.maximum(self._frames, 1.0)
         spread = np.sqrt(np.clip(2.0 - 2.0 * length, 0.0, 2.0)) * (self._frames > 0.0)
-        return _smooth_step(spread, DEPTH_UNKNOWN_SPREAD, DEPTH_KNOWN_SPREAD)
+        return _smooth_step(spread, 0.3, 0.8)  # radians: a sixth of a turn, and a whole one
 
 
 def _smooth_step(
@@ -415,10 +402,8 @@ def _neckline_lift(
     depth = np.where(parts == TORSO, 2.0 * local[:, 0], 0.0)
     lift = np.zeros(len(local))
     for _ in range(3):
-        slopes = _smooth_step(
-            np.stack([local[:, 2], local[:, 2] + lift]), (1.0 - NECKLINE_REACH) * neck, neck
-        )
-        lift = NECKLINE_SLOPE * depth * slopes.mean(axis=0)
+        slopes = _smooth_step(np.stack([local[:, 2], local[:, 2] + lift]), (1.0 - 0.4) * neck, neck)
+        lift = 0.4 * depth * slopes.mean(axis=0)  # falls by 22° at the neck's base
     return lift
 
 
@@ -486,12 +471,12 @@ def _rarity_at_outline(
         here = np.flatnonzero((rig.seed_parts == part) & (evidence.seen > 0.0))
         if part == HEAD or not len(here):
             continue
-        height = frames.to_bone(rig.seeds[here], rig.seed_parts[here])[:, 2] / ROW_M
+        height = frames.to_bone(rig.seeds[here], rig.seed_parts[here])[:, 2] / 0.08  # metres
         near = np.exp(-0.5 * np.subtract.outer(height, height) ** 2) * outline[here]
         apart = cdist(evidence.colors[here], evidence.colors[here], "sqeuclidean")
-        alike = (near * np.exp(-0.5 / COLOR_SPREAD**2 * apart)).sum(axis=1)
+        alike = (near * np.exp(-0.5 / 0.12**2 * apart)).sum(axis=1)
         share = (alike + 1e-6) / (near.sum(axis=1) + 1e-6)
-        rarity[here] = -np.log(np.maximum(share, LEAST_SHARE))
+        rarity[here] = -np.log(np.maximum(share, 0.02))
     return rarity
 
 
@@ -503,7 +488,7 @@ def _faces(frames: _BoneFrames, rig: Rig) -> Float[np.ndarray, "seeds"]:
         return np.zeros(len(head))
     forward = (forward - forward[head].min()) / np.ptp(forward[head])
     height = height / height[head].max()
-    behind = np.where(height > 0.3, EARS_BACK_SHARE, THROAT_BACK_SHARE)
+    behind = np.where(height > 0.3, 0.33, 0.5)  # ears and throat end there, from the back
     middle = 1.0 - (aside / np.abs(aside[head]).max()) ** 2
     # heights as shares of the head's: the neck ends at 0.3; hair covers what is above the line
     hairline = np.interp(forward * middle, (0.0, 1.0), (0.7, 0.92))

@@ -30,8 +30,6 @@ from export.player import picture_on_white
 from export.player_inputs import fit_camera
 from preprocess.body.body_pose import BodyPose
 
-MAX_SEGMENTS = 1_600_000
-"""Add no picture beyond this number of segments; rays through fog have many."""
 PosedView = tuple[BodyPose, Camera]
 """A pose and a camera that looks at it."""
 RgbaPicture = Float32[np.ndarray, "height width 4"]
@@ -93,8 +91,6 @@ FREE_ROUNDS = 1
 """SIRT rounds in which each voxel has its own codes; a second gains 0.05 dB."""
 SHARED_ROUNDS = 2
 """SIRT rounds in which the voxels of a cell share a code."""
-MAX_DENSITY_CODE_CHANGE = 24
-"""Largest change of a density code: twice or half as dense as the field."""
 POSE_NOISE_RAD = 0.05
 """Standard deviation of joint rotations about a view's pose in training pictures, radians."""
 NOVEL_POSES = 2
@@ -141,8 +137,8 @@ class FineTuningInputs:
     ) -> list[RenderTargets]:
         """Draw views with the renderer while the player's rays are traced beside it, for each tier.
 
-        A tier gets all views, or the first of them that reach `MAX_SEGMENTS`; `on_picture` is
-        called after each picture.
+        A tier gets all views, or the first of them that reach 1.6 million segments (rays
+        through fog have many); `on_picture` is called after each picture.
         """
         drawn = [list[tuple[TracedPicture, RgbaPicture]]() for _ in tiers]
         tracers = [self._tracers[tier] for tier in tiers]
@@ -156,7 +152,7 @@ class FineTuningInputs:
             waiting = [
                 (parts, trace)
                 for parts, trace in zip(drawn, traced, strict=True)
-                if sum(len(each.segments.step_m) for each, _ in parts) <= MAX_SEGMENTS
+                if sum(len(each.segments.step_m) for each, _ in parts) <= 1_600_000
             ]
             if not waiting:
                 break
@@ -314,11 +310,11 @@ class _SirtSolver:
 def _take_step(
     codes: VoxelCodes, update: SirtUpdate, middle: Float32[np.ndarray, "voxels"]
 ) -> None:
-    """Change codes, in place; densities stay within `MAX_DENSITY_CODE_CHANGE` about `middle`."""
+    """Change codes, in place; densities stay within half and twice `middle`."""
     # a voxel seen by less than half a ray hardly changes
     color_step = update.color / (update.color_normalizer + np.float32(0.5))[:, None]
     # ten rays whose colors change by 0.01 with every code
     density_step = update.density / (update.density_normalizer + np.float32(1e-3))
-    low, high = middle - MAX_DENSITY_CODE_CHANGE, middle + MAX_DENSITY_CODE_CHANGE
+    low, high = middle - 24, middle + 24
     codes.color[:] = np.clip(codes.color - color_step, 0.0, 255.0)
     codes.density[:] = np.clip(np.clip(codes.density - density_step, low, high), 0.0, 255.0)

@@ -7,9 +7,7 @@ import pytest
 import torch
 
 from avatar.occupancy_grid import (
-    INTERIOR_DEPTH_M,
     MIN_STEP_OPACITY,
-    OFF_SKIN_M,
     OccupancyGrid,
     dilate,
     find_floaters,
@@ -143,7 +141,7 @@ def test_solid_points_lie_deep_under_the_skin(rig, occupancy, generator):
     cell = ((points - occupancy.density_grid.low) * occupancy.density_grid.cells_per_m).long()
     assert len(points) == 500
     assert rig.inside_skin[tuple(cell.T.numpy())].all()
-    assert (rig.skin_distance[tuple(cell.T.numpy())] > INTERIOR_DEPTH_M).all()
+    assert (rig.skin_distance[tuple(cell.T.numpy())] > 0.015).all()
 
 
 def test_points_off_the_skin_are_where_no_clothes_are(rig, generator):
@@ -152,7 +150,7 @@ def test_points_off_the_skin_are_where_no_clothes_are(rig, generator):
     cell = ((points - occupancy.density_grid.low) * occupancy.density_grid.cells_per_m).long()
     distance = rig.skin_distance[tuple(cell.T.numpy())]
     assert len(points) == 500
-    assert ((distance > OFF_SKIN_M) & (distance <= CLOTHING_BAND_M)).all()
+    assert ((distance > 0.03) & (distance <= CLOTHING_BAND_M)).all()
     assert not rig.inside_skin[tuple(cell.T.numpy())].any()
 
 

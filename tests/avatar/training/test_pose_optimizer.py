@@ -20,10 +20,8 @@ from avatar.training.pose_correction import MIN_RAY_LOSS, SIGMA_OF_ROW
 from avatar.training.pose_optimizer import (
     FIRST_CORRECTION_STEPS,
     FREEZE_AFTER_STEPS,
-    MAX_ESTIMATED_INTERVAL,
     MIN_ESTIMATES_BEFORE_FREEZE,
     MIN_POSE_GRADIENT_CELL_M,
-    MIN_STEPS_BEFORE_FREEZE,
     PoseOptimizer,
 )
 from avatar.training.trainer import Trainer, cosine_decay
@@ -331,7 +329,7 @@ def test_a_pose_whose_rays_do_not_agree_is_exact_and_stays(rig, bent_pose, gener
     table, pose = PoseOptimizer(rig, 2), pose_of(bent_pose)
     table.set_pose(0, pose)
     table.set_pose(1, pose)
-    loss, later = torch.full((300,), 0.1), MIN_STEPS_BEFORE_FREEZE
+    loss, later = torch.full((300,), 0.1), 300
 
     def pulled(step, slot, bias):
         table.freeze_converged(step)
@@ -363,7 +361,7 @@ def test_estimated_poses_follow_their_rays_even_where_these_hardly_agree(rig, be
     assert not tables[0].freeze_converged(FREEZE_AFTER_STEPS)
     assert tables[1].freeze_converged(FREEZE_AFTER_STEPS)
     assert tables[1].correction_interval(1.0) == 1
-    assert tables[1].correction_interval(0.1) == MAX_ESTIMATED_INTERVAL
+    assert tables[1].correction_interval(0.1) == 4
 
 
 def test_a_held_out_pose_follows_more_rays_and_its_given_pose_less(rig, bent_pose, generator):

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from avatar import radiance_field
-from avatar.config import MAX_SAMPLE_STEP_M, TrainConfig
+from avatar.config import TrainConfig
 from avatar.kernels import numba_training_step, operations
 from avatar.kernels.numba_priors import OPACITY_LENGTH_M
 from avatar.kernels.operands import MarchSettings, RaySamples
@@ -204,5 +204,5 @@ def test_samples_are_coarse_at_first_and_fine_at_last():
     config = TrainConfig(sample_step_m=0.004, initial_step_factor=3.0)
     assert config.sample_step_at(0.0) == pytest.approx(0.012)
     assert config.sample_step_at(1.0) == pytest.approx(0.004)
-    assert TrainConfig(sample_step_m=0.01).sample_step_at(0.0) == MAX_SAMPLE_STEP_M
+    assert TrainConfig(sample_step_m=0.01).sample_step_at(0.0) == 0.015
     assert TrainConfig(sample_step_m=0.02).sample_step_at(0.0) == 0.02  # never finer than stated
