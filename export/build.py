@@ -192,8 +192,7 @@ def export_field(
         draft = _PackageDraft(
             path=path, rig=rig, views=views, exact=exact, metrics=metrics, executor=executor
         )
-        settings = {tier: QUALITY_TIERS[tier] for tier in config.tiers}
-        baked = FineTuningResult(tables=baking.result(), settings=settings, psnr=None)
+        baked = FineTuningResult(tables=baking.result(), settings=QUALITY_TIERS, psnr=None)
         first: ExportReport | None = None
         if baked_first or not config.fine_tuning_pictures:
             first = draft.write(
@@ -212,15 +211,15 @@ def export_field(
 
         tuned = _fine_tune(
             FineTuningInputs(
-                tables=baked.tables, rig=rig, settings=settings, renderer=renderer, views=views,
-                executor=executor,
+                tables=baked.tables, rig=rig, settings=QUALITY_TIERS, renderer=renderer,
+                views=views, executor=executor,
             ),
             bake_again, config.fine_tuning_pictures,
             lambda done: progress(0.25 + 0.55 * done),  # the rest are the checks
         )  # fmt: skip
         warnings = [] if tuned.psnr else [INTERRUPTED_WARNING]
         if tuned.psnr or not baked_first:
-            is_checked = first is not None and tuned.settings == settings
+            is_checked = first is not None and tuned.settings == QUALITY_TIERS
             yield draft.write(
                 tuned, warnings, seconds=time.perf_counter() - started,
                 difference=first.largest_difference if first and is_checked else None,

@@ -22,7 +22,6 @@ from export.package.player_tables import (
     BRICK_SIZE,
     COLOR_CODE_STEP,
     DENSITY_CODE_STEP,
-    QUALITY_TIERS,
     SURFEL_BITS,
     THICKNESS_STEP_M,
     WEIGHT_SCALE,
@@ -113,7 +112,6 @@ class BakeConfig:
         surfel_spacing_m: Cell of the surface's extraction; enlarged until surfels can be numbered.
         surface_density: Density of the surface, 1/m; less where the whole field is faint.
         faint_fraction: Upper bound of that, as a fraction of visible density's 99th percentile.
-        tiers: Quality tiers; "hq" is always among them.
         fine_tuning_pictures: Pictures on which bricks are fine-tuned; 0 for no fine-tuning.
     """
 
@@ -121,7 +119,6 @@ class BakeConfig:
     surfel_spacing_m: float = 0.006
     surface_density: float = 20.0
     faint_fraction: float = 0.1
-    tiers: tuple[str, ...] = tuple(QUALITY_TIERS)
     fine_tuning_pictures: int = 0
 
     @classmethod

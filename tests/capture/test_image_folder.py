@@ -25,12 +25,9 @@ def test_pictures_come_in_natural_order_and_exactly(write_images):
     np.testing.assert_allclose([frame.time_s for frame in frames], np.arange(12) / 30)
     assert source.frame_count == source.count_frames() == 12
     assert not source.warnings
-
-
-def test_a_selection_of_pictures_keeps_their_numbers(write_images):
-    source = open_source(write_images(12), frames=slice(1, 10, 3))
-    assert [frame.index for frame in source.frames()] == [1, 4, 7]
-    assert source.frame_count == 3
+    some = open_source(source.path, frames=slice(1, 10, 3))
+    assert [frame.index for frame in some.frames()] == [1, 4, 7]
+    assert some.frame_count == 3
 
 
 @pytest.mark.parametrize("ending", ["png", "webp"])

@@ -33,8 +33,9 @@ def on_white(picture):
 
 
 @pytest.mark.parametrize("tier", ["hq", "lite"])
-@pytest.mark.parametrize("posed", ["canonical", "bent"])
-@pytest.mark.parametrize(("size", "distance_m"), [((96, 120), 3.0), ((131, 77), 1.2)])
+@pytest.mark.parametrize(
+    ("posed", "size", "distance_m"), [("canonical", (96, 120), 3.0), ("bent", (131, 77), 1.2)]
+)
 def test_the_graph_draws_what_the_reference_draws(
     exported, tables, stand_in, bent, camera, tier, posed, size, distance_m
 ):
@@ -154,9 +155,7 @@ def test_a_twisted_sleeve_looks_like_its_mesh(exported, tables, camera, tier, la
     assert (apart[body] > 0.2).mean() < 0.0035
 
 
-@pytest.mark.parametrize(
-    ("layers", "other_sheet_gap_m"), [(1, 0.01), (2, -0.015), (3, -0.015), (4, 0.01)]
-)
+@pytest.mark.parametrize(("layers", "other_sheet_gap_m"), [(1, 0.01), (2, -0.015), (4, 0.01)])
 def test_any_number_of_layers_is_drawn_as_in_the_reference(
     exported, tables, stand_in, bent, camera, layers, other_sheet_gap_m
 ):

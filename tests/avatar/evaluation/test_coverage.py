@@ -5,9 +5,11 @@ import pytest
 
 from avatar.evaluation.coverage import (
     PART_NAMES,
+    SEEN_COMPLETELY,
     SIDE_NAMES,
     Coverage,
     VisibilityStage,
+    coverage_advice,
     pose_patches,
 )
 
@@ -65,6 +67,7 @@ def test_turning_once_shows_all_around(observed, coverage):
     assert coverage.seen_share > 0.93
     for name in ("torso", "left thigh", "right shin", "left forearm"):
         assert min(coverage.by_part()[name].values()) > 0.9
+    assert coverage_advice(coverage) == SEEN_COMPLETELY
 
 
 def test_an_arm_before_the_chest_hides_it(shaped, observed):

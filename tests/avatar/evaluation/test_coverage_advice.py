@@ -12,8 +12,6 @@ from avatar.evaluation.coverage import (
     coverage_advice,
 )
 
-AROUND = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
-
 
 def without(
     coverage: Coverage, where: np.ndarray, stage: VisibilityStage = VisibilityStage.FACING_AWAY
@@ -54,14 +52,8 @@ def test_the_side_is_the_persons_and_opposite_to_the_seen_one(observed, coverage
     assert coverage_advice(coverage) == sentence
 
 
-def test_turning_once_is_enough(observed, coverage):
-    for turned in AROUND:
-        coverage.add(observed(turned=turned))
-    assert coverage_advice(coverage) == SEEN_COMPLETELY
-
-
 def test_feet_below_the_picture_ask_for_a_step_back(observed, coverage):
-    for turned in AROUND:
+    for turned in np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False):
         coverage.add(observed(turned=turned, up_m=1.0))
     assert coverage_advice(coverage) == "Step back: no picture shows your legs."
 

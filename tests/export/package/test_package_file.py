@@ -19,7 +19,7 @@ from export.player import Player
 
 def rewritten(source, target, change):
     """A copy of a package whose entries went through `change(name, content)`; None drops one."""
-    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as new:
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w") as new:
         for name in old.namelist():
             changed = change(name, old.read(name))
             if changed is not None:
