@@ -137,9 +137,10 @@ class EvaluationSession:
                 "The player renders pinhole images; this lens has distortion, so it is not scored."
             )
             return renderers
-        for tier in ("hq", *Player.load(package).manifest.tiers):
-            if f"player {tier}" not in renderers:
-                renderers[f"player {tier}"] = partial(_play, Player.load(package, tier=tier))
+        best = Player.load(package)
+        for tier in best.manifest.tiers:
+            player = best if tier == "hq" else Player.load(package, tier=tier)
+            renderers[f"player {tier}"] = partial(_play, player)
         return renderers
 
 

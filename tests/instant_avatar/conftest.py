@@ -1,5 +1,6 @@
 """A short film of the actor and a short run on it, shared by all tests of the commands."""
 
+import functools
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -84,6 +85,26 @@ def pytest_runtest_setup():
 def pytest_runtest_teardown():
     """Undo it."""
     BRIEF.undo()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def packages_load_once():
+    """One player of packages of the same bytes, of which these tests load few many times."""
+    load = Player.load
+
+    @functools.lru_cache(maxsize=8)
+    def load_once(content: bytes, path: Path, options: tuple[tuple[str, object], ...]) -> Player:
+        return load(path, **dict(options))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            Player,
+            "load",
+            lambda path, **options: load_once(
+                Path(path).read_bytes(), path, tuple(options.items())
+            ),
+        )
+        yield
 
 
 @pytest.fixture(scope="session")
