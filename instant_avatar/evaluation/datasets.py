@@ -163,8 +163,6 @@ POSES = Path("4d_humans/smpl_optimized_aligned_scale.npz")
 MASK_FOLDERS = {Path("4d_humans/sam_segmentations"): False, Path("segmentations"): True}
 """Masks in the order of preference, and whether the person is black in them."""
 POSE_KEYS = ("global_orient", "body_pose", "transl", "betas", "scale")
-NOT_TRAINED_EVERY = 5
-"""One frame of these is not trained on."""
 
 
 def find_neuman(folder: Path) -> list[DatasetSubject]:
@@ -179,7 +177,7 @@ def find_neuman(folder: Path) -> list[DatasetSubject]:
 
 def split_by_rule(count: int) -> tuple[list[int], list[int]]:
     """Return training and test frames of NeuMan's rule; the rest are validation frames."""
-    step = int(1 / max(1, count // NOT_TRAINED_EVERY) * count)  # rounded as NeuMan's code does
+    step = int(1 / max(1, count // 5) * count)  # about 5, rounded as NeuMan's code does
     left_out = list(range(count))[step // 2 :: step]
     train = sorted(set(range(count)) - set(left_out))
     return train, left_out[: len(left_out) // 2]

@@ -95,8 +95,6 @@ VIEW_AXES = {"front": (0, 1.0), "left": (2, -1.0), "back": (0, -1.0), "right": (
 """Axis of the body, and its sign, that points right in each view."""
 DOT_SPACING_CM = 2.7
 """Distance of neighboring dots, centimeters."""
-LEVELS = ("never", "slant", "well")
-"""CSS classes of a dot: unseen, seen at a grazing angle, seen frontally."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -134,7 +132,7 @@ class CoverageMap:
             left += float(places[:, 0].max()) + 14.0  # and a gap
 
     def svg(self) -> Markup:
-        """Draw the coverage in its current state; the CSS classes in `LEVELS` give the colors."""
+        """Draw the coverage in its current state; the CSS classes of the dots give the colors."""
         level = np.digitize(self._coverage.cosines, [1e-6, MIN_WELL_SEEN_COSINE])
         everything = np.concatenate([view.positions_cm for view in self._views.values()])
         width, height = everything.max(axis=0).tolist()
@@ -144,7 +142,7 @@ class CoverageMap:
                 round(float(view.positions_cm[:, 0].min() + view.positions_cm[:, 0].max()) / 2, 1),
                 {
                     kind: view.positions_cm[level[view.patches] == k].tolist()
-                    for k, kind in enumerate(LEVELS)
+                    for k, kind in enumerate(("never", "slant", "well"))
                 },
             )
             for name, view in self._views.items()

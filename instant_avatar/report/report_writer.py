@@ -42,9 +42,6 @@ from instant_avatar.run.run_folder import RunFolder
 from instant_avatar.run.session_events import Ended, PackageWritten, SessionEvent
 from preprocess.capture_session import Capture
 
-CHECK_OPTIONS = ("poses", "person", "masks", "cameras", "body")
-"""Arguments of ia-ingest that ia-check takes for the same capture."""
-
 
 def diagnose_failure(report: Report) -> str | None:
     """Explain a failed avatar and suggest what to do; None if it has not failed."""
@@ -93,7 +90,8 @@ def _check_advice(command: Mapping[str, Any]) -> str:
     video = str(command.get("video"))
     if camera_address(Path(video)) is not None:
         return "."
-    named = {name: command.get(name) for name in CHECK_OPTIONS if command.get(name) != "solve"}
+    shared = ("poses", "person", "masks", "cameras", "body")  # with ia-ingest
+    named = {name: command.get(name) for name in shared if command.get(name) != "solve"}
     words = quote_command("ia-check", video, *option_words(named))
     return f", and check poses and masks: {words}"
 
