@@ -96,14 +96,13 @@ def packages_load_once():
     def load_once(content: bytes, path: Path, options: tuple[tuple[str, object], ...]) -> Player:
         return load(path, **dict(options))
 
+    def cached(path: Path | str, **options: object) -> Player:
+        if not Path(path).is_file():
+            return load(path, **options)
+        return load_once(Path(path).read_bytes(), path, tuple(options.items()))
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            Player,
-            "load",
-            lambda path, **options: load_once(
-                Path(path).read_bytes(), path, tuple(options.items())
-            ),
-        )
+        patch.setattr(Player, "load", cached)
         yield
 
 
