@@ -111,7 +111,7 @@ def draw_texture(
     image[rows, columns] = color_at(points, directions)
     # single texels may see a voxel that no picture shows: in small concave places, lips and eyelids
     image = cv2.medianBlur(_fill_gutters(image, face_at >= 0), 3)
-    coarse = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.75)  # as these pictures
+    coarse = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.75)  # as coarse as these pictures
     total = np.zeros((len(points), 3), dtype=np.float32)
     weight = np.full((len(points), 1), OWN_WEIGHT, dtype=np.float32)
     for camera in cameras_around(positions, views=VIEWS, pixel_m=PIXEL_M):

@@ -67,7 +67,7 @@ def _draw_frames(capture: Capture, doubts: Mapping[int, str]) -> Iterator[RgbIma
 
 def _video_size_px(size_px: tuple[int, int]) -> tuple[int, int]:
     """Size of the video of frames of a size; even numbers, as encoders want."""
-    scale = max(1.0, 320 / min(size_px))  # smaller text cannot be read
+    scale = max(1.0, 320 / min(size_px))  # text on a smaller image cannot be read
     scale = min(scale, LONGER_SIDE_PX / max(size_px))
     width, height = (max(2, 2 * round(scale * side / 2)) for side in size_px)
     return width, height

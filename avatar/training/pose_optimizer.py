@@ -180,7 +180,7 @@ class PoseOptimizer:
         self._can_freeze = age >= 300
         if self.poses_may_be_exact:
             evidence = self._evidence_sum / self._estimate_count.clip(min=1)
-            # frozen, as noise would move it, that blur the field, and the field the next pose
+            # else noise moves it, the motion blurs the field, and the field moves the next pose
             exact = (self._estimate_count >= MIN_ESTIMATES_BEFORE_FREEZE) & (
                 0.5 * (evidence + self._evidence) < 1.3
             )
