@@ -3,6 +3,7 @@
 import json
 import threading
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -143,23 +144,18 @@ def test_parts_that_are_missing_are_named_before_tracking(option, video, tmp_pat
     assert not out.exists()
 
 
-def test_of_a_long_video_every_nth_frame_is_tracked(video, monkeypatch):
-    monkeypatch.setattr(person_tracking, "MAX_FRAMES", 8)
-    inputs = CaptureInputs(video=video)
-    limited = person_tracking.limit_frames(inputs, open_source(video))
-    assert limited.frames == slice(None, None, 3)
-    chosen = CaptureInputs(video=video, frames=slice(0, 15, 1))
-    assert person_tracking.limit_frames(chosen, open_source(video)) == chosen
-
-
-def test_of_a_video_to_learn_from_half_of_thirty_frames_a_second_are_tracked(video, monkeypatch):
+@pytest.mark.parametrize(
+    ("limit", "for_learning", "step"),
+    [("MAX_FRAMES", False, 3), ("FEW_FRAMES", True, 2), ("FEW_FRAMES", False, None)],
+)
+def test_of_a_long_video_every_nth_frame_is_tracked(video, monkeypatch, limit, for_learning, step):
     inputs, source = CaptureInputs(video=video), open_source(video)
-    assert source.frame_count / source.duration_s == pytest.approx(30.0)
-    assert person_tracking.limit_frames(inputs, source, for_learning=True) == inputs  # it is short
-    monkeypatch.setattr(person_tracking, "FEW_FRAMES", 4)
-    limited = person_tracking.limit_frames(inputs, source, for_learning=True)
-    assert limited.frames == slice(None, None, 2)
-    assert person_tracking.limit_frames(inputs, source) == inputs
+    limit_frames = partial(person_tracking.limit_frames, source=source, for_learning=for_learning)
+    assert limit_frames(inputs) == inputs  # 20 frames, 30 a second, are few
+    monkeypatch.setattr(person_tracking, limit, {"MAX_FRAMES": 8, "FEW_FRAMES": 4}[limit])
+    assert limit_frames(inputs) == replace(inputs, frames=step and slice(None, None, step))
+    chosen = replace(inputs, frames=slice(0, 15, 1))
+    assert limit_frames(chosen) == chosen
 
 
 def test_what_was_found_before_ctrl_c_is_kept(video, tmp_path):
@@ -186,14 +182,3 @@ def test_what_was_found_before_ctrl_c_is_kept(video, tmp_path):
     assert len(read_poses(tmp_path / "out" / "poses.npz")) == 9
     assert len(list((tmp_path / "out" / "masks").glob("*.png"))) == 9
     assert open_capture(found.imported.inputs).source.frame_count == 9
-
-
-def test_frames_that_had_better_not_be_learnt_from_have_no_valid_pose(video, tmp_path, monkeypatch):
-    graded = person_tracking._grade
-    monkeypatch.setattr(
-        person_tracking, "_grade", lambda *parts: replace(graded(*parts), left_out=(3, 4))
-    )
-    words = ["--out", str(tmp_path / "poses.npz"), "--frames", ":8", "--no-film"]
-    assert track.main([str(video), *words]) in (0, 1)
-    found = read_poses(tmp_path / "poses.npz")
-    assert found.frames[~found.valid].tolist() == [3, 4]
