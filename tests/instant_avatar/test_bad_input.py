@@ -39,10 +39,6 @@ def masks_of(capture: Path) -> list[Path]:
     return sorted((capture / "masks").glob("*.png"))
 
 
-def test_a_video_that_is_not_there(refused, tmp_path):
-    refused(tmp_path / "none.mp4", "--poses", tmp_path / "none.npz", words=["none.mp4"])
-
-
 WITHOUT_HEAVY_CODE = """
 import sys
 from instant_avatar import ingest
@@ -83,27 +79,22 @@ def test_a_video_that_cannot_be_tracked_well_leaves_what_was_tracked(
     assert visible == ["tracking"]
 
 
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes here")
-@pytest.mark.parametrize(
-    ("option", "name"),
-    [("poses", "p.npz"), ("cameras", "c.json"), ("masks", "m.mp4"),
-     ("body", "b.npz")],
-)  # fmt: skip
-def test_a_pipe_is_refused_instead_of_waited_for(refused, capture, tmp_path, option, name):
-    os.mkfifo(tmp_path / name)
-    refused(capture, f"--{option}", tmp_path / name, words=[name])
-
-
 def test_a_pipe_among_masks_is_refused(refused, capture):
     masks_of(capture)[3].unlink()
     os.mkfifo(masks_of(capture)[0].with_name("000003.png"))
     refused(capture, words=["000003.png"])
 
 
-@pytest.mark.parametrize("option", ["poses", "cameras", "masks", "body"])
-def test_a_folder_without_what_was_asked_for(refused, capture, tmp_path, option):
-    (tmp_path / "empty").mkdir()
-    refused(capture, f"--{option}", tmp_path / "empty", words=["empty"])
+@pytest.mark.parametrize("make", ["mkfifo", "mkdir"])
+@pytest.mark.parametrize(
+    ("option", "name"),
+    [("poses", "p.npz"), ("cameras", "c.json"), ("masks", "m.mp4"), ("body", "b.npz")],
+)
+def test_a_pipe_or_an_empty_folder_in_the_place_of_a_file(
+    refused, capture, tmp_path, make, option, name
+):
+    getattr(os, make)(tmp_path / name)
+    refused(capture, f"--{option}", tmp_path / name, words=[name])
 
 
 @pytest.mark.parametrize("flags", [[], ["--force"], ["--masks", "segmenter:blazepose"]])

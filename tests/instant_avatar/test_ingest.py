@@ -23,23 +23,6 @@ from instant_avatar.run import final_scoring, snapshot_writer
 from instant_avatar.run.run_folder import RunFolder
 from instant_avatar.run.snapshot_writer import CheckpointWriter
 
-KEYS = {
-    "": "format verdict command recipe machine frames training held_out held_out_refined all_round "
-    "curve stream package coverage earlier_videos cameras tracking licence",
-    "licence": "commercial_use because parts summary",
-    "machine": "threads device backend",
-    "frames": "read used held_out dropped near_duplicates not_replayed",
-    "training": "wall_seconds cpu_seconds step_cpu_seconds startup_seconds "
-    "steps rays rays_per_second samples_per_ray peak_memory_mb",
-    "held_out": "frames size psnr psnr_mask ssim verdict blur overlap lpips background poses "
-    "whole_images",
-    "stream": "realtime ingest_ms inbox_dropped ready_after_last_frame_seconds latency_ms "
-    "lateness_ms inbox_depth",
-    "package": "path bytes seconds psnr_to_renderer",
-    "coverage": "seen well advice parts",
-    "all_round": "verdict limit advice seen half_transparent mean_cosine",
-}
-
 FEW = ("--frames", "0:8", "--no-refine-poses")
 """Enough for everything that is not about how well something was learnt."""
 
@@ -57,21 +40,6 @@ def test_a_run_leaves_five_things(run):
         "report.json",
         "turning.webp",
     ]
-
-
-def test_the_report_has_the_keys_that_were_agreed(report):
-    for place, keys in KEYS.items():
-        found = report[place] if place else report
-        assert list(found) == keys.split()
-    assert set(report["curve"][0]) == {
-        "wall_seconds", "cpu_seconds", "frames_seen", "psnr", "psnr_mask", "verdict",
-        "frames", "video", "pixels",
-    }  # fmt: skip
-    last = report["curve"][-1]
-    assert [frame for frame, _ in last["frames"]] == report["held_out"]["frames"]
-    assert np.mean([psnr for _, psnr in last["frames"]]) == pytest.approx(last["psnr"], abs=1e-5)
-    assert set(report["stream"]["ingest_ms"]) == {"p50", "p95"}
-    assert set(report["package"]["psnr_to_renderer"]) == {"hq", "lite"}
 
 
 def test_every_frame_is_accounted_for(report):
@@ -128,7 +96,10 @@ def test_the_clock_counts_training_alone(report):
     assert training["rays"] == training["steps"] * report["recipe"]["rays"]
     expected = training["rays"] / training["wall_seconds"]
     assert training["rays_per_second"] == pytest.approx(expected, rel=1e-4)
-    assert report["curve"][-1]["wall_seconds"] == training["wall_seconds"]
+    last = report["curve"][-1]
+    assert last["wall_seconds"] == training["wall_seconds"]
+    assert [frame for frame, _ in last["frames"]] == report["held_out"]["frames"]
+    assert np.mean([psnr for _, psnr in last["frames"]]) == pytest.approx(last["psnr"], abs=1e-5)
     marks = [point["wall_seconds"] for point in report["curve"]]
     assert len(marks) == 2  # after 100 steps, and after the last
     assert 0.0 < marks[0] < marks[1]

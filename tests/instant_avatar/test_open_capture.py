@@ -40,21 +40,6 @@ def in_camera(own) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([turned[:, None], body], axis=1), places
 
 
-def test_a_trackers_file_and_the_films_own_poses_are_one(film, own, in_camera, tmp_path):
-    matrices, places = in_camera
-    camera = own.cameras[0]
-    rows = {"pred_rotmat": matrices, "pred_trans": places[:, None], "frame": np.arange(24)}
-    rows |= {"img_focal": camera.focal_px[0], "img_center": np.array(camera.center_px)}
-    np.save(tmp_path / "hps_track_0.npy", rows)
-    poses, cameras = tmp_path / "hps_track_0.npy", str(film / "cameras.npz")
-    other = open_capture(CaptureInputs(video=film, poses=poses, cameras=cameras))
-    read = place_in_camera_world(read_poses(poses), own.shaped, own.cameras, cameras_given=True)
-    for row in range(0, 24, 5):  # before they are fitted to a body that is not SMPL's
-        joints = [own.shaped.with_pose(m[row]).joints() for m in (own.motion, read)]
-        np.testing.assert_allclose(joints[0], joints[1], atol=1e-9)
-    assert any("body model 'smpl'" in note for note in other.notes)
-
-
 def test_of_two_people_one_is_taken_and_by_number_the_other(film, in_camera, tmp_path):
     poses = axis_angles_from_matrices(in_camera[0]).reshape(-1, 72)
     actor = {"pose": poses, "trans": in_camera[1], "frame_ids": np.arange(24)}

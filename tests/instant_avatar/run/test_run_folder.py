@@ -2,8 +2,6 @@
 
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -12,7 +10,6 @@ from avatar.training import checkpoint
 from capture.atomic_files import LIST_NAME, write_text_atomically
 from capture.input_error import InputError
 from instant_avatar import ingest
-from instant_avatar.cli.command_line import CommandExit
 from instant_avatar.cli.console import Console
 from instant_avatar.cli.shared_options import (
     check_output_file,
@@ -21,7 +18,6 @@ from instant_avatar.cli.shared_options import (
 )
 from instant_avatar.run.run_folder import (
     CHECKPOINT_FILES,
-    LOCK_FILE_NAME,
     STATE_FILE,
     RunFolder,
     claim_folder,
@@ -143,28 +139,6 @@ def test_a_second_run_into_a_folder_is_refused_while_the_first_goes_on(film, tmp
     with claim_folder(tmp_path, Console()):
         assert ingest.main([str(film), "--out", str(tmp_path), "--overwrite"]) == 3
     assert "--out" in capsys.readouterr().err
-    with claim_folder(tmp_path, Console()):
-        pass
-    assert os.listdir(tmp_path) == []
-
-
-def test_a_killed_run_holds_its_folder_no_longer(tmp_path):
-    code = (
-        "import pathlib, sys\n"
-        "from instant_avatar.run.run_folder import claim_folder\n"
-        "from instant_avatar.cli.console import Console\n"
-        "with claim_folder(pathlib.Path(sys.argv[1]), Console()):\n"
-        "    print('held', flush=True); input()"
-    )
-    command = [sys.executable, "-c", code, str(tmp_path)]
-    with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stdout.readline() == "held\n"
-        with pytest.raises(CommandExit), claim_folder(tmp_path, Console()):
-            pass
-        process.kill()
-    assert (tmp_path / LOCK_FILE_NAME).exists()
     with claim_folder(tmp_path, Console()):
         pass
     assert os.listdir(tmp_path) == []

@@ -30,7 +30,6 @@ from instant_avatar.run.session_events import PackageWritten, Scored, SessionEve
 from instant_avatar.run.session_start import _announce_coverage
 from instant_avatar.run.snapshot_writer import CheckpointWriter
 from instant_avatar.run.training_session import TrainingSession
-from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.capture_session import Capture, RecordedObservations
 from preprocess.observation import DroppedFrame
@@ -245,36 +244,22 @@ def test_a_full_disk_is_reported_to_the_thread_that_trains(writer, monkeypatch, 
         getattr(writer, how)()
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("announced") / "capture"
-    film_capture(folder, ShootConfig(frames=24, size=64, turns=1.0))
-    return folder
-
-
 def announced(capture) -> list[str]:
     console = Console()
     _announce_coverage(capture, console)
     return console.warnings
 
 
-def test_a_whole_turn_gives_no_warning(folder):
-    assert not announced(open_capture(CaptureInputs(video=folder)))
-
-
-def test_the_front_of_a_turn_warns_of_unseen_skin(folder):
-    (warning,) = announced(open_capture(CaptureInputs(video=folder, frames=slice(0, 3))))
-    assert "of the person's skin" in warning
+def test_unseen_skin_is_warned_of_by_frames_that_have_a_pose(film):
+    assert not announced(open_capture(CaptureInputs(video=film)))
+    front = open_capture(CaptureInputs(video=film, frames=slice(0, 3)))
+    (warning,) = announced(front)
     assert "back" in warning
-
-
-def test_poses_without_a_frame_do_not_count(folder):
-    capture = open_capture(CaptureInputs(video=folder, frames=slice(0, 3)))
     numbers = np.arange(24.0)
     numbers[5:] = np.nan
-    strays = replace(capture.geometry(), row_frames=numbers)
-    object.__setattr__(capture, "geometry", lambda: strays)
-    assert len(announced(capture)) == 1
+    strays = replace(front.geometry(), row_frames=numbers)
+    object.__setattr__(front, "geometry", lambda: strays)
+    assert announced(front) == [warning]
 
 
 @pytest.mark.parametrize(

@@ -70,19 +70,19 @@ def test_frames_that_never_arrive_are_forgotten():
     assert [index for index, _ in meter._available_at] == [99]
 
 
-def test_ready_counts_from_the_last_frame_as_if_it_had_been_filmed():
-    """First frame at 100 s on the clock, the last one 4 s later by its timestamp."""
+@pytest.mark.parametrize(
+    ("times", "due", "ready_at", "seconds"),
+    [
+        ([7.0, 9.5, 11.0], [100.0, 102.5, 104.0], 105.25, 1.25),
+        ([0.0, 1.0, 2.0, 4.0], [100.0, 100.0, 100.0, 102.0], 102.5, 0.5),
+        ([0.0, 1.0], [100.0, 101.0], None, None),
+    ],
+    ids=["played", "resumed after two seconds", "never ready"],
+)
+def test_ready_counts_from_the_last_frame_as_if_it_had_been_filmed(times, due, ready_at, seconds):
     meter = StreamMeter(threading.Event(), Recorded())
-    list(meter.measure_arrival(frames([7.0, 9.5, 11.0], due=[100.0, 102.5, 104.0])))
-    assert meter.stats(ready_at=105.25).ready_after_last_frame_seconds == pytest.approx(1.25)
-    assert meter.stats(ready_at=None).ready_after_last_frame_seconds is None
-
-
-def test_ready_counts_on_from_where_a_resumed_run_had_come_to():
-    """Two seconds were read back at once, at 100 s on the clock; the other two were played."""
-    meter = StreamMeter(threading.Event(), Recorded())
-    list(meter.measure_arrival(frames([0.0, 1.0, 2.0, 4.0], due=[100.0, 100.0, 100.0, 102.0])))
-    assert meter.stats(ready_at=102.5).ready_after_last_frame_seconds == pytest.approx(0.5)
+    list(meter.measure_arrival(frames(times, due)))
+    assert meter.stats(ready_at=ready_at).ready_after_last_frame_seconds == seconds
 
 
 def test_ready_may_be_before_the_end_of_a_video_that_is_read_faster_than_it_plays():
