@@ -12,7 +12,14 @@ from jaxtyping import UInt8
 from PIL import Image, ImageOps
 
 from capture.input_error import InputError, counted
-from capture.source import ASSUMED_FPS, Frame, FrameSelection, FrameSource, RgbImage
+from capture.source import (
+    ASSUMED_FPS,
+    Frame,
+    FrameSelection,
+    FrameSource,
+    RgbImage,
+    shrink_to_longer_side,
+)
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff"})
 """File endings of images that are read."""
@@ -98,10 +105,16 @@ def any_has_cutout_alpha(images: Sequence[Path]) -> bool:
     return False
 
 
-def _reduce(frame: Frame, longer_px: int) -> Frame:
-    scale = min(1.0, longer_px / max(frame.size_px))
-    size_px = [max(1, round(side * scale)) for side in frame.size_px]
-    return replace(frame, rgb=cv2.resize(frame.rgb, size_px, interpolation=cv2.INTER_AREA))
+def resize_frame(frame: Frame, size_px: tuple[int, int]) -> Frame:
+    """The frame at another width and height."""
+    if frame.size_px == size_px:
+        return frame
+    alpha = frame.alpha
+    return replace(
+        frame,
+        rgb=cv2.resize(frame.rgb, size_px, interpolation=cv2.INTER_AREA),
+        alpha=None if alpha is None else cv2.resize(alpha, size_px, interpolation=cv2.INTER_AREA),
+    )
 
 
 class ImageFolder(FrameSource):
@@ -135,23 +148,19 @@ class ImageFolder(FrameSource):
             except InputError as cause:  # damaged, or the disk was unplugged
                 self._warn(f"{cause} It was left out.")
                 continue
-            if rgb.shape[1::-1] != self.size_px:
-                self._warn(
-                    f"{path.name} has {rgb.shape[1]}x{rgb.shape[0]} px, the first picture "
-                    f"{self.size_px[0]}x{self.size_px[1]}. It was left out."
-                )
-                continue
-            yield Frame(index=index, time_s=index / ASSUMED_FPS, rgb=rgb, alpha=alpha)
+            if self._is_of_size(path.name, rgb):
+                yield Frame(index=index, time_s=index / ASSUMED_FPS, rgb=rgb, alpha=alpha)
 
     def glance(
         self, times_s: Sequence[float], apart_s: float, longer_px: int
     ) -> Iterator[tuple[Frame, Frame]]:
         """Yield reduced images near some times, each with the one that follows it."""
         del apart_s  # photographs may be far apart
+        size_px = shrink_to_longer_side(self.size_px, longer_px)
         for time_s in times_s:
             place = min(round(time_s * ASSUMED_FPS), max(0, len(self._images) - 2))
             some = FrameSelection(start=place, stop=place + 2)
-            pair = [_reduce(frame, longer_px) for frame in ImageFolder(self.path, some).frames()]
+            pair = [resize_frame(frame, size_px) for frame in ImageFolder(self.path, some).frames()]
             if len(pair) == 2:
                 yield pair[0], pair[1]
 

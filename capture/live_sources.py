@@ -63,8 +63,7 @@ class CameraDevice(FrameSource):
             InputError: If there is no such camera.
             OSError: If it exists and is in use (EBUSY), or may not be opened (EACCES).
         """
-        super().__init__(Path(CAMERA_PREFIX + address), selection)
-        self._pace, self._waited_s = pace, 0.0
+        super().__init__(Path(CAMERA_PREFIX + address), selection, pace)
         self._inbox: Inbox[Frame] | None = None
         self._is_file = Path(address).is_file()
         self._capture = _open_device(address)
@@ -78,11 +77,6 @@ class CameraDevice(FrameSource):
         self._first = self._frame(0, self._first_at, picture)
 
     @property
-    def waited_s(self) -> float:
-        """Seconds of waiting for images, and for what belongs to them, so far."""
-        return self._waited_s + self._pace.waited_s
-
-    @property
     def dropped(self) -> int:
         """Number of images that were dropped for later ones."""
         return 0 if self._inbox is None else self._inbox.dropped
@@ -94,7 +88,7 @@ class CameraDevice(FrameSource):
         while not (inbox.finished or self._pace.stopped):
             began = time.perf_counter()
             taken = inbox.take(timeout_s=0.1, max_items=1)
-            self._waited_s += time.perf_counter() - began
+            self._pace.waited_s += time.perf_counter() - began
             for frame in taken:
                 if self.selection.is_past_end(frame.index):
                     return
@@ -103,7 +97,7 @@ class CameraDevice(FrameSource):
 
     def close(self) -> None:
         """Release the camera."""
-        self._pace.stop()
+        super().close()
         if self._inbox is not None:
             self._inbox.close(timeout_s=2.0)  # a stuck driver must not hold what was learnt
         if self._inbox is None or self._inbox.finished:
@@ -205,17 +199,12 @@ class WatchedImageFolder(FrameSource):
         """
         if not path.is_dir():
             raise InputError(f"{path} is no folder; --live watches a folder of images that grows.")
-        super().__init__(path, selection)
-        self._pace, self._idle_s, self._watch_s = pace, idle_s, watch_s
+        super().__init__(path, selection, pace)
+        self._idle_s, self._watch_s = idle_s, watch_s
         rgb = self._first()
         self.started_at, self._first_at = time.time(), pace.now()
         self.size_px = (rgb.shape[1], rgb.shape[0])
         self.has_alpha = any_has_cutout_alpha(list_images(path))
-
-    @property
-    def waited_s(self) -> float:
-        """Seconds of waiting for images so far."""
-        return self._pace.waited_s
 
     def frames(self) -> Iterator[Frame]:
         """The images as they are completed."""
@@ -235,10 +224,6 @@ class WatchedImageFolder(FrameSource):
     def count_frames(self) -> int:
         """The number of images by now."""
         return len(list_images(self.path))
-
-    def close(self) -> None:
-        """End the watch, also in the middle of a wait."""
-        self._pace.stop()
 
     def _first(self) -> RgbImage:
         """The first image that can be read."""
@@ -292,13 +277,7 @@ class WatchedImageFolder(FrameSource):
                     return None
                 self._pace.wait_until(self._pace.now() + POLL_INTERVAL_S)
                 continue
-            if image[0].shape[1::-1] == self.size_px:
-                return image
-            self._warn(
-                f"{path.name} has {image[0].shape[1]}x{image[0].shape[0]} px, the first image "
-                f"{self.size_px[0]}x{self.size_px[1]}. It was left out."
-            )
-            return None
+            return image if self._is_of_size(path.name, image[0]) else None
         return None
 
     def _is_done(self) -> bool:

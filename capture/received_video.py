@@ -8,6 +8,7 @@ import json
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path
 from typing import Any, final
 
@@ -17,7 +18,7 @@ from av.error import FFmpegError
 from capture.atomic_files import write_text_atomically
 from capture.input_error import InputError
 from capture.source import Frame, FrameSelection, FrameSource, PacingClock
-from capture.video import DecodedFrame, decode
+from capture.video import decode
 
 POLL_S = 0.01
 """Interval at which a reader looks for bytes that it waits for, seconds."""
@@ -120,13 +121,8 @@ class _GrowingReader:
     """Reads what has come of a file, and waits for what has not; `waits` counts the waits."""
 
     def __init__(self, path: Path, pace: PacingClock, idle_s: float) -> None:
-        self._file, self._pace, self._idle_s, self._at = (
-            path.open("rb", buffering=0),
-            pace,
-            idle_s,
-            0,
-        )
-        self._note, self.waits = note_of(path), 0
+        self._file, self._pace, self._idle_s = path.open("rb", buffering=0), pace, idle_s
+        self._note, self._at, self.waits = note_of(path), 0, 0
         self._state: dict[str, Any] = {"spans": []}
         self._look()
 
@@ -206,8 +202,8 @@ class ReceivedVideo(FrameSource):
             pace: Its clock; stopping it ends the video.
             idle_s: The video ends when no byte has come for this time, seconds.
         """
-        super().__init__(path, selection)
-        self._pace, self._reader = pace, _GrowingReader(path, pace, idle_s)
+        super().__init__(path, selection, pace)
+        self._reader = _GrowingReader(path, pace, idle_s)
         self.skippable = not self._reader.is_whole_known
         options = {} if self._reader.is_whole_known else STREAM_OPTIONS
         try:
@@ -215,21 +211,14 @@ class ReceivedVideo(FrameSource):
             stream = self._container.streams.video[0]
             self._decoded = decode(self._container, stream, at_once=not self._reader.is_whole_known)
             first = next(self._decoded, None)
+            rgb = None if first is None else first.rgb(MAX_LONGER_PX)
         except (FFmpegError, ValueError, IndexError, OSError) as cause:
             self._reader.close()
             raise InputError(self._unreadable()) from cause
-        if first is None:
+        if first is None or rgb is None:
             raise InputError(self._unreadable())
-        self._first, rgb = first, first.rgb(MAX_LONGER_PX)
-        if rgb is None:
-            raise InputError(self._unreadable())
-        self.size_px = (rgb.shape[1], rgb.shape[0])
+        self._first, self.size_px = first, (rgb.shape[1], rgb.shape[0])
         self._began = pace.now() - first.time_s
-
-    @property
-    def waited_s(self) -> float:
-        """Seconds of waiting for bytes so far."""
-        return self._pace.waited_s
 
     def frames(self) -> Iterator[Frame]:
         """The frames as they come; to be read once."""
@@ -243,7 +232,7 @@ class ReceivedVideo(FrameSource):
 
     def _selected(self) -> Iterator[Frame]:
         waits = self._reader.waits
-        for index, decoded in enumerate(self._all()):
+        for index, decoded in enumerate(chain([self._first], self._decoded)):
             now = self._pace.now()
             if waits != self._reader.waits:
                 waits, self._began = self._reader.waits, now - decoded.time_s
@@ -253,17 +242,8 @@ class ReceivedVideo(FrameSource):
             rgb = decoded.rgb(MAX_LONGER_PX) if self.selection.contains(index) else None
             if rgb is None or rgb.shape[1::-1] != self.size_px:
                 continue
-            corrupt = decoded.after_gap or decoded.frame.is_corrupt
-            flags = frozenset({"corrupt"} if corrupt else ())
-            yield Frame(index=index, time_s=decoded.time_s, rgb=rgb, flags=flags, due_s=due_s)
-
-    def close(self) -> None:
-        """End the video, also in the middle of a wait."""
-        self._pace.stop()
-
-    def _all(self) -> Iterator[DecodedFrame]:
-        yield self._first
-        yield from self._decoded
+            time_s, flags = decoded.time_s, decoded.flags
+            yield Frame(index=index, time_s=time_s, rgb=rgb, flags=flags, due_s=due_s)
 
     def _unreadable(self) -> str:
         why = f" {self._reader.reason}" if self._reader.reason else ""

@@ -45,6 +45,21 @@ class Frame:
         """Width and height."""
         return self.rgb.shape[1], self.rgb.shape[0]
 
+    def turn(self, degrees: int) -> "Frame":
+        """The frame turned clockwise by a multiple of 90 degrees."""
+        rgb, alpha = np.rot90(self.rgb, -degrees // 90), self.alpha
+        if alpha is not None:
+            alpha = np.ascontiguousarray(np.rot90(alpha, -degrees // 90))
+        return replace(self, rgb=np.ascontiguousarray(rgb), alpha=alpha)
+
+
+def shrink_to_longer_side(size_px: tuple[int, int], longer_px: int | None) -> tuple[int, int]:
+    """Width and height with the longer side shrunk to `longer_px`; never enlarged."""
+    if longer_px is None or longer_px >= max(size_px):
+        return size_px
+    scale = longer_px / max(size_px)
+    return max(1, round(size_px[0] * scale)), max(1, round(size_px[1] * scale))
+
 
 @dataclass(frozen=True, kw_only=True)
 class FrameSelection:
@@ -94,142 +109,6 @@ class FrameSelection:
         return (count - 1) * self.step + 1 if count else 0
 
 
-class FrameSource:
-    """A recorded or live stream of upright RGB frames of one size.
-
-    Attributes:
-        path: The video file or the folder of images itself.
-        frames_in_file: Number of all frames, selected or not, as the container claims; of a live
-            source 0.
-        frame_count: Number of selected frames; fewer may come, see `warnings`. None for a live
-            source.
-        duration_s: Duration of the selected frames, as the container claims; None if unknown.
-        has_alpha: Whether the frames' own alpha channel cuts the person out of one of the sampled
-            images.
-        rotate: Degrees by which the user had upright frames turned clockwise.
-        is_hdr: Whether frames are tone mapped from HDR.
-        live: Whether frames that are not taken in time are lost.
-        paced: Whether frames come at times of their own, however fast they are taken.
-        skippable: Whether a newer frame may replace one that was not taken in time, as both are
-            filmed at this moment.
-        all_came: Whether every frame has come, and only such as were skipped are still to be taken.
-        started_at: Time when the first frame of a live source was filmed, seconds since 1970.
-        warnings: Problems so far; grows while `frames()` is read.
-    """
-
-    size_px: tuple[int, int]
-    frames_in_file: int = 0
-    frame_count: int | None = None
-    duration_s: float | None = None
-    has_alpha: bool = False
-    is_hdr: bool = False
-    live: bool = False
-    paced: bool = False
-    skippable: bool = False
-    all_came: bool = False
-    rotate: int = 0
-    started_at: float = 0.0
-
-    def __init__(self, path: Path, selection: FrameSelection) -> None:
-        """Keep the arguments; nothing is read yet."""
-        self.path, self.selection = path, selection
-        self.warnings: list[str] = []
-
-    @property
-    def waited_s(self) -> float:
-        """Seconds that `frames()` has waited for frames, in all."""
-        return 0.0
-
-    @property
-    def dropped(self) -> int:
-        """Number of frames that were lost because they were not taken in time."""
-        return 0
-
-    def frames(self) -> Iterator[Frame]:
-        """The selected frames, lazily and in order; every call starts from the first."""
-        raise NotImplementedError
-
-    def count_frames(self) -> int:
-        """The true number of all frames, found by decoding, which is slow; 0 if it is unknown."""
-        return 0
-
-    def close(self) -> None:
-        """End `frames()`, also one that waits on another thread, and release a device."""
-
-    def _warn(self, message: str) -> None:
-        if message not in self.warnings and len(self.warnings) < 100:
-            self.warnings.append(message)
-
-
-class WrappedSource(FrameSource):
-    """A source of which something is changed; all else is the source's own."""
-
-    def __init__(self, source: FrameSource) -> None:
-        """Wrap a source; nothing is read yet."""
-        super().__init__(source.path, source.selection)
-        self._source = source
-        for name in FrameSource.__annotations__:
-            setattr(self, name, getattr(source, name))
-        self.warnings = source.warnings
-
-    @property
-    def waited_s(self) -> float:
-        """The source's own."""
-        return self._source.waited_s
-
-    @property
-    def dropped(self) -> int:
-        """The source's own."""
-        return self._source.dropped
-
-    def frames(self) -> Iterator[Frame]:
-        """The source's frames."""
-        return self._source.frames()
-
-    def count_frames(self) -> int:
-        """The source's true number of frames, found by decoding."""
-        return self._source.count_frames()
-
-    def close(self) -> None:
-        """Close the source."""
-        self._source.close()
-
-
-@final
-class RotatedSource(WrappedSource):
-    """A source whose frames are turned clockwise by 90, 180 or 270 degrees."""
-
-    def __init__(self, source: FrameSource, degrees: int) -> None:
-        """Wrap a source; nothing is read yet."""
-        super().__init__(source)
-        self.rotate = degrees
-        if degrees % 180:
-            self.size_px = (source.size_px[1], source.size_px[0])
-
-    def frames(self) -> Iterator[Frame]:
-        """The frames, turned."""
-        turns = -self.rotate // 90
-        for frame in self._source.frames():
-            alpha = (
-                None if frame.alpha is None else np.ascontiguousarray(np.rot90(frame.alpha, turns))
-            )
-            yield replace(frame, rgb=np.ascontiguousarray(np.rot90(frame.rgb, turns)), alpha=alpha)
-
-
-@final
-class TransposedSource(WrappedSource):
-    """A recording that reports its width as its height and its height as its width.
-
-    With it masks and cameras of upright images can be opened for a video that was rotated by a
-    quarter turn afterwards. The frames themselves are unchanged.
-    """
-
-    def __init__(self, source: FrameSource) -> None:
-        """Wrap a recording; nothing is read yet."""
-        super().__init__(source)
-        self.size_px = (source.size_px[1], source.size_px[0])
-
-
 @final
 class PacingClock:
     """The clock of a source whose frames come at times of their own.
@@ -271,6 +150,133 @@ class PacingClock:
         return not self.stopped
 
 
+class FrameSource:
+    """A recorded or live stream of upright RGB frames of one size.
+
+    Attributes:
+        path: The video file or the folder of images itself.
+        frames_in_file: Number of all frames, selected or not, as the container claims; of a live
+            source 0.
+        frame_count: Number of selected frames; fewer may come, see `warnings`. None for a live
+            source.
+        duration_s: Duration of the selected frames, as the container claims; None if unknown.
+        has_alpha: Whether the frames' own alpha channel cuts the person out of one of the sampled
+            images.
+        rotate: Degrees by which the user had upright frames turned clockwise.
+        is_hdr: Whether frames are tone mapped from HDR.
+        live: Whether frames that are not taken in time are lost.
+        paced: Whether frames come at times of their own, however fast they are taken.
+        skippable: Whether a newer frame may replace one that was not taken in time, as both are
+            filmed at this moment.
+        all_came: Whether every frame has come, and only such as were skipped are still to be taken.
+        started_at: Time when the first frame of a live source was filmed, seconds since 1970.
+        warnings: Problems so far; grows while `frames()` is read.
+    """
+
+    size_px: tuple[int, int]
+    frames_in_file: int = 0
+    frame_count: int | None = None
+    duration_s: float | None = None
+    has_alpha: bool = False
+    is_hdr: bool = False
+    live: bool = False
+    paced: bool = False
+    skippable: bool = False
+    all_came: bool = False
+    rotate: int = 0
+    started_at: float = 0.0
+
+    def __init__(
+        self, path: Path, selection: FrameSelection, pace: PacingClock | None = None
+    ) -> None:
+        """Keep the arguments; nothing is read yet. Stopping the clock `pace` ends every wait."""
+        self.path, self.selection, self._pace = path, selection, pace or PacingClock()
+        self.warnings: list[str] = []
+
+    @property
+    def waited_s(self) -> float:
+        """Seconds that `frames()` has waited for frames, in all."""
+        return self._pace.waited_s
+
+    @property
+    def dropped(self) -> int:
+        """Number of frames that were lost because they were not taken in time."""
+        return 0
+
+    def frames(self) -> Iterator[Frame]:
+        """The selected frames, lazily and in order; every call starts from the first."""
+        raise NotImplementedError
+
+    def count_frames(self) -> int:
+        """The true number of all frames, found by decoding, which is slow; 0 if it is unknown."""
+        return 0
+
+    def close(self) -> None:
+        """End `frames()`, also one that waits on another thread, and release a device."""
+        self._pace.stop()
+
+    def _is_of_size(self, name: str, rgb: RgbImage) -> bool:
+        """Return whether an image has the size of the first one; warn if not."""
+        height, width = rgb.shape[:2]
+        if (width, height) != self.size_px:
+            self._warn(
+                f"{name} has {width}x{height} px, the first picture "
+                f"{self.size_px[0]}x{self.size_px[1]}. It was left out."
+            )
+        return (width, height) == self.size_px
+
+    def _warn(self, message: str) -> None:
+        if message not in self.warnings and len(self.warnings) < 100:
+            self.warnings.append(message)
+
+
+class WrappedSource(FrameSource):
+    """A source of which something is changed; all else is the source's own."""
+
+    def __init__(self, source: FrameSource) -> None:
+        """Wrap a source; nothing is read yet."""
+        super().__init__(source.path, source.selection, source._pace)
+        self._source = source
+        for name in FrameSource.__annotations__:
+            setattr(self, name, getattr(source, name))
+        self.warnings = source.warnings
+
+    @property
+    def dropped(self) -> int:
+        """The source's own."""
+        return self._source.dropped
+
+    def frames(self) -> Iterator[Frame]:
+        """The source's frames."""
+        return self._source.frames()
+
+    def count_frames(self) -> int:
+        """The source's true number of frames, found by decoding."""
+        return self._source.count_frames()
+
+    def close(self) -> None:
+        """Close the source."""
+        super().close()
+        self._source.close()
+
+
+@final
+class RotatedSource(WrappedSource):
+    """A source whose frames are turned clockwise by 90, 180 or 270 degrees."""
+
+    def __init__(self, source: FrameSource, degrees: int) -> None:
+        """Wrap a source; nothing is read yet."""
+        super().__init__(source)
+        self.rotate = degrees
+        if degrees % 180:
+            self.size_px = (source.size_px[1], source.size_px[0])
+
+    def frames(self) -> Iterator[Frame]:
+        """The frames, turned."""
+        for frame in self._source.frames():
+            yield frame.turn(self.rotate)
+
+
 @final
 class RealtimePlayback(WrappedSource):
     """A source whose frames are handed over no earlier than their timestamps say.
@@ -287,11 +293,6 @@ class RealtimePlayback(WrappedSource):
         self._pace, self.paced, self.catch_up = pace, True, False
         self.skippable = skippable
 
-    @property
-    def waited_s(self) -> float:
-        """Seconds for which frames have been held back in all."""
-        return self._pace.waited_s
-
     def frames(self) -> Iterator[Frame]:
         """The frames when they are due, read one ahead; every call plays from the start."""
         began = due = None
@@ -303,8 +304,3 @@ class RealtimePlayback(WrappedSource):
             if not self._pace.wait_until(due):
                 return
             yield replace(frame, due_s=due)
-
-    def close(self) -> None:
-        """End the playback, also in the middle of a wait."""
-        self._pace.stop()
-        super().close()

@@ -1,6 +1,5 @@
 """Opens a source of frames: a video file, a folder of images, a capture folder, a camera."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -51,11 +50,7 @@ def glance(source: FrameSource) -> list[tuple[Frame, Frame]]:
     places = np.unique(np.round((np.arange(GLANCES) + 0.5) * last / GLANCES))
     places += source.selection.start
     pairs = recording.glance((places / rate).tolist(), GLANCE_APART_S, 960)
-    return [(_turn(one, source.rotate), _turn(other, source.rotate)) for one, other in pairs]
-
-
-def _turn(frame: Frame, degrees: int) -> Frame:
-    return replace(frame, rgb=np.ascontiguousarray(np.rot90(frame.rgb, -degrees // 90)))
+    return [(one.turn(source.rotate), other.turn(source.rotate)) for one, other in pairs]
 
 
 def describe_recording(source: FrameSource) -> str:

@@ -13,7 +13,7 @@ from jaxtyping import Float32, UInt8, UInt16
 
 from capture.image_folder import refuse_pipe
 from capture.input_error import InputError, counted, quote_command
-from capture.source import Frame, FrameSelection, FrameSource, RgbImage
+from capture.source import Frame, FrameSelection, FrameSource, RgbImage, shrink_to_longer_side
 
 VIDEO_SUFFIXES = frozenset(
     {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".ts", ".wmv"}
@@ -34,20 +34,21 @@ class DecodedFrame(NamedTuple):
 
     def rgb(self, longer_px: int | None = None) -> RgbImage | None:
         """Convert to upright 8-bit RGB, reduced to a longer side first; None if that fails."""
-        curve, longer = int(self.frame.color_trc), max(self.frame.width, self.frame.height)
-        scale = 1.0 if longer_px is None else min(1.0, longer_px / longer)
-        size = {
-            "width": max(1, round(self.frame.width * scale)),
-            "height": max(1, round(self.frame.height * scale)),
-        }
+        frame, curve = self.frame, int(self.frame.color_trc)
+        width, height = shrink_to_longer_side((frame.width, frame.height), longer_px)
+        is_hdr = curve in HDR_TRANSFERS
+        kind = "rgb48le" if is_hdr else "rgb24"
         try:
-            if curve in HDR_TRANSFERS:
-                rgb = tone_map_hdr(self.frame.to_ndarray(format="rgb48le", **size), curve)
-            else:
-                rgb = self.frame.to_ndarray(format="rgb24", **size)
+            rgb = frame.to_ndarray(format=kind, width=width, height=height)
+            rgb = tone_map_hdr(rgb, curve) if is_hdr else rgb
         except (FFmpegError, ValueError):
             return None
         return np.ascontiguousarray(np.rot90(rgb, quarter_turns(self.frame)))
+
+    @property
+    def flags(self) -> frozenset[str]:
+        """Those of `Frame`: a frame after a gap was predicted from one that is lost."""
+        return frozenset({"corrupt"} if self.after_gap or self.frame.is_corrupt else ())
 
 
 class VideoFile(FrameSource):
@@ -102,10 +103,7 @@ class VideoFile(FrameSource):
             if rgb is None or rgb.shape[1::-1] != self.size_px:
                 self._warn(f"Frame {index} of {self.path.name} could not be decoded; left out.")
                 continue
-            # a frame after a gap was predicted from one that is lost
-            corrupt = decoded.after_gap or decoded.frame.is_corrupt
-            flags = frozenset({"corrupt"} if corrupt else ())
-            yield Frame(index=index, time_s=decoded.time_s, rgb=rgb, flags=flags)
+            yield Frame(index=index, time_s=decoded.time_s, rgb=rgb, flags=decoded.flags)
 
     def glance(
         self, times_s: Sequence[float], apart_s: float, longer_px: int

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 
 from capture.atomic_files import atomic_file
-from capture.source import AlphaMask, RgbImage
+from capture.source import AlphaMask, RgbImage, shrink_to_longer_side
 from capture.video_writer import H264, write_video
 from preprocess.body.body_surface import SkinPoints
 from preprocess.capture_session import Capture
-from preprocess.observation import Observation, shrink_to_longer_side
+from preprocess.observation import Observation
 
 LONGER_SIDE_PX = 720
 """Longer side of the video, px."""

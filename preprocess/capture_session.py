@@ -251,15 +251,17 @@ class ObservationSource:
     Attributes:
         capture: What the frames are joined with, and where that comes from.
         frames: The frames, as they are delivered.
+        join: Joins the next frame with its pose, mask and camera.
     """
 
-    def __init__(self, capture: Capture, frames: FrameSource) -> None:
+    def __init__(
+        self,
+        capture: Capture,
+        frames: FrameSource,
+        join: Callable[[Frame], Observation | DroppedFrame],
+    ) -> None:
         """Read nothing yet."""
-        self.capture, self.frames = capture, frames
-
-    def join(self, frame: Frame) -> Observation | DroppedFrame:
-        """Join the next frame with its pose, mask and camera."""
-        raise NotImplementedError
+        self.capture, self.frames, self.join = capture, frames, join
 
     def set_catch_up(self, catch_up: bool) -> None:
         """Deliver frames without delay while a resumed run reads back what it has seen."""
@@ -276,12 +278,8 @@ class RecordedObservations(ObservationSource):
     def __init__(self, capture: Capture, *, realtime: bool = False) -> None:
         """Read nothing yet; an InputError if the capture's parts do not fit together."""
         self._playback = RealtimePlayback(capture.source, PacingClock())
-        super().__init__(capture, self._playback if realtime else capture.source)
-        self._join = capture.observation_builder()
-
-    def join(self, frame: Frame) -> Observation | DroppedFrame:
-        """Join a frame with its pose, mask and camera."""
-        return self._join(frame)
+        frames = self._playback if realtime else capture.source
+        super().__init__(capture, frames, capture.observation_builder())
 
     def set_catch_up(self, catch_up: bool) -> None:
         """Play without delay for a while."""

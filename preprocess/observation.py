@@ -1,15 +1,15 @@
 """Observations: frames joined with the person's mask, pose and camera, all of one size."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
 from capture.camera import Camera
+from capture.image_folder import resize_frame
 from capture.input_error import InputError
-from capture.source import AlphaMask, Frame, FrameSource
+from capture.source import AlphaMask, Frame, FrameSource, shrink_to_longer_side
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.cameras.camera_file import CameraTrack
 from preprocess.frame_association import associate_by_order, associate_by_time
@@ -100,7 +100,7 @@ def join_frame(
     if isinstance(pose, str):
         return DroppedFrame(index=frame.index, reason=pose)
     camera = camera_of(frame.index)
-    scaled = _resize_frame(frame, camera.size_px)
+    scaled = resize_frame(frame, camera.size_px)
     try:
         alpha = masks.alpha(frame, scaled, pose, camera)
     except InputError as cause:
@@ -139,22 +139,3 @@ def associate_cameras(cameras: CameraTrack, source: FrameSource) -> Callable[[in
     if not cameras.is_moving:
         return lambda index: 0
     return associate_by_order(len(cameras.cameras), source, f"cameras in {cameras.source}")
-
-
-def shrink_to_longer_side(size_px: tuple[int, int], longer_px: int | None) -> tuple[int, int]:
-    """Width and height with the longer side shrunk to `longer_px`; never enlarged."""
-    if longer_px is None or longer_px >= max(size_px):
-        return size_px
-    scale = longer_px / max(size_px)
-    return max(1, round(size_px[0] * scale)), max(1, round(size_px[1] * scale))
-
-
-def _resize_frame(frame: Frame, size_px: tuple[int, int]) -> Frame:
-    if frame.size_px == size_px:
-        return frame
-    alpha = frame.alpha
-    return replace(
-        frame,
-        rgb=cv2.resize(frame.rgb, size_px, interpolation=cv2.INTER_AREA),
-        alpha=None if alpha is None else cv2.resize(alpha, size_px, interpolation=cv2.INTER_AREA),
-    )

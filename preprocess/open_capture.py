@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from capture.input_error import InputError
-from capture.source import Frame, FrameSource, PacingClock, RealtimePlayback, TransposedSource
+from capture.source import Frame, FrameSource, PacingClock, RealtimePlayback, WrappedSource
 from capture.source_opening import open_live_source, open_source
 from preprocess.alignment.capture_geometry import CaptureGeometry, rescale_motion
 from preprocess.body.body_pose import Motion
@@ -81,14 +81,18 @@ class ImportedCapture:
 
     def given_masks(self) -> GivenMasks | None:
         """The masks of files or alpha channels; None if there are none."""
-        refine = GivenMaskRefiner(enabled=self.inputs.refine_masks)
-        if self.stored_masks is not None:
-            return StoredMasks(self.stored_masks, self.source, refine)
-        return AlphaChannelMasks(self.source, refine) if self.segmenter is None else None
+        if self.segmenter is not None:
+            return None
+        return _given_masks(self.stored_masks, self.source, self.inputs)
 
     def transposed(self) -> "ImportedCapture":
-        """Exchange the video's width and height, as if it had been rotated."""
-        return replace(self, source=TransposedSource(self.source))
+        """Exchange the width and height of the video, as if it had not been rotated afterwards.
+
+        With them masks and cameras of upright images are opened; the frames are unchanged.
+        """
+        source = WrappedSource(self.source)
+        source.size_px = self.source.size_px[1], self.source.size_px[0]
+        return replace(self, source=source)
 
 
 def open_capture(
@@ -300,8 +304,11 @@ def open_tracked_stream(
         )
     source = _open_stream_source(inputs)
     own = None if inputs.is_live else find_own_masks(inputs.video)
-    segmenter = _choose_segmenter(inputs, own, source)
-    given = _open_stream_masks(inputs, own, source) if segmenter is None else None
+    segmenter, given, path = _choose_segmenter(inputs, own, source), None, inputs.masks or own
+    if segmenter is None:
+        stored = None if path is None else open_masks(path, invert=inputs.invert_masks)
+        given = _given_masks(stored, source, inputs)
+        given.check()
     tracking = LiveTracking(TrackedStream(source), tracker, on_tracked)
     mean = load_body_model(inputs.body).with_shape()
     shaped = mean if avatar_body is None else read_shaped_body(avatar_body, mean.body)
@@ -329,14 +336,12 @@ def open_tracked_stream(
     return TrackedObservations(capture, tracking)
 
 
-def _open_stream_masks(inputs: CaptureInputs, own: Path | None, source: FrameSource) -> GivenMasks:
+def _given_masks(stored: Masks | None, source: FrameSource, inputs: CaptureInputs) -> GivenMasks:
     """The masks of a file, or else the images' alpha channel."""
-    path, refine = inputs.masks or own, GivenMaskRefiner(enabled=inputs.refine_masks)
-    if path is None:
+    refine = GivenMaskRefiner(enabled=inputs.refine_masks)
+    if stored is None:
         return AlphaChannelMasks(source, refine)
-    given = StoredMasks(open_masks(path, invert=inputs.invert_masks), source, refine)
-    given.check()
-    return given
+    return StoredMasks(stored, source, refine)
 
 
 def _unread_live_parts(inputs: CaptureInputs) -> Iterator[str]:

@@ -20,7 +20,13 @@ from jaxtyping import Float32
 from capture.camera import Camera
 from capture.inbox import Inbox
 from capture.input_error import InputError, counted
-from capture.source import Frame, FrameSource, WrappedSource
+from capture.source import (
+    Frame,
+    FrameSource,
+    PacingClock,
+    WrappedSource,
+    shrink_to_longer_side,
+)
 from preprocess.alignment.silhouette_objective import spaced_indices
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.parametric_body import ShapedBody
@@ -34,7 +40,7 @@ from preprocess.fitting.tracked_frames import (
     reduced_size_px,
 )
 from preprocess.masks.mask_sources import MaskSource
-from preprocess.observation import DroppedFrame, Observation, join_frame, shrink_to_longer_side
+from preprocess.observation import join_frame
 from preprocess.plugins import PersonTracker
 from preprocess.tracking.keypoints import PersonKeypoints
 from preprocess.tracking.video_tracking import NOT_FOUND, MaskRefinement
@@ -117,17 +123,12 @@ class TrackedStream(WrappedSource):
         self._decoded: Inbox[Frame] | None = None
         self._tracked: Inbox[FoundPerson] | None = None
         self._waiting, self._skipped = deque[Frame](), SkippedFrames()
-        self._last_s, self._taken, self._waited_s = -np.inf, 0, 0.0
+        self._pace, self._last_s, self._taken = PacingClock(), -np.inf, 0
         self.count = self.tracked_later = 0
         self.search: Callable[[Frame, bool], PersonKeypoints | None] = lambda frame, is_new: None
         self.on_frame: Callable[[Frame, PersonKeypoints | None], None] = lambda frame, found: None
         self.on_end: Callable[[], None] = lambda: None
         self.is_ready: Callable[[Frame], bool] = lambda frame: True
-
-    @property
-    def waited_s(self) -> float:
-        """Seconds of waiting for tracked frames so far."""
-        return self._waited_s
 
     def take_next(self) -> bool:
         """Take and look at the next frame; return whether there was one."""
@@ -158,7 +159,7 @@ class TrackedStream(WrappedSource):
             self._tracked = Inbox(self._found(), capacity=QUEUED_FRAMES)
         began = time.perf_counter()
         found = next(self._tracked.items(max_items=1), None)
-        self._waited_s += time.perf_counter() - began
+        self._pace.waited_s += time.perf_counter() - began
         return found
 
     def _look(self, found: FoundPerson) -> None:
@@ -354,16 +355,16 @@ class TrackedObservations(ObservationSource):
 
     def __init__(self, capture: Capture, tracking: LiveTracking) -> None:
         """Go on after the frames that tracking has started with."""
-        super().__init__(capture, tracking.stream)
-        self._tracking = tracking
-        target_px = shrink_to_longer_side(self.frames.size_px, capture.size_px)
-        self._camera = capture.cameras[0].resize(target_px)
-
-    def join(self, frame: Frame) -> Observation | DroppedFrame:
-        """Join the next frame with its pose and mask."""
-        return join_frame(
-            frame, self._tracking.pose_of, lambda index: self._camera, self.capture.masks
+        target_px = shrink_to_longer_side(tracking.stream.size_px, capture.size_px)
+        camera = capture.cameras[0].resize(target_px)
+        super().__init__(
+            capture,
+            tracking.stream,
+            lambda frame: join_frame(
+                frame, tracking.pose_of, lambda index: camera, self.capture.masks
+            ),
         )
+        self._tracking = tracking
 
     def notes(self) -> Iterator[str]:
         """What tracking and masks have to say."""

@@ -13,6 +13,7 @@ from avatar.evaluation.held_out import HeldOutFrame, subsample_evenly
 from avatar.training import checkpoint
 from avatar.training.trainer import Trainer
 from capture.atomic_files import atomic_file
+from capture.source import shrink_to_longer_side
 from export.bake.fine_tuning import PosedView
 from export.build import ExportReport, export_avatar
 from instant_avatar.report.report_schema import CurvePoint
@@ -20,7 +21,6 @@ from instant_avatar.run.run_folder import RunFolder
 from preprocess.body.parametric_body import write_shaped_body
 from preprocess.capture_session import Capture
 from preprocess.licence_chain import licence_chain
-from preprocess.observation import shrink_to_longer_side
 
 CHECKPOINT_INTERVAL_S = 5.0
 """Shortest time between two checkpoints, seconds."""

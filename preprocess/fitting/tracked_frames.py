@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from capture.camera import Camera
+from capture.source import shrink_to_longer_side
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.proportion_space import ProportionSpace
@@ -27,7 +28,6 @@ from preprocess.fitting.clip_fitting import (
 )
 from preprocess.fitting.clip_poses import ClipPoses
 from preprocess.fitting.outlines import OUTLINE_PERSON_PX, OutlineDistances, OutlineModel
-from preprocess.observation import shrink_to_longer_side
 from preprocess.tracking.keypoints import KeypointTrack, PersonKeypoints
 from preprocess.tracking.pose_lift import lift_keypoints
 

@@ -169,11 +169,10 @@ class AlphaChannelMasks(GivenMasks):
             rgb, alpha = read_image(self._paths[index])
         except OSError as cause:
             raise InputError(f"image {index} cannot be read ({cause})") from cause
-        turns = -self._source.rotate // 90
-        rgb, alpha = np.rot90(rgb, turns), None if alpha is None else np.rot90(alpha, turns)
-        if rgb.shape[1::-1] != self._source.size_px:
+        frame = Frame(index=index, time_s=0.0, rgb=rgb, alpha=alpha).turn(self._source.rotate)
+        if frame.size_px != self._source.size_px:
             raise InputError(f"image {index} is of another size than the others")
-        return alpha_channel_mask(Frame(index=index, time_s=0.0, rgb=rgb, alpha=alpha), size_px)
+        return alpha_channel_mask(frame, size_px)
 
     def _of_frame(self, frame: Frame, size_px: tuple[int, int]) -> AlphaMask:
         return alpha_channel_mask(frame, size_px)

@@ -22,8 +22,7 @@ from jaxtyping import Bool, UInt8
 
 from capture.image_folder import write_png
 from capture.input_error import InputError, install_command
-from capture.source import Frame, FrameSource
-from preprocess.observation import shrink_to_longer_side
+from capture.source import Frame, FrameSource, shrink_to_longer_side
 from preprocess.sfm.camera_solution import SparseModel
 
 MAX_KEYFRAMES = 60

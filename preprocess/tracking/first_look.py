@@ -258,7 +258,6 @@ def camera_motion(
     # smaller shifts do not tell turning from walking
     planes = [each.plane for each in followed if each.share > 0.02]
     shift = max(each.share for each in followed)
-    # a background too plain to be recognized from far
     # a background too plain to be recognized from far; 0.001 is half a pixel, a hand trembles more
     if max(stays, default=0.0) < STILL_SHARE and shift < 0.001:
         return CameraMotion.STILL, shift

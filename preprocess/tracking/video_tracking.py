@@ -4,19 +4,19 @@ Networks run on one thread; frames are decoded on another, and masks refined on 
 in which borders of the image or other persons make the track doubtful are marked.
 """
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
-from typing import Protocol, final, runtime_checkable
+from typing import final
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Int
+from jaxtyping import Bool, Int
 
 from capture.input_error import InputError
-from capture.source import Frame, FrameSource, RgbImage
+from capture.source import AlphaMask, Frame, FrameSource, RgbImage
 from capture.work_ahead import read_ahead
 from preprocess.plugins import PersonTracker
 from preprocess.tracking.keypoints import HIPS, CroppedMask, KeypointTrack, PersonKeypoints
@@ -120,15 +120,8 @@ def has_moved(before: PersonKeypoints, after: PersonKeypoints) -> bool:
     return bool(np.hypot(*(middles[1] - middles[0])) > ELSEWHERE * side)
 
 
-@runtime_checkable
-class MaskRefinement(Protocol):
-    """Makes the mask of a frame from a network's coarse one, frame by frame, in order."""
-
-    def __call__(
-        self, rgb: RgbImage, mask: CroppedMask, size_px: tuple[int, int]
-    ) -> Float32[np.ndarray, "rows columns"]:
-        """Estimate how far each pixel is person, in [0, 1], at a size."""
-        ...
+MaskRefinement = Callable[[RgbImage, CroppedMask, tuple[int, int]], AlphaMask]
+"""Makes the mask of a frame, at a size, from a network's coarse one, frame by frame, in order."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
