@@ -103,14 +103,34 @@ def bent_arm():
     return replace(BodyPose.rest(), root_translation=place, joint_rotations=joints)
 
 
-@pytest.mark.parametrize("size", [(160, 90), (90, 160), (120, 120)])
-def test_the_whole_person_fits_into_every_shape(player, following, size):
+@pytest.mark.parametrize(
+    ("size", "share"), [((160, 90), 0.8), ((90, 160), 0.675), ((256, 256), 0.8)]
+)
+def test_the_whole_person_takes_most_of_a_picture_of_every_shape(player, following, size, share):
     pose = canonical_pose_of(player)
     alpha = player.render(pose, following(size).camera_for(pose))[..., 3]
     assert alpha.shape == size[::-1]
     border = np.concatenate([alpha[0], alpha[-1], alpha[:, 0], alpha[:, -1]])
     assert not border.any()
-    assert (alpha > 127).any(axis=1).sum() > 0.6 * min(size)
+    rows = np.flatnonzero((alpha > 127).any(axis=1))
+    assert (rows[-1] + 1 - rows[0]) / size[1] == pytest.approx(share, abs=0.03)
+    assert (rows[-1] + 1 + rows[0]) / size[1] == pytest.approx(1.0, abs=0.03)
+
+
+def test_the_camera_does_not_depend_on_where_the_trackers_world_lies(player, rng):
+    motion, pelvis = motion_of(30.0, 1, rng), player.manifest.rest_joints[0]
+    turn, shift = rotation_matrices(rng.normal(size=3)), rng.normal(size=3)
+    moved = replace(
+        motion,
+        root_rotations=(
+            Rotation.from_matrix(turn) * Rotation.from_rotvec(motion.root_rotations)
+        ).as_rotvec(),
+        root_translations=(pelvis + motion.root_translations) @ turn.T + shift - pelvis,
+    )
+    before, after = (FollowingCamera.of(player, m, 96).camera_for(m[0]) for m in (motion, moved))
+    back = before.camera_from_world[:3, :3] @ turn.T
+    np.testing.assert_allclose(after.camera_from_world[:3, :3], back, atol=1e-9)
+    np.testing.assert_allclose(after.center_world, turn @ before.center_world + shift, atol=1e-9)
 
 
 def test_wishes_that_cannot_be_are_named():
