@@ -56,6 +56,15 @@ def test_a_resized_camera_sees_the_same_directions():
     np.testing.assert_allclose(half.resize((200, 150)).intrinsic, camera.intrinsic)
 
 
+def test_the_intrinsic_matrix_goes_round():
+    camera = camera_at(7, (0.1, 0.0, 0.0, 0.0))
+    again = Camera.from_intrinsic(
+        camera.intrinsic, camera.size_px, camera.camera_from_world, camera.distortion
+    )
+    np.testing.assert_array_equal(again.intrinsic, camera.intrinsic)
+    assert again.distortion == camera.distortion
+
+
 def test_barrel_distortion_pulls_points_inwards():
     point = np.array([1.0, 0.0, 1.0])  # r = 1: r (1 + k1 r²) = 0.9
     camera = plain_camera(-0.1, 0.0, 0.0, 0.0)
