@@ -63,7 +63,8 @@ BRIEF = pytest.MonkeyPatch()
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup():
     """Bake coarser voxels, fine-tune on fewer, smaller images, export fewer Gaussians
-    and texels, fit poses in fewer steps, judge smaller pictures, and show a shorter film."""
+    and texels, fit poses in fewer steps, judge smaller pictures, close a stream in fewer
+    steps, and show a shorter film."""
     BRIEF.setattr(bake_tables, "MIN_VOXEL_M", BRIEF_VOXEL_M)
     BRIEF.setattr(bake_tables, "MAX_VOXEL_M", BRIEF_VOXEL_M)
     BRIEF.setattr(bake_tables, "FINE_TUNING_PICTURES", 2)
@@ -77,6 +78,8 @@ def pytest_runtest_setup():
     BRIEF.setattr(held_out_pose_fitting, "CORRECTIONS_PER_FRAME", 3)
     BRIEF.setattr(held_out_pose_fitting, "RAYS_PER_CORRECTION", 1024)
     BRIEF.setattr(final_scoring, "UNFILMED_REDUCTION", 5)
+    BRIEF.setattr(train, "CLOSING_S", 0.1)
+    BRIEF.setattr(train, "LEAST_STEPS", FEW_STEPS)
     BRIEF.setattr(report_writer, "ANIMATION_PX", 96)
     BRIEF.setattr(report_writer, "ANIMATION_FRAMES", 4)
 

@@ -52,7 +52,7 @@ def test_a_good_film_needs_no_advice(look, frames):
     )
 
 
-@pytest.mark.parametrize("rotate", [90, 180, 270])
+@pytest.mark.parametrize("rotate", [90, 180])
 def test_a_turned_film_is_named_with_the_option_that_turns_it_upright(look, frames, rotate):
     seen = look([np.rot90(frame, rotate // 90) for frame in frames])
     assert seen.rotation == rotate

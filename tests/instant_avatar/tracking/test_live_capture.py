@@ -23,8 +23,8 @@ def watch(call_ingest, without_baking, monkeypatch, tmp_path):
 
     def watch(*arguments):
         monkeypatch.setattr(train, "warm_up", warm_up)  # a live source waits for no compiler
-        words = [*map(str, arguments), "--out", str(tmp_path / "run"), "--no-refine-poses"]
-        code = ingest.main(words)
+        out, small = ("--out", str(tmp_path / "run")), ("--no-refine-poses", "--size", "96")
+        code = ingest.main([*map(str, arguments), *out, *small])
         path = tmp_path / "run" / "report.json"
         return code, json.loads(path.read_text()) if path.exists() else None
 

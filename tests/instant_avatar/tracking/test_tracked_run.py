@@ -23,11 +23,11 @@ from tests.instant_avatar.conftest import Outcome
 
 @pytest.fixture
 def ingest_video(video, tmp_path, capsys, on_one_core):
-    """Runs ia-ingest on the video; returns how it ended and the run's folder."""
+    """Runs ia-ingest on the video in small; returns how it ended and the run's folder."""
 
     def call(*words, steps=10):
         out = tmp_path / "run"
-        named = ["--out", out, "--steps", steps, *words]
+        named = ["--out", out, "--steps", steps, "--size", 96, *words]
         code = ingest.main([str(word) for word in (video, *named)])
         captured = capsys.readouterr()
         return Outcome(code=code, out=captured.out, err=captured.err), out
