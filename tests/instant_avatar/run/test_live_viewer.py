@@ -15,6 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import tyro
 
 from avatar.config import TrainConfig
 from avatar.correspondence_grid import CorrespondenceGrid
@@ -24,7 +25,7 @@ from export.player import Player
 from instant_avatar import ingest
 from instant_avatar.cli.command_line import fill_optional_value
 from instant_avatar.run import live_viewer, session_start
-from instant_avatar.run.ingest_arguments import VIEW_PORT
+from instant_avatar.run.ingest_arguments import VIEW_PORT, IngestArguments
 from instant_avatar.run.live_viewer import (
     BACKGROUND_RGB,
     DANCE,
@@ -227,10 +228,6 @@ def test_view_without_viser_says_how_to_get_it(film, tmp_path, monkeypatch, caps
     ],
 )
 def test_the_port_may_be_left_out(words, port):
-    import tyro
-
-    from instant_avatar.run.ingest_arguments import IngestArguments
-
     given = tyro.cli(IngestArguments, args=fill_optional_value(words, "--view", VIEW_PORT))
     assert given.view == port
     assert given.video == Path("v.mp4")

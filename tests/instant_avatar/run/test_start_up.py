@@ -92,13 +92,16 @@ def test_waiting_ends_once_the_kernels_are_compiled(started, monkeypatch):
         assert [process.poll() for process in started] == [0] * PROCESSES
 
 
-@pytest.fixture
-def inputs(film):
-    return CaptureInputs(video=film, frames=slice(0, 24, 2))
+def open_some(film):
+    """A capture that was not fitted."""
+    return open_capture(CaptureInputs(video=film, frames=slice(0, 24, 2)), size_px=SIZE_PX)
 
 
-def equal_captures(inputs):
-    return [open_capture(inputs, size_px=SIZE_PX) for _ in range(2)]
+@pytest.fixture(scope="module")
+def fitted(film):
+    """A capture and the fit that this process finds."""
+    capture = open_some(film)
+    return capture, fit_capture(capture)
 
 
 def assert_same(one, other):
@@ -107,34 +110,31 @@ def assert_same(one, other):
         np.testing.assert_allclose(value, getattr(other, name), rtol=1e-5, atol=1e-5)
 
 
-def test_another_process_fits_and_remembers_what_this_one_would(inputs):
-    here, there = equal_captures(inputs)
+def test_another_process_fits_and_remembers_what_this_one_would(film, fitted):
+    (here, fit), there = fitted, open_some(film)
     with fitting_beside() as fitting:
         fitting.send(there, None, with_rig=True)
         found = fitting.fit(there)
         sent_rig = fitting.rig()
-    assert_same(found, fit_capture(here))
-    rig = Rig.from_shaped_body(apply_fit(here, found).shaped)
-    assert_same(sent_rig, rig)
+    assert_same(found, fit)
+    assert_same(sent_rig, Rig.from_shaped_body(apply_fit(here, fit).shaped))
     assert not there.masks.needs_all_frames  # it has compared borders, as the other one
     assert there.masks.refine._ratios == here.masks.refine._ratios
 
 
-def test_a_process_that_fails_is_done_without(inputs, monkeypatch):
-    monkeypatch.setattr(start_up, "FIT", "raise SystemExit(1)")
-    here, there = equal_captures(inputs)
+@pytest.mark.parametrize("trouble", ["the process fails", "the masks cannot be sent"])
+def test_what_another_process_does_not_fit_is_fitted_by_this_one(
+    film, fitted, monkeypatch, trouble
+):
+    there = open_some(film)
+    if trouble == "the process fails":
+        monkeypatch.setattr(start_up, "FIT", "raise SystemExit(1)")
+    else:
+        there.masks.plugin = lambda: None  # not to be pickled
     with fitting_beside() as fitting:
         fitting.send(there, None, with_rig=True)
-        assert_same(fitting.fit(there), fit_capture(here))
+        assert_same(fitting.fit(there), fitted[1])
         assert fitting.rig() is None
-
-
-def test_what_cannot_be_sent_is_fitted_by_this_process(inputs):
-    here, there = equal_captures(inputs)
-    there.masks.plugin = lambda: None  # not to be pickled
-    with fitting_beside() as fitting:
-        fitting.send(there, None, with_rig=False)
-        assert_same(fitting.fit(there), fit_capture(here))
 
 
 def test_a_process_without_a_capture_ends_before_training(started):
