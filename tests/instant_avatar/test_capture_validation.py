@@ -73,9 +73,11 @@ def call_check(capsys, tmp_path):
     return call
 
 
-def test_a_good_capture_is_called_good(dancing, call_check, tmp_path):
-    code, _, found = call_check(dancing)
-    assert code == 0
+def test_a_good_capture_is_called_good_and_there_is_nothing_to_mend(dancing, call_check, tmp_path):
+    code, said, found = call_check(dancing, "--fix", tmp_path / "mended")
+    assert code == 2
+    assert "No correctable mistake" in said
+    assert not (tmp_path / "mended").exists()
     assert found["verdict"] == "good"
     assert found["cause"] is None
     assert found["iou"]["now"] == found["iou"]["after_fix"] > 0.75
@@ -219,13 +221,6 @@ def test_what_no_correction_explains_is_not_named(spoilt, call_check):
     assert "No known mistake explains this" in said
 
 
-def test_mending_needs_a_mistake(dancing, tmp_path, call_check):
-    code, said, _ = call_check(dancing, "--fix", tmp_path / "mended")
-    assert code == 2
-    assert "No correctable mistake" in said
-    assert not (tmp_path / "mended").exists()
-
-
 def test_unreadable_input_is_reported_in_the_json_too(tmp_path, call_check):
     code, said, found = call_check(tmp_path / "nothing", "--poses", tmp_path / "none.npz")
     assert code == 2
@@ -259,7 +254,7 @@ def test_a_glance_is_enough_for_a_good_capture_and_notices_a_late_one(dancing, s
 
 def test_ingest_stops_before_an_unusable_capture_and_says_why(spoilt, call_ingest, tmp_path):
     folder = spoilt(capture_corruptions.scale_focal(0.4))
-    outcome = call_ingest(folder, "--out", tmp_path / "run")
+    outcome = call_ingest(folder, "--frames", ":12", "--out", tmp_path / "run")
     assert outcome.code == 2
     assert "--force" in outcome.complaint()
     assert not (tmp_path / "run").exists()

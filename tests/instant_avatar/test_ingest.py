@@ -228,31 +228,24 @@ def test_a_full_disk_keeps_the_checkpoint_before(
     assert trainer.steps == 1
 
 
-def test_a_disk_that_is_full_from_the_start_leaves_the_package_if_that_found_room(
-    capture, call_ingest, without_baking, tmp_path, monkeypatch
-):
-    def full(state, file):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(torch, "save", full)
-    outcome = call_ingest(capture, *FEW, "--out", tmp_path / "run")
-    assert outcome.code == 3
-    assert "can be played" in outcome.complaint()
-    assert {file.name for file in (tmp_path / "run").rglob("*")} == {"avatar.iavatar", LIST}
-
-
-def test_a_disk_that_has_no_room_for_anything_is_left_as_it_was(
-    capture, call_ingest, tmp_path, monkeypatch
+@pytest.mark.parametrize(
+    ("fits", "word", "left"),
+    [(True, "can be played", {"avatar.iavatar", LIST}), (False, "Nothing was written", set())],
+)
+def test_a_disk_that_is_full_from_the_start_leaves_the_package_if_that_fits(
+    capture, call_ingest, without_baking, tmp_path, monkeypatch, fits, word, left
 ):
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(torch, "save", full)
-    monkeypatch.setattr("instant_avatar.run.snapshot_writer.export_avatar", full)
+    if not fits:
+        monkeypatch.setattr(snapshot_writer, "export_avatar", full)
     outcome = call_ingest(capture, *FEW, "--out", tmp_path / "run")
     assert outcome.code == 3
-    assert "Nothing was written" in outcome.complaint()
-    assert not (tmp_path / "run").exists()
+    assert word in outcome.complaint()
+    assert {file.name for file in (tmp_path / "run").rglob("*")} == left
+    assert (tmp_path / "run").exists() == fits
 
 
 @pytest.mark.slow
