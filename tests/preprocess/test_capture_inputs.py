@@ -67,12 +67,6 @@ def test_what_is_named_wins(make):
     assert found_in(root / "v.mp4", root / "p.npz", cameras="static").cameras is None
 
 
-def test_a_video_without_poses_is_refused(make):
-    root = make("video.mp4", "poses.npz")
-    with pytest.raises(InputError, match="--poses"):
-        found_in(root / "video.mp4")
-
-
 @pytest.mark.parametrize("missing", ["video", "poses", "masks", "cameras"])
 def test_what_is_named_must_be_there(make, missing):
     root = make("video.npz", "poses.npz", "masks.npz", "cameras.npz")

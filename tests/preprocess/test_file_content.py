@@ -115,18 +115,17 @@ def test_a_python_2_file_with_chumpy_and_scipy_is_read(tmp_path, smpl_arrays, ch
     assert body.parents[0] == -1
 
 
-@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
 @pytest.mark.parametrize("kind", ["<f8", ">f4", "<i2", "|u1", "|b1", ">u8"])
 @pytest.mark.parametrize("order", ["C", "F"])
-def test_arrays_go_round_in_every_type_order_and_protocol(tmp_path, protocol, kind, order):
+def test_arrays_go_round_in_every_type_order_and_protocol(tmp_path, kind, order):
     array = np.asarray(np.arange(24).reshape(2, 3, 4) % 7, dtype=kind, order=order)
-    path = tmp_path / "a.pkl"
-    path.write_bytes(pickle.dumps({"a": array, "s": array[0, 0, 1], "l": [1.5, 2]}, protocol))
-    read = read_pickled_arrays(path, ("a", "s", "l", "missing"))
-    np.testing.assert_array_equal(read["a"], array)
-    np.testing.assert_array_equal(read["s"], array[0, 0, 1])
-    np.testing.assert_array_equal(read["l"], [1.5, 2.0])
-    assert "missing" not in read
+    path, held = tmp_path / "a.pkl", {"a": array, "s": array[0, 0, 1], "l": [1.5, 2]}
+    for protocol in range(pickle.HIGHEST_PROTOCOL + 1):
+        path.write_bytes(pickle.dumps(held, protocol))
+        read = read_pickled_arrays(path, (*held, "missing"))
+        assert read.keys() == held.keys()
+        for key, value in held.items():
+            np.testing.assert_array_equal(read[key], value)
 
 
 def test_names_are_allowed_exactly_not_by_module(tmp_path):
@@ -140,7 +139,7 @@ def test_names_are_allowed_exactly_not_by_module(tmp_path):
 @pytest.mark.parametrize(
     "data",
     [
-        b"]" * 100_000,  # no end
+        b"]" * 10_000,  # no end
         b"cbuiltins\nset\n}}\x86b.",  # a state for a class
         b"cchumpy.ch\nCh\n}}\x86b.",  # a state for one of ours
         b"\x80\x04\x82\x01.",  # copyreg's extensions

@@ -95,9 +95,9 @@ def plain(rgb, mask, size_px):
     return mask.resample((rgb.shape[1], rgb.shape[0]), size_px)
 
 
-def started(tracker, source=None):
+def started(tracker, source=None, *advice):
     stream = TrackedStream(source or Pictures())
-    tracking = LiveTracking(stream, tracker)
+    tracking = LiveTracking(stream, tracker, *advice)
     camera = assume_camera(Path("film.mp4"), "static", stream)
     start = tracking.start(load_body_model(None).with_shape(), camera)
     return stream, tracking, start
@@ -166,10 +166,8 @@ class Filmed(Pictures):
 
 def test_the_tracker_looks_at_the_newest_frame_and_at_skipped_ones_when_filming_is_over(standing):
     source, looked_at = Filmed(standing), []
-    stream = TrackedStream(source)
-    tracking = LiveTracking(stream, source, lambda frame, found: looked_at.append(frame.index))
-    camera = assume_camera(Path("film.mp4"), "static", stream)
-    start = tracking.start(load_body_model(None).with_shape(), camera)
+    advise = lambda frame, found: looked_at.append(frame.index)  # noqa: E731
+    stream, tracking, start = started(source, source, advise)
     seen = observe_all(stream, tracking, start)
     order = [item.frame.index for item in seen]
     assert stream.all_came  # rates fall from then on, while skipped frames follow

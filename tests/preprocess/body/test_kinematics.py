@@ -7,7 +7,6 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from preprocess.body.kinematics import (
-    JOINT_NAMES,
     PARENTS,
     body_from_rest,
     joint_transforms,
@@ -35,13 +34,6 @@ def descendants(joint: int) -> set[int]:
     return inside
 
 
-@given(VECTORS)
-@settings(max_examples=25)
-def test_rotation_matrices_are_those_of_scipy(vector):
-    expected = Rotation.from_rotvec(vector).as_matrix()
-    np.testing.assert_allclose(rotation_matrices(vector), expected, atol=1e-12)
-
-
 def test_a_rotation_by_nothing_or_next_to_it_is_smooth():
     np.testing.assert_array_equal(rotation_matrices(np.zeros((4, 3)))[2], np.eye(3))
     tiny = rotation_matrices(np.array([1e-9, 0.0, 0.0]))
@@ -65,6 +57,7 @@ def test_bending_a_joint_moves_its_descendants_alone(joint, vector):
 
 
 @given(st.integers(0, 100))
+@settings(max_examples=25)
 def test_bones_keep_their_lengths(seed):
     rng = np.random.default_rng(seed)
     rest = rest_joints(seed)
@@ -75,6 +68,7 @@ def test_bones_keep_their_lengths(seed):
 
 
 @given(VECTORS, VECTORS, VECTORS)
+@settings(max_examples=25)
 def test_the_root_turns_about_the_pelvis(pelvis, rotation, translation):
     transform = world_from_body(pelvis, rotation, translation)
     np.testing.assert_allclose(
@@ -90,12 +84,3 @@ def test_the_world_and_the_body_make_the_whole_tree():
     apart = world_from_body(rest[0], turn, np.zeros(3)) @ body_from_rest(rest, TREE, bends)
     rotations = rotation_matrices(np.concatenate([turn[None], bends]))
     np.testing.assert_allclose(apart, joint_transforms(rest, TREE, rotations), atol=1e-12)
-
-
-def test_every_parent_comes_before_its_children_and_sides_mirror():
-    assert all(parent < joint for joint, parent in enumerate(PARENTS))
-    for joint, name in enumerate(JOINT_NAMES):
-        if name.startswith("left_"):
-            other = JOINT_NAMES.index(name.replace("left_", "right_"))
-            parent, others = JOINT_NAMES[PARENTS[joint]], JOINT_NAMES[PARENTS[other]]
-            assert parent.replace("left_", "right_") == others

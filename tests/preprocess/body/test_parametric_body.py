@@ -133,11 +133,10 @@ def test_smpl_keys_in_an_npz(write_npz, smpl_arrays):
     assert_is(body, smpl_arrays)
 
 
-@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
-def test_smpl_keys_in_a_pickle_of_any_protocol(tmp_path, smpl_arrays, protocol):
+def test_smpl_keys_in_a_pickle(tmp_path, smpl_arrays):
     path = tmp_path / "body.pkl"
     extras = {"bs_style": "lbs", "bs_type": "lrotmin", "gender": np.float64(1.0)}
-    path.write_bytes(pickle.dumps({**smpl_arrays, **extras}, protocol))
+    path.write_bytes(pickle.dumps({**smpl_arrays, **extras}))
     assert_is(load_body_model(path), smpl_arrays)
 
 
@@ -196,7 +195,7 @@ def test_what_is_no_body_is_refused_by_name(write_npz, changes):
         load_body_model(write_npz(**changes))
 
 
-@pytest.mark.parametrize("name", ["body.npz", "body.pkl"])
+@pytest.mark.parametrize("name", ["body.npz", "body.pkl", "body.obj"])
 @pytest.mark.parametrize("content", [b"", b"junk", bytes(1000), b"PK\x03\x04junk"])
 def test_a_file_that_is_something_else_is_refused(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
@@ -204,12 +203,9 @@ def test_a_file_that_is_something_else_is_refused(tmp_path, name, content):
         load_body_model(tmp_path / name)
 
 
-def test_a_missing_file_or_another_suffix_is_refused(tmp_path):
+def test_a_missing_file_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"body\.npz"):
         load_body_model(tmp_path / "body.npz")
-    (tmp_path / "body.obj").write_text("v 0 0 0")
-    with pytest.raises(InputError, match=r"\.obj"):
-        load_body_model(tmp_path / "body.obj")
 
 
 def test_fitted_proportions_are_the_persons_shape_whatever_the_betas(motion):

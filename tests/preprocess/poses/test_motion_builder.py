@@ -55,24 +55,15 @@ def test_another_anchor_of_the_root_is_the_same_motion(truth, shaped, joints_of,
 
 
 def test_poses_of_a_camera_that_moves_land_in_its_world(truth, shaped, joints_of, rng):
-    cameras = [camera(900.0, rigid(rng)) for _ in range(len(truth))]
-    tracked = replace(truth, space="camera")
+    """Each row by the camera of its frame."""
+    cameras = [camera(900.0, rigid(rng)) for _ in range(90)]
+    tracked = replace(truth, space="camera", frames=np.arange(40) + 50)
     there = place_in_camera_world(tracked, shaped, track_of(*cameras), cameras_given=True)
     assert there.space == "world"
-    for seen, joints, true in zip(cameras, joints_of(there), joints_of(truth), strict=True):
+    for seen, joints, true in zip(cameras[50:], joints_of(there), joints_of(truth), strict=True):
         transform = seen.camera_from_world
         back = joints @ transform[:3, :3].T + transform[:3, 3]
         np.testing.assert_allclose(back, true, atol=1e-9)
-
-
-def test_rows_find_their_camera_by_frame_number(truth, shaped, rng):
-    cameras = [camera(900.0, rigid(rng)) for _ in range(100)]
-    tracked = replace(truth, space="camera", frames=np.arange(40) + 50)
-    there = place_in_camera_world(tracked, shaped, track_of(*cameras), cameras_given=True)
-    expected = place_in_camera_world(
-        replace(tracked, frames=None), shaped, track_of(*cameras[50:]), cameras_given=True
-    )
-    np.testing.assert_array_equal(there.root_translations, expected.root_translations)
 
 
 def test_a_files_own_cameras_count_unless_others_are_given(truth, shaped, joints_of, rng):

@@ -291,9 +291,8 @@ def test_people_of_comfyuis_glb_are_kept_apart(truth, tmp_path):
     data = Rig(numbered("bone_{:03d}"), twist=0.7).glb(*truth)
     path = edited(tmp_path / "all_tracks.glb", data, add_person)
     rotations, places = truth
-    for person, aside in (("track00", 0.0), ("track01", 2.0)):
-        motion = read_poses(path, person=person)
-        assert fitted_m(motion, (rotations, places + np.array([aside, 0.0, 0.0]))) < 0.005
+    motion = read_poses(path, person="track01")
+    assert fitted_m(motion, (rotations, places + np.array([2.0, 0.0, 0.0]))) < 0.005
 
 
 def test_numbers_of_another_skeleton_are_named(truth, tmp_path):

@@ -1,6 +1,5 @@
 """A room to solve cameras in: a textured box, a turning camera, and where it really stood."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -23,7 +22,7 @@ def looking(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
     return np.stack([right, np.cross(forward, right), forward])
 
 
-def arc(
+def walked(
     count: int, *, degrees: float, radius_m: float = 2.2, size_px: tuple[int, int], focal_px: float
 ) -> list[Camera]:
     """A walk round the middle of the room with an unsteady hand."""
@@ -96,12 +95,7 @@ def room() -> Room:
     return Room.of()
 
 
-@pytest.fixture(scope="session")
-def walked() -> Callable[..., list[Camera]]:
-    return arc
-
-
-def exactly(cameras: list[Camera], points: np.ndarray, noise_px: float = 0.0) -> SparseModel:
+def exact_model(cameras: list[Camera], points: np.ndarray, noise_px: float = 0.0) -> SparseModel:
     """A model in which every camera sees every point that is in its picture, where it is."""
     rng = np.random.default_rng(2)
     seen_by, seen_point, pixels = [], [], []
@@ -134,16 +128,11 @@ def room_points() -> np.ndarray:
 
 
 @pytest.fixture
-def cameras(walked) -> list[Camera]:
+def cameras() -> list[Camera]:
     return walked(24, degrees=100, size_px=(640, 480), focal_px=520.0)
 
 
 @pytest.fixture
 def model(cameras, room_points) -> SparseModel:
     """An exact solution, in metres."""
-    return exactly(cameras, room_points)
-
-
-@pytest.fixture(scope="session")
-def exact_model() -> Callable[..., SparseModel]:
-    return exactly
+    return exact_model(cameras, room_points)

@@ -16,6 +16,7 @@ from preprocess.sfm.metric_world import (
     to_metric_world,
     upright_axes,
 )
+from tests.preprocess.sfm.conftest import exact_model
 
 TRUE = 0.4
 """Metres per unit of the solved world."""
@@ -106,7 +107,7 @@ def test_errors_of_single_frames_average_out(cameras):
 UP = np.array([0.0, 1.0, 0.0])
 
 
-def test_the_floor_is_found_among_walls(cameras, room_points, exact_model, rng):
+def test_the_floor_is_found_among_walls(cameras, room_points, rng):
     rough = room_points + 0.004 * rng.normal(size=room_points.shape)
     model = exact_model(cameras, rough)
     floor = fit_floor_plane(model, mean_camera_up(model))
@@ -116,31 +117,18 @@ def test_the_floor_is_found_among_walls(cameras, room_points, exact_model, rng):
     assert floor.heights_above(np.array([[0.0, 1.5, 0.0]])) == pytest.approx([1.5], abs=0.01)
 
 
-def test_a_table_is_no_floor(cameras, room_points, exact_model, rng):
+def test_a_table_is_no_floor(cameras, room_points, rng):
     table = rng.uniform([-2.5, 0.75, -2.5], [2.5, 0.75, 0.5], (700, 3))  # larger than the floor
     floor = fit_floor_plane(exact_model(cameras, np.concatenate([room_points, table])), UP)
     assert abs(floor.offset) < 0.005
 
 
-def test_no_floor_is_made_up(cameras, room_points, exact_model):
+def test_no_floor_is_made_up(cameras, room_points):
     walls = room_points[(room_points[:, 1] > 0.3)]
     assert fit_floor_plane(exact_model(cameras, walls), UP) is None
 
 
-def test_axes_are_a_rotation_with_y_up(rng):
-    for _ in range(20):
-        up, towards = rng.normal(size=(2, 3))
-        up /= np.linalg.norm(up)
-        axes = upright_axes(up, towards)
-        np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
-        assert np.linalg.det(axes) == pytest.approx(1.0)
-        np.testing.assert_allclose(axes @ up, UP, atol=1e-12)
-        seen = axes @ towards
-        assert abs(seen[0]) < 1e-9  # neither left nor right of z
-        assert seen[2] > 0.0
-
-
-def test_the_metric_world_shows_the_same_pictures(cameras, model, room_points, exact_model):
+def test_the_metric_world_shows_the_same_pictures(cameras, model, room_points):
     turn, scale = Rotation.from_rotvec([0.4, 1.0, -0.3]).as_matrix(), 0.25
     shrunk = []
     for camera in cameras:

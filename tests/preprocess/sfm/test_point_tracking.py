@@ -16,6 +16,7 @@ from preprocess.sfm.point_tracking import (
     track_points,
 )
 from preprocess.sfm.turning_camera import MAX_STATIC_MOTION, measure_background_motion
+from tests.preprocess.sfm.conftest import exact_model, walked
 
 
 def apart(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
@@ -74,28 +75,28 @@ def shown(room, cameras) -> list[SfmKeyframe]:
     return keys
 
 
-def test_a_tripod_is_known_though_the_person_moves(room, walked):
+def test_a_tripod_is_known_though_the_person_moves(room):
     camera = walked(2, degrees=0.0, size_px=(320, 240), focal_px=260.0)[0]
-    assert measure_background_motion(shown(room, [camera] * 12)) < 1e-3
+    assert measure_background_motion(shown(room, [camera] * 6)) < 1e-3
 
 
-def test_a_camera_that_walks_or_trembles_is_no_tripod(room, walked):
-    for degrees in (100.0, 0.0):  # round the room; on the spot, by 2 cm each way
-        cameras = walked(12, degrees=degrees, size_px=(320, 240), focal_px=260.0)
+def test_a_camera_that_walks_or_trembles_is_no_tripod(room):
+    for degrees in (45.0, 0.0):  # round the room; on the spot, by 2 cm each way
+        cameras = walked(6, degrees=degrees, size_px=(320, 240), focal_px=260.0)
         assert not measure_background_motion(shown(room, cameras)) <= MAX_STATIC_MOTION
 
 
 @pytest.fixture(scope="module")
-def film(room, walked, tmp_path_factory):
+def film(room, tmp_path_factory):
     folder = tmp_path_factory.mktemp("film")
-    cameras = walked(31, degrees=30, size_px=(320, 240), focal_px=260.0)
+    cameras = walked(15, degrees=14, size_px=(320, 240), focal_px=260.0)
     for index, camera in enumerate(cameras):
         cv2.imwrite(str(folder / f"{index:04d}.png"), room.seen(camera)[..., ::-1])
     return cameras, open_source(folder)
 
 
-def keyed(film, cameras, room_points, exact_model, rows):
-    """Every fifth frame is known exactly, with the corners of its picture as points."""
+def keyed(film, cameras, room_points, rows):
+    """Some frames are known exactly, with the corners of their pictures as points."""
     keys, seen = [], []
     for frame in film.frames():
         if frame.index in rows:
@@ -108,12 +109,12 @@ def keyed(film, cameras, room_points, exact_model, rows):
     return keys, replace(model, frames=np.array(rows))
 
 
-def test_frames_between_key_frames_are_placed_to_millimetres(film, room_points, exact_model):
+def test_frames_between_key_frames_are_placed_to_millimetres(film, room_points):
     cameras, source = film
-    rows = [0, 6, 12, 18, 24]
-    keys, model = keyed(source, cameras, room_points, exact_model, rows)
+    rows = [0, 6, 12]
+    keys, model = keyed(source, cameras, room_points, rows)
     found = resect_intermediate_frames(source, model, keys, lambda share: None)
-    assert sorted(found.cameras) == [i for i in range(31) if i not in rows]  # those at the end, too
+    assert sorted(found.cameras) == [i for i in range(15) if i not in rows]  # those at the end, too
     off = np.array([apart(found.cameras[i], cameras[i].camera_from_world) for i in found.cameras])
     assert np.median(off[:, 0]) < 4.0
     assert off[:, 0].max() < 20.0
@@ -122,12 +123,10 @@ def test_frames_between_key_frames_are_placed_to_millimetres(film, room_points, 
     assert max(found.keyframe_errors_px.values()) < 0.6
 
 
-def test_a_key_frame_in_the_wrong_place_is_betrayed_by_what_is_followed(
-    film, room_points, exact_model
-):
+def test_a_key_frame_in_the_wrong_place_is_betrayed_by_what_is_followed(film, room_points):
     cameras, source = film
-    rows = [0, 6, 12, 18, 24]
-    keys, model = keyed(source, cameras, room_points, exact_model, rows)
+    rows = [0, 6, 12]
+    keys, model = keyed(source, cameras, room_points, rows)
     views = model.camera_from_world.copy()
     views[2, :3, 3] += [0.12, 0.0, 0.0]
     found = resect_intermediate_frames(

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from preprocess.sfm.camera_solution import evaluate_gates, find_outlier_cameras
+from tests.preprocess.sfm.conftest import exact_model, walked
 
 
 def failed(gates) -> list[str]:
@@ -40,7 +41,7 @@ def test_an_exact_solution_passes_whatever_its_world(model):
         assert not find_outlier_cameras(one).any()
 
 
-def test_noise_of_pixels_is_measured(cameras, room_points, exact_model):
+def test_noise_of_pixels_is_measured(cameras, room_points):
     noisy = exact_model(cameras, room_points, noise_px=1.0)
     gates = evaluate_gates(noisy, len(cameras))
     assert failed(gates) == ["reprojection_px"]
@@ -55,7 +56,7 @@ def test_key_frames_that_are_missing_are_counted(model):
 
 
 @pytest.mark.parametrize(("share", "bound"), [(0.3, "0.5"), (2.6, "2")])
-def test_an_impossible_focal_length_is_refused(cameras, room_points, exact_model, share, bound):
+def test_an_impossible_focal_length_is_refused(cameras, room_points, share, bound):
     focal = share * 640
     lenses = [replace(camera, focal_px=(focal, focal)) for camera in cameras]
     gates = evaluate_gates(exact_model(lenses, room_points), len(cameras))
@@ -64,7 +65,7 @@ def test_an_impossible_focal_length_is_refused(cameras, room_points, exact_model
     assert focal_gate.describe_failure().endswith(f"the bound is {bound})")
 
 
-def test_a_camera_that_hardly_moves_is_refused(walked, room_points, exact_model):
+def test_a_camera_that_hardly_moves_is_refused(room_points):
     still = walked(24, degrees=0.2, size_px=(640, 480), focal_px=520.0)
     eye = still[0].camera_from_world[:3, 3]
     close = []

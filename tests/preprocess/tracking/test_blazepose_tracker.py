@@ -113,13 +113,6 @@ def test_a_small_person_in_a_wide_frame_is_found(plain):
 # --- several persons --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("person", "left"), [(1, 0), (2, 300)])
-def test_persons_are_numbered_from_the_left(striped, plain, person, left):
-    found = BlazePoseTracker(person=person)(scene((striped, 0), (plain, 300), width=600))
-    assert found is not None
-    assert abs(hips(found) - middle(left)) < 15
-
-
 def test_a_person_who_is_not_there_yet_is_awaited(striped, plain):
     tracker = BlazePoseTracker(person=2)
     assert tracker(scene((plain, 300), width=600)) is None
@@ -143,16 +136,16 @@ def test_the_person_in_front_is_followed(striped, plain):
 def test_a_person_who_walks_past_is_not_followed(striped, plain, is_in_front):
     tracker = BlazePoseTracker(person=1)
     found_frames, crowded = [], []
-    for frame in range(12):
-        placed = [(striped, 100), (plain, 330 - 40 * frame)]
+    for frame in range(9):
+        placed = [(striped, 100), (plain, 330 - 55 * frame)]
         found = tracker(scene(*(placed if is_in_front else placed[::-1]), width=600))
         if found is not None:
             assert abs(hips(found) - middle(100)) < 30
             found_frames.append(frame)
             crowded.append(found.crowded)
     assert any(crowded)
-    assert found_frames[-1] == 11
-    assert len(found_frames) == 12 if not is_in_front else len(found_frames) > 5
+    assert found_frames[-1] == 8
+    assert len(found_frames) == 9 if not is_in_front else len(found_frames) > 4
 
 
 def test_persons_side_by_side_are_separated(striped, plain):
