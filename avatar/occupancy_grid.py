@@ -15,7 +15,14 @@ from scipy.ndimage import label
 from torch import Tensor
 
 from avatar.kernels import numba_priors
-from avatar.kernels.operands import MAX_LOG_DENSITY, DensityGrid
+from avatar.kernels.operands import (
+    EMPTY_SPACE,
+    HEAD_INTERIOR,
+    INTERIOR,
+    MAX_LOG_DENSITY,
+    OFF_SKIN,
+    DensityGrid,
+)
 from avatar.rig import CLOTHING_BAND_M, Rig
 from preprocess.body.kinematics import HEAD_JOINT
 
@@ -55,15 +62,17 @@ class OccupancyGrid:
         interior = np.argwhere(rig.inside_skin & (rig.skin_distance > 0.015))
         weights = rig.weights_at(rig.box_low + (interior + 0.5) / rig.cells_per_m)
         flat = np.ravel_multi_index(tuple(interior.T), band.shape)
-        self._interior_cells = torch.from_numpy(flat)
         self._deep_head_cells = torch.from_numpy(flat[weights[:, HEAD_JOINT] > 0.5])
-        self._head_cells = self._deep_head_cells
         off_skin = torch.from_numpy(~rig.inside_skin & (rig.skin_distance > 0.03))  # off clothes
-        self._off_skin_cells = (band & off_skin).flatten().nonzero()[:, 0]
+        self._cells_of_kind: dict[int, Tensor] = {
+            INTERIOR: torch.from_numpy(flat),
+            HEAD_INTERIOR: self._deep_head_cells,
+            OFF_SKIN: (band & off_skin).flatten().nonzero()[:, 0],
+        }
         self._near_skin = rig.skin_distance <= NEAR_SKIN_M
         self._cached_empty_cells: tuple[int, Tensor] | None = None
         self._floaters, self._updates = torch.zeros_like(self._in_band), 0
-        self._ahead = dict[str, tuple[Tensor, int, list[Tensor]]]()
+        self._ahead = dict[int, tuple[Tensor, int, list[Tensor]]]()
 
     def shape_face(self, before: Int64[Tensor, "before"], under: Int64[Tensor, "under"]) -> None:
         """Keeps cells before a face empty, and adds those under its skin to the head's interior.
@@ -73,7 +82,7 @@ class OccupancyGrid:
         self._in_band = self._band.clone()
         self._in_band.view(-1)[before] = 0
         self.density_grid.occupied.mul_(self._in_band)
-        self._head_cells = torch.cat([self._deep_head_cells, under])
+        self._cells_of_kind[HEAD_INTERIOR] = torch.cat([self._deep_head_cells, under])
 
     @torch.no_grad()
     def update(
@@ -134,23 +143,23 @@ class OccupancyGrid:
             float(self.density_grid.density.view(-1)[self.band_cells].mean()),
         )
 
-    def sample_empty(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
-        """Random points in unoccupied cells of the band, at most `count`."""
-        return self._draw("empty", self._empty_cells(), count, generator)
-
-    def sample_off_skin(
-        self, count: int, generator: torch.Generator
+    def sample(
+        self, kind: int, count: int, generator: torch.Generator
     ) -> Float32[Tensor, "points 3"]:
-        """Random points of the band that lie off the skin, at most `count`."""
-        return self._draw("off skin", self._off_skin_cells, count, generator)
+        """Random points, at most `count`, where priors of a kind hold.
 
-    def sample_interior(
-        self, count: int, generator: torch.Generator, *, of_head: bool = False
-    ) -> Float32[Tensor, "points 3"]:
-        """Random points deep under the skin, or under the head's, at most `count`."""
-        if of_head:
-            return self._draw("head", self._head_cells, count, generator)
-        return self._draw("interior", self._interior_cells, count, generator)
+        `EMPTY_SPACE` is unoccupied cells of the band, and `OFF_SKIN` its cells off the skin; those
+        of `INTERIOR` and `HEAD_INTERIOR` lie deep under it. Points are drawn for many calls at
+        once, and drawn again when the cells, or `count`, are others.
+        """
+        cells = self._empty_cells() if kind == EMPTY_SPACE else self._cells_of_kind[kind]
+        of, each, ahead = self._ahead.get(kind, (None, 0, []))
+        if of is not cells or each != count or not ahead:
+            size = (count * CALLS_PER_DRAW if len(cells) else 0,)
+            drawn = torch.randint(max(len(cells), 1), size, generator=generator)
+            ahead = list(self._random_places(cells[drawn], generator).chunk(CALLS_PER_DRAW))
+            self._ahead[kind] = cells, count, ahead
+        return ahead.pop()
 
     def _empty_cells(self) -> Int64[Tensor, "cells"]:
         """Unoccupied cells of the band, cached until the occupancy changes."""
@@ -159,21 +168,6 @@ class OccupancyGrid:
             cells = self.band_cells[self.density_grid.occupied.view(-1)[self.band_cells] == 0]
             self._cached_empty_cells = version, cells
         return self._cached_empty_cells[1]
-
-    def _draw(
-        self, kind: str, cells: Int64[Tensor, "cells"], count: int, generator: torch.Generator
-    ) -> Float32[Tensor, "drawn 3"]:
-        """Random points in cells, at most `count`, of those that are drawn for many calls at once.
-
-        They are drawn again when the cells of this `kind`, or `count`, are others.
-        """
-        of, each, ahead = self._ahead.get(kind, (None, 0, []))
-        if of is not cells or each != count or not ahead:
-            size = (count * CALLS_PER_DRAW if len(cells) else 0,)
-            drawn = torch.randint(max(len(cells), 1), size, generator=generator)
-            ahead = list(self._random_places(cells[drawn], generator).chunk(CALLS_PER_DRAW))
-            self._ahead[kind] = cells, count, ahead
-        return ahead.pop()
 
     def _random_places(
         self, cells: Int64[Tensor, "cells"], generator: torch.Generator

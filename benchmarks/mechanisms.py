@@ -81,7 +81,6 @@ MECHANISMS = [
         off={"empty_space_weight": 0.0},
         code=(
             "avatar.kernels.numba_priors.empty_space",
-            "avatar.occupancy_grid.OccupancyGrid.sample_empty",
             "avatar.occupancy_grid.OccupancyGrid._empty_cells",
         ),
     ),
@@ -166,10 +165,7 @@ MECHANISMS = [
     Mechanism(
         name="interior",
         off={"interior_weight": 0.0, "head_interior_weight": 0.0},
-        code=(
-            "avatar.kernels.numba_priors.interior",
-            "avatar.occupancy_grid.OccupancyGrid.sample_interior",
-        ),
+        code=("avatar.kernels.numba_priors.interior",),
     ),
     Mechanism(
         name="density slope and color variation",
@@ -184,10 +180,7 @@ MECHANISMS = [
     Mechanism(
         name="density off the skin",
         off={"off_skin_weight": 0.0},
-        code=(
-            "avatar.kernels.numba_priors.log_density_l1",
-            "avatar.occupancy_grid.OccupancyGrid.sample_off_skin",
-        ),
+        code=("avatar.kernels.numba_priors.log_density_l1",),
     ),
     Mechanism(
         name="unseen skin",

@@ -10,7 +10,7 @@ from torch import Tensor
 from avatar.config import TrainConfig
 from avatar.kernels import operations
 from avatar.kernels.numba_priors import OPACITY_LENGTH_M
-from avatar.kernels.operands import HashLevels, MarchSettings, RaySamples
+from avatar.kernels.operands import EMPTY_SPACE, HashLevels, MarchSettings, RaySamples
 from avatar.radiance_field import RadianceField, sample_tv_pairs
 from avatar.training.replay_buffer import ReplayBuffer, TrainingBatch
 from avatar.training.training_step import compute_gradients
@@ -76,14 +76,14 @@ def step_marks(seen: LoadedTrainer) -> list[Measurement]:
     grid = avatar.occupancy.density_grid
     samples = operations.march(batch.rays, replay.correspondences, grid, how)
     chance = _seeded()
-    empty = avatar.occupancy.sample_empty(config.empty_space_points, chance)
+    empty = avatar.occupancy.sample(EMPTY_SPACE, config.empty_space_points, chance)
     near = sample_tv_pairs(samples.points, config, 1)
     plain = AutogradField(field)
 
     def ours(config: TrainConfig = config) -> None:
         field.table_grad.zero_()
         compute_gradients(
-            avatar, seen.trainer.sampler, replay.correspondences, batch, config,
+            avatar, replay.correspondences, batch, config,
             hard_surface_share=1.0, generator=_seeded(),
         )  # fmt: skip
 

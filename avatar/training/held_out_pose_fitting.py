@@ -16,7 +16,7 @@ from avatar.training.pose_correction import interpolate_correction
 from avatar.training.pose_optimizer import PoseOptimizer
 from avatar.training.replay_buffer import ReplayBuffer
 from avatar.training.trainer import Trainer, correct_poses, cosine_decay, resolve_correspondences
-from avatar.training.training_step import OccupancySampler, compute_gradients
+from avatar.training.training_step import compute_gradients
 
 CORRECTIONS_PER_FRAME = 12
 """Corrections of each frame's pose."""
@@ -82,7 +82,6 @@ def _fit_frames(
         off_skin_weight=0.0,
         rays=at_once * RAYS_PER_CORRECTION,
     )
-    sampler = OccupancySampler(avatar.occupancy, config)
     generator = torch.Generator().manual_seed(config.seed)
     steps = math.ceil(CORRECTIONS_PER_FRAME * len(replay) / at_once)
     for step in range(steps):
@@ -90,7 +89,7 @@ def _fit_frames(
             poses.min_gradient_cell_m = 0.0
         batch = replay.sample_rays(config.rays, generator)
         result = compute_gradients(
-            avatar, sampler, replay.correspondences, exposures.neutralize(batch), config,
+            avatar, replay.correspondences, exposures.neutralize(batch), config,
             hard_surface_share=1.0, poses=poses, generator=generator,
         )  # fmt: skip
         if config.estimate_exposures:

@@ -11,12 +11,11 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, NamedTuple, final
+from typing import Any, final
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float32
-from torch import Tensor
 
 from avatar.avatar_model import Avatar, OrientationShading
 from avatar.config import COARSEST_M, NOMINAL_STEPS_PER_S, TrainConfig
@@ -30,12 +29,7 @@ from avatar.training.frame_exposure import FrameExposures
 from avatar.training.frame_stream import TrainingFrame
 from avatar.training.pose_optimizer import PoseOptimizer
 from avatar.training.replay_buffer import ReplayBuffer
-from avatar.training.training_step import (
-    OccupancySampler,
-    RaySampler,
-    StepResult,
-    compute_gradients,
-)
+from avatar.training.training_step import StepResult, compute_gradients
 from avatar.training.unseen_skin import UnseenSkin
 
 EMA_HORIZON_STEPS = 250
@@ -58,14 +52,6 @@ def update_ema(average: RadianceField, field: RadianceField, steps: int) -> None
     operations.move_toward(average.parameters(), field.parameters(), share)
 
 
-class ParameterMemory(NamedTuple):
-    """A parameter's gradient, steps and arrays of numbers, as Adam's state holds them."""
-
-    gradient: Tensor
-    steps: Float32[np.ndarray, ""]
-    arrays: AdamArrays
-
-
 @final
 class UncompiledAdam(torch.optim.Adam):
     """`torch.optim.Adam` that does not load `torch._dynamo` (0.7 to 1 s) at its first use.
@@ -81,7 +67,7 @@ class UncompiledAdam(torch.optim.Adam):
     def __init__(self, params: Any, **options: Any) -> None:
         """Starts with the arguments of `torch.optim.Adam`."""
         super().__init__(params, **options)
-        self.memory = dict[torch.nn.Parameter, ParameterMemory]()
+        self.memory = dict[torch.nn.Parameter, tuple[Float32[np.ndarray, ""], AdamArrays]]()
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Continues from a saved state."""
@@ -98,17 +84,19 @@ def step_optimizer(optimizer: UncompiledAdam) -> None:
     stepped = []
     for group in optimizer.param_groups:
         for parameter in group["params"]:
-            of, steps, arrays = optimizer.memory.get(parameter, (None, None, None))
-            if steps is None or arrays is None or of is not parameter.grad:
-                of, steps, arrays = optimizer.memory[parameter] = _memory_of(optimizer, parameter)
+            if parameter not in optimizer.memory:
+                optimizer.memory[parameter] = _memory_of(optimizer, parameter)
+            steps, arrays = optimizer.memory[parameter]
             steps += 1
             how = AdamSettings(group["lr"], group["betas"], group["eps"], int(steps))
             stepped.append((how, arrays))
     operations.adam_step(stepped)
 
 
-def _memory_of(optimizer: UncompiledAdam, parameter: torch.nn.Parameter) -> ParameterMemory:
-    """Gradient, steps and arrays of a parameter, whose state begins if there is none."""
+def _memory_of(
+    optimizer: UncompiledAdam, parameter: torch.nn.Parameter
+) -> tuple[Float32[np.ndarray, ""], AdamArrays]:
+    """Steps and arrays of a parameter, whose state begins if there is none."""
     state, grad = optimizer.state[parameter], parameter.grad
     if not state:
         state["step"] = torch.zeros(())
@@ -117,7 +105,7 @@ def _memory_of(optimizer: UncompiledAdam, parameter: torch.nn.Parameter) -> Para
     assert grad is not None, "a gradient is zeroed, never taken away"
     parts = grad, state["exp_avg"], state["exp_avg_sq"], parameter.detach()
     arrays = AdamArrays(*(part.numpy().reshape(-1) for part in parts))
-    return ParameterMemory(grad, state["step"].numpy(), arrays)
+    return state["step"].numpy(), arrays
 
 
 NETWORK_RATE_FACTOR = 0.3
@@ -130,7 +118,7 @@ class Trainer:
 
     Attributes:
         field: The field that steps change.
-        learner: Avatar with `field`, which the samplers query.
+        learner: Avatar with `field`.
         avatar: Avatar to render; its field is the running mean of `field`.
         poses, exposures: Of the replay frames, corrected if the configuration says so.
         unseen: The skin that frames have shown, and the sources of the other skin.
@@ -160,7 +148,6 @@ class Trainer:
             shading=OrientationShading(rig),
         )
         self.unseen = UnseenSkin(rig)
-        self.sampler: RaySampler = OccupancySampler(self.learner.occupancy, config, self.unseen)
         self.avatar = replace(self.learner, field=self.field.clone())
         self.replay = ReplayBuffer(config.replay_capacity)
         self.poses = PoseOptimizer(
@@ -246,10 +233,11 @@ class Trainer:
         refines = refines and self.poses.freeze_converged(self.steps)
         neutral = self.exposures.neutralize(batch)
         result = compute_gradients(
-            self.learner, self.sampler, self.replay.correspondences, neutral, config,
+            self.learner, self.replay.correspondences, neutral, config,
             hard_surface_share=hard_surface_share,
             surface_share=1.0 - falling,
             caches_density=self.steps % config.occupancy_interval < 2,
+            unseen=self.unseen,
             poses=self.poses if refines else None,
             generator=self.generator,
         )  # fmt: skip
@@ -273,10 +261,8 @@ class Trainer:
         return result
 
     def _config_at(self, detail_share: float) -> TrainConfig:
-        """The configuration with the samples' distance of this step; baselines keep theirs."""
-        if not isinstance(self.sampler, OccupancySampler):
-            return self.config
-        step_m = self.sampler.sample_step_m = self.config.sample_step_at(detail_share)
+        """The configuration with the samples' distance of this step."""
+        step_m = self.config.sample_step_at(detail_share)
         if step_m == self.config.sample_step_m:
             return self.config
         return replace(self.config, sample_step_m=step_m)

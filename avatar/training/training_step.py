@@ -1,6 +1,6 @@
 """One training step: sample, query the field, composite, and propagate gradients by hand."""
 
-from typing import NamedTuple, Protocol, final, runtime_checkable
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -25,8 +25,6 @@ from avatar.kernels.operands import (
     PosedBones,
     PremultipliedPixels,
     PriorPoints,
-    RayBatch,
-    RaySamples,
 )
 from avatar.occupancy_grid import OccupancyGrid
 from avatar.training.pose_optimizer import PoseOptimizer
@@ -35,64 +33,6 @@ from avatar.training.unseen_skin import SourcePairs, UnseenSkin
 
 TV_SEED, SMOOTHNESS_SEED = 0x5BD1E995, 0x9E3779B9
 """Bits by which the seeds of a step's pairs differ from that of its draw of gradients."""
-
-
-@runtime_checkable
-class RaySampler(Protocol):
-    """Chooses the canonical points at which a step queries the field.
-
-    `OccupancySampler` is the implementation; `baselines.instant_avatar` has the paper's.
-    """
-
-    def sample_rays(self, rays: RayBatch, correspondences: CorrespondenceTables) -> RaySamples:
-        """Canonical samples along rays in the body frames that `correspondences` covers."""
-        ...
-
-    def sample_empty(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
-        """At most `count` canonical points at which density is penalised."""
-        ...
-
-    def sample_source_pairs(self, count: int, generator: torch.Generator) -> SourcePairs:
-        """At most `count` points of unseen skin, and what they are drawn to."""
-        ...
-
-
-@final
-class OccupancySampler:
-    """Samples occupied canonical cells, up to the cached surface that makes a ray opaque.
-
-    `sample_step_m`, the distance between samples along a ray, may be changed at any time.
-    """
-
-    def __init__(
-        self, occupancy: OccupancyGrid, config: TrainConfig, unseen: UnseenSkin | None = None
-    ) -> None:
-        """Reads `occupancy` and `unseen` at every call; their owner keeps them up to date."""
-        self._unseen = unseen if config.unseen_weight else None
-        self._occupancy = occupancy
-        self._config = config
-        self.sample_step_m = config.sample_step_m
-
-    def sample_rays(self, rays: RayBatch, correspondences: CorrespondenceTables) -> RaySamples:
-        """Canonical samples in occupied cells, until the cached optical depth ends the ray."""
-        return operations.march(
-            rays,
-            correspondences,
-            self._occupancy.density_grid,
-            MarchSettings(
-                self.sample_step_m, self._config.opaque_margin_m, self._config.max_samples
-            ),
-        )
-
-    def sample_empty(self, count: int, generator: torch.Generator) -> Float32[Tensor, "points 3"]:
-        """Random points in unoccupied cells near the skin, at most `count`."""
-        return self._occupancy.sample_empty(count, generator)
-
-    def sample_source_pairs(self, count: int, generator: torch.Generator) -> SourcePairs:
-        """Points of unseen skin and their sources, at most `count`; none without `unseen`."""
-        if self._unseen is None:
-            return SourcePairs.none()
-        return self._unseen.sample(count, generator)
 
 
 class StepResult(NamedTuple):
@@ -107,7 +47,6 @@ class StepResult(NamedTuple):
 @torch.no_grad()
 def compute_gradients(
     learner: Avatar,
-    sampler: RaySampler,
     correspondences: CorrespondenceTables,
     batch: TrainingBatch,
     config: TrainConfig,
@@ -115,6 +54,7 @@ def compute_gradients(
     hard_surface_share: float,
     surface_share: float = 0.0,
     caches_density: bool = False,
+    unseen: UnseenSkin | None = None,
     poses: PoseOptimizer | None = None,
     generator: torch.Generator,
 ) -> StepResult:
@@ -129,13 +69,16 @@ def compute_gradients(
             a surface has to be found before it can be made hard.
         surface_share: Progress from smooth densities to firm surfaces, in [0, 1].
         caches_density: Whether the samples raise the occupancy's cached densities.
+        unseen: Skin that is drawn to its source, if any.
         poses: Accumulates the samples' wrenches, if poses are refined.
     """
     field = learner.field
     seed = int(torch.randint(1 << 32, (), generator=generator))
-    samples = sampler.sample_rays(batch.rays, correspondences)
+    how = MarchSettings(config.sample_step_m, config.opaque_margin_m, config.max_samples)
+    grid = learner.occupancy.density_grid
+    samples = operations.march(batch.rays, correspondences, grid, how)
     priors = _prior_points(
-        sampler, learner.occupancy, samples.points, config, surface_share, seed, generator
+        learner.occupancy, unseen, samples.points, config, surface_share, seed, generator
     )
     count, bones = len(samples.points), None
     if poses is not None and count:
@@ -156,15 +99,13 @@ def compute_gradients(
     if poses is not None and bones is not None:
         poses.accumulate(batch.rays.slots, learnt.wrenches, learnt.loss)
     if caches_density:
-        operations.scatter_max_density(
-            samples.points, learnt.log_density.contiguous(), learner.occupancy.density_grid
-        )
+        operations.scatter_max_density(samples.points, learnt.log_density.contiguous(), grid)
     return StepResult(learnt.loss, learnt.rendered, learnt.normals, count)
 
 
 def _prior_points(
-    sampler: RaySampler,
     occupancy: OccupancyGrid,
+    unseen: UnseenSkin | None,
     points: Float32[Tensor, "samples 3"],
     config: TrainConfig,
     surface_share: float,
@@ -172,23 +113,20 @@ def _prior_points(
     generator: torch.Generator,
 ) -> PriorPoints:
     """Draws the points at which priors hold, and weighs the priors' terms."""
-    none = points[:0]
-    pairs = sampler.sample_source_pairs(config.unseen_points, generator)
+    pairs = SourcePairs.none()
+    if unseen is not None and config.unseen_weight:
+        pairs = unseen.sample(config.unseen_points, generator)
+
+    def in_cells(kind: int, weight: float, count: int) -> Float32[Tensor, "points 3"]:
+        return occupancy.sample(kind, count, generator) if weight else points[:0]
+
     lists = [
-        sampler.sample_empty(config.empty_space_points, generator)
-        if config.empty_space_weight
-        else none,
+        in_cells(EMPTY_SPACE, config.empty_space_weight, config.empty_space_points),
         radiance_field.sample_tv_pairs(points, config, seed ^ TV_SEED),
-        occupancy.sample_interior(config.interior_points, generator)
-        if config.interior_weight
-        else none,
+        in_cells(INTERIOR, config.interior_weight, config.interior_points),
         radiance_field.sample_smoothness_pairs(points, config, seed ^ SMOOTHNESS_SEED),
-        occupancy.sample_off_skin(config.off_skin_points, generator)
-        if config.off_skin_weight
-        else none,
-        occupancy.sample_interior(config.head_interior_points, generator, of_head=True)
-        if config.head_interior_weight
-        else none,
+        in_cells(OFF_SKIN, config.off_skin_weight, config.off_skin_points),
+        in_cells(HEAD_INTERIOR, config.head_interior_weight, config.head_interior_points),
         pairs.points,
     ]
     weights = np.zeros((len(lists), 2), dtype=np.float32)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from avatar.kernels.operands import EMPTY_SPACE, HEAD_INTERIOR, INTERIOR, OFF_SKIN
 from avatar.occupancy_grid import (
     MIN_STEP_OPACITY,
     OccupancyGrid,
@@ -70,7 +71,7 @@ def test_everything_near_the_skin_is_occupied_at_first_and_nothing_ever_far_from
 def test_empty_points_lie_in_cells_that_hold_nothing(rig, occupancy, generator):
     log_density_at, _ = shell_at(rig, thickness_m=0.05)
     run(occupancy, log_density_at, generator, 60)
-    points = occupancy.sample_empty(500, generator)
+    points = occupancy.sample(EMPTY_SPACE, 500, generator)
     cell = ((points - occupancy.density_grid.low) * occupancy.density_grid.cells_per_m).long()
     assert len(points) == 500
     assert not occupancy.density_grid.occupied[tuple(cell.T)].any()
@@ -80,16 +81,16 @@ def test_empty_points_lie_in_cells_that_hold_nothing(rig, occupancy, generator):
 def test_empty_points_follow_every_change_of_the_occupancy(occupancy, generator):
     occupied = occupancy.density_grid.occupied
     occupied.zero_()
-    assert len(occupancy.sample_empty(100, generator)) == 100
+    assert len(occupancy.sample(EMPTY_SPACE, 100, generator)) == 100
     occupied.fill_(1)
-    assert len(occupancy.sample_empty(100, generator)) == 0
+    assert len(occupancy.sample(EMPTY_SPACE, 100, generator)) == 0
     occupied.view(-1)[occupancy.band_cells[7]] = 0
-    points = occupancy.sample_empty(100, generator)
+    points = occupancy.sample(EMPTY_SPACE, 100, generator)
     cell = ((points - occupancy.density_grid.low) * occupancy.density_grid.cells_per_m).long()
     assert len(points) == 100
     assert not occupied[tuple(cell.T)].any()
     run(occupancy, lambda at: torch.full_like(at[:, 0], 5.0), generator, 60)
-    assert len(occupancy.sample_empty(100, generator)) == 0
+    assert len(occupancy.sample(EMPTY_SPACE, 100, generator)) == 0
 
 
 def test_haze_below_the_minimum_density_counts_as_empty(occupancy, generator):
@@ -131,7 +132,7 @@ def test_specks_go_and_pieces_near_the_skin_stay():
 
 
 def test_solid_points_lie_deep_under_the_skin(rig, occupancy, generator):
-    points = occupancy.sample_interior(500, generator)
+    points = occupancy.sample(INTERIOR, 500, generator)
     cell = ((points - occupancy.density_grid.low) * occupancy.density_grid.cells_per_m).long()
     assert len(points) == 500
     assert rig.inside_skin[tuple(cell.T.numpy())].all()
@@ -140,7 +141,7 @@ def test_solid_points_lie_deep_under_the_skin(rig, occupancy, generator):
 
 def test_points_off_the_skin_are_where_no_clothes_are(rig, generator):
     occupancy = OccupancyGrid(rig)
-    points = occupancy.sample_off_skin(500, generator)
+    points = occupancy.sample(OFF_SKIN, 500, generator)
     cell = ((points - occupancy.density_grid.low) * occupancy.density_grid.cells_per_m).long()
     distance = rig.skin_distance[tuple(cell.T.numpy())]
     assert len(points) == 500
@@ -149,7 +150,7 @@ def test_points_off_the_skin_are_where_no_clothes_are(rig, generator):
 
 
 def test_the_heads_interior_lies_in_the_head(rig, generator):
-    points = OccupancyGrid(rig).sample_interior(200, generator, of_head=True).numpy()
+    points = OccupancyGrid(rig).sample(HEAD_INTERIOR, 200, generator).numpy()
     assert len(points) == 200
     assert (rig.weights_at(points).argmax(axis=1) == HEAD_JOINT).mean() > 0.95
     assert points[:, 1].min() > rig.rest_joints[HEAD_JOINT, 1] - 0.1
@@ -164,7 +165,7 @@ def test_a_face_is_empty_before_its_skin_until_it_is_given_other_cells(rig, gene
     occupied = occupancy.density_grid.occupied.view(-1)
     assert not occupied[before].any()
     assert occupied[under].float().mean() > 0.9
-    grid, drawn = occupancy.density_grid, occupancy.sample_interior(500, generator, of_head=True)
+    grid, drawn = occupancy.density_grid, occupancy.sample(HEAD_INTERIOR, 500, generator)
     place = ((drawn - grid.low) * grid.cells_per_m).long().numpy().T
     flat = np.ravel_multi_index(tuple(place), tuple(grid.occupied.shape))
     assert np.isin(flat, under.numpy()).mean() > 0.3

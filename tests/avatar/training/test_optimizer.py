@@ -83,7 +83,7 @@ numbers = torch.nn.Parameter(torch.zeros(3))
 adam = UncompiledAdam([numbers])
 numbers.grad = torch.ones(3)
 adam.step()
-numbers.grad = torch.ones(3)
+numbers.grad.fill_(1.0)
 step_optimizer(adam)
 adam.load_state_dict(adam.state_dict())
 assert numbers.max() < 0
@@ -103,8 +103,9 @@ def test_compiled_steps_are_those_of_torch_and_spend_the_gradient():
     for step in range(6):
         for mine, other in zip(ours, theirs, strict=True):
             grad = torch.randn(mine.shape, generator=generator)
-            mine.grad = grad * (torch.rand(grad.shape, generator=generator) < 0.2)
-            other.grad = mine.grad.clone()
+            grad *= torch.rand(grad.shape, generator=generator) < 0.2
+            other.grad = grad.clone()
+            mine.grad = grad if mine.grad is None else mine.grad.copy_(grad)
         step_optimizer(pair[0])
         pair[1].step()
         assert not any(p.grad.any() for p in ours)

@@ -11,16 +11,17 @@ from avatar import radiance_field
 from avatar.config import TrainConfig
 from avatar.kernels import numba_training_step, operations
 from avatar.kernels.numba_priors import OPACITY_LENGTH_M
-from avatar.kernels.operands import MarchSettings, RaySamples
+from avatar.kernels.operands import (
+    EMPTY_SPACE,
+    INTERIOR,
+    OFF_SKIN,
+    MarchSettings,
+    RaySamples,
+)
 from avatar.training.frame_stream import prepare_frame
 from avatar.training.pose_optimizer import PoseOptimizer
 from avatar.training.trainer import Trainer, cosine_decay
-from avatar.training.training_step import (
-    SMOOTHNESS_SEED,
-    TV_SEED,
-    OccupancySampler,
-    compute_gradients,
-)
+from avatar.training.training_step import SMOOTHNESS_SEED, TV_SEED, compute_gradients
 from baselines import torch_reference
 from tests.avatar_fixtures import pose_gradient
 
@@ -97,8 +98,7 @@ def one_step(trainer):
     occupancy._ahead.clear()
     field.table_grad.zero_()
     compute_gradients(
-        trainer.avatar, OccupancySampler(occupancy, CONFIG),
-        trainer.replay.correspondences, batch, CONFIG,
+        trainer.avatar, trainer.replay.correspondences, batch, CONFIG,
         hard_surface_share=1.0, surface_share=FIRM_SHARE, generator=generator,
     )  # fmt: skip
     generator = torch.Generator().manual_seed(4)
@@ -107,11 +107,11 @@ def one_step(trainer):
     how = MarchSettings(CONFIG.sample_step_m, CONFIG.opaque_margin_m, CONFIG.max_samples)
     cells = trainer.replay.correspondences
     samples = operations.march(batch.rays, cells, occupancy.density_grid, how)
-    empty = occupancy.sample_empty(CONFIG.empty_space_points, generator)
+    empty = occupancy.sample(EMPTY_SPACE, CONFIG.empty_space_points, generator)
     pairs = radiance_field.sample_tv_pairs(samples.points, CONFIG, seed ^ TV_SEED)
-    solid = occupancy.sample_interior(CONFIG.interior_points, generator)
+    solid = occupancy.sample(INTERIOR, CONFIG.interior_points, generator)
     close = radiance_field.sample_smoothness_pairs(samples.points, CONFIG, seed ^ SMOOTHNESS_SEED)
-    gaps = occupancy.sample_off_skin(CONFIG.off_skin_points, generator)
+    gaps = occupancy.sample(OFF_SKIN, CONFIG.off_skin_points, generator)
     grads = [parameter.grad.clone() for parameter in field.parameters()]
     return grads, (samples, empty, pairs, solid, close, gaps, batch)
 
@@ -165,7 +165,7 @@ def test_half_of_the_samples_give_nearly_the_steps_whole_gradient(trainer):
         trainer.avatar.occupancy._ahead.clear()
         trainer.field.table_grad.zero_()
         compute_gradients(
-            trainer.learner, trainer.sampler, trainer.replay.correspondences,
+            trainer.learner, trainer.replay.correspondences,
             trainer.replay.sample_rays(CONFIG.rays, torch.Generator().manual_seed(3)),
             dataclasses.replace(CONFIG, faint_gradient_share=share), hard_surface_share=1.0,
             poses=poses, generator=torch.Generator().manual_seed(4),
