@@ -17,18 +17,13 @@ from jaxtyping import Float32, Float64
 from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
-from avatar.kernels import operations
 from avatar.kernels.numba_shading import add_light, light_factors
 from avatar.kernels.operands import (
     MAX_LOG_DENSITY,
-    CorrespondenceTables,
     DensityGrid,
     LitSkin,
     NormalVolume,
     PremultipliedPixels,
-    RawOutputs,
-    RayBatch,
-    RaySamples,
 )
 from avatar.occupancy_grid import OccupancyGrid, in_occupied_cells
 from avatar.radiance_field import RadianceField
@@ -52,7 +47,8 @@ OBSERVATION_INTERVAL = 4
 class OrientationShading:
     """The room's light on the person: `coefficients` of a factor of the neutral color.
 
-    While it `is_neutral`, no shading has been found, and the factor is 1 everywhere.
+    While it `is_neutral`, no shading has been found, and the factor is 1 everywhere. `normals` are
+    those of the skin's distance volume.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -61,7 +57,7 @@ class OrientationShading:
         distance = gaussian_filter(distance.astype(np.float32), 1.0)
         slope = np.stack([np.gradient(distance, axis=axis) for axis in range(3)], axis=-1)
         slope /= np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-6)
-        self._normals = NormalVolume(
+        self.normals = NormalVolume(
             torch.from_numpy(slope.astype(np.float32)),
             torch.from_numpy(rig.box_low),
             torch.from_numpy(rig.cells_per_m),
@@ -72,25 +68,11 @@ class OrientationShading:
         self.is_neutral = True
         self._steps = 1  # not an observation's turn, where none is ever asked for
 
-    def body_normals(
-        self,
-        rays: RayBatch,
-        samples: RaySamples,
-        raw: RawOutputs,
-        cells: CorrespondenceTables,
-        step_m: float,
-    ) -> Float32[Tensor, "rays 3"]:
-        """Mean normal of what each ray sees, in the body frame; shorter than 1 where it is thin.
-
-        Normals of the skin's distance volume, through the warp, composited like colors.
-        """
-        return operations.mean_normals(raw, samples, step_m, rays.slots, cells, self._normals)
-
     def lit_skin(self) -> LitSkin:
         """Normals and light of a step; in steps that need no normals all of them are zero."""
         needed = not self.is_neutral or self._steps % OBSERVATION_INTERVAL == 0
         return LitSkin(
-            self._normals, self.coefficients, MIN_NORMAL_LENGTH, (MIN_FACTOR, MAX_FACTOR), needed
+            self.normals, self.coefficients, MIN_NORMAL_LENGTH, (MIN_FACTOR, MAX_FACTOR), needed
         )
 
     def factors(self, normals: Float32[Tensor, "rays 3"]) -> PremultipliedPixels:

@@ -23,12 +23,13 @@ from jaxtyping import Bool, Float, Float32, Int32, Int64
 from scipy.ndimage import distance_transform_cdt
 from torch import Tensor
 
-from avatar.kernels import operations
 from avatar.kernels.numba_correspondence import (
     SEARCH_MARGIN_M,
+    TransformVolume,
     blended_transform_volume,
     find_off_ray_points,
     find_unreliable_roots,
+    solve_correspondences,
 )
 from avatar.kernels.numba_correspondence import cull_cells as cull_cells_numba
 from avatar.kernels.numba_skinning import MATRIX_LANES
@@ -67,7 +68,7 @@ class CorrespondenceGrid:
     ) -> "CorrespondenceGrid":
         """Solves a pose, but for its root, up to `band_m` from the skin, within the rig's box."""
         bones = rig.body_from_canonical(joint_rotations)[:, :3].reshape(24, 12)
-        low, packed_cells, roots = operations.solve_correspondences(
+        low, packed_cells, roots = solve_correspondences(
             rig, bones.astype(np.float32), band_m, CORRESPONDENCE_CELL_M
         )
         return cls(low=low, cell_m=CORRESPONDENCE_CELL_M, packed_cells=packed_cells, roots=roots)
@@ -122,14 +123,11 @@ MAX_RAY_DISTANCE_M = 0.005
 class CorrespondenceCheck:
     """Finds the spurious samples of one pose.
 
-    `unreliable_rows` are the root rows whose warp is wrong in some corner of their cell;
-    `transforms` are blended 3×4 matrices at the nodes of the skinning volume.
+    `unreliable_rows` are the root rows whose warp is wrong in some corner of their cell.
     """
 
     unreliable_rows: Bool[Tensor, "rows"]
-    transforms: Float32[np.ndarray, "x y z lanes"]
-    low: Float32[np.ndarray, "3"]
-    nodes_per_m: Float32[np.ndarray, "3"]
+    volume: TransformVolume
 
     @classmethod
     def for_pose(
@@ -145,13 +143,7 @@ class CorrespondenceCheck:
             cells.packed_cells, cells.roots[None], cells.low, np.float32(cells.cell_m), *volume,
             np.float32(MAX_RAY_DISTANCE_M), unreliable, np.empty(MATRIX_LANES, dtype=np.float32),
         )  # fmt: skip
-        transforms, low, nodes_per_m = volume
-        return cls(
-            unreliable_rows=torch.from_numpy(unreliable),
-            transforms=transforms,
-            low=low,
-            nodes_per_m=nodes_per_m,
-        )
+        return cls(unreliable_rows=torch.from_numpy(unreliable), volume=volume)
 
     def find_spurious(self, samples: RaySamples, rays: RayBatch) -> Int64[Tensor, "spurious"]:
         """Indices of the samples that skinning does not carry to their rays."""
@@ -160,7 +152,7 @@ class CorrespondenceCheck:
         parts = (samples.points[asked], rays.origins[ray], rays.directions[ray])
         found = np.empty(len(asked), dtype=bool)
         find_off_ray_points(
-            *(part.numpy() for part in parts), self.transforms, self.low, self.nodes_per_m,
-            np.float32(MAX_RAY_DISTANCE_M), found, np.empty(MATRIX_LANES, dtype=np.float32),
+            *(part.numpy() for part in parts), *self.volume, np.float32(MAX_RAY_DISTANCE_M), found,
+            np.empty(MATRIX_LANES, dtype=np.float32),
         )  # fmt: skip
         return asked[torch.from_numpy(found)]

@@ -180,7 +180,9 @@ def trace_rays(
         raw[check.find_spurious(samples, rays), 3] = EMPTY_LOG_DENSITY
         part = operations.composite(raw, samples, sample_step_m)
         if shading is not None:
-            found = shading.body_normals(rays, samples, raw, cells, sample_step_m)
+            found = operations.mean_normals(
+                raw, samples, sample_step_m, rays.slots, cells, shading.normals
+            )
             normals[alive] += (1.0 - nearer[:, 3:]) * found
         nearer = nearer + (1.0 - nearer[:, 3:]) * part
         colors[alive] = nearer

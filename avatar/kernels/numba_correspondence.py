@@ -9,7 +9,7 @@ culls cells, and leaves out spurious correspondences.
 import math
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int32
 
 from avatar.kernels.kernel_compiler import FAST_MATH, INLINED, NO_ALLOCATION, compile_kernel
 from avatar.kernels.numba_rendering import canonical_point
@@ -42,8 +42,19 @@ SEARCH_MARGIN_M = 0.03
 """Margin about the band within which roots are searched, metres."""
 
 
-def solve_correspondences(rig, bones, band_m, cell_m):
-    """As `avatar.kernels.operations.solve_correspondences`."""
+TransformVolume = tuple[
+    Float32[np.ndarray, "x y z lanes"], Float32[np.ndarray, "3"], Float32[np.ndarray, "3"]
+]
+"""Blended 3×4 transforms on the nodes of the weight volume, its corner, and nodes per metre."""
+
+
+def solve_correspondences(
+    rig: Rig, bones: Float32[np.ndarray, "24 12"], band_m: float, cell_m: float
+) -> tuple[Float32[np.ndarray, "3"], Int32[np.ndarray, "gx gy gz"], Float32[np.ndarray, "rows 12"]]:
+    """Corner, packed cells and roots of a pose's `CorrespondenceGrid`, whose cells are `cell_m`.
+
+    `bones` are body-from-canonical transforms; skin is covered up to a distance of `band_m`.
+    """
     volume = blended_transform_volume(rig, bones, band_m + SEARCH_MARGIN_M)
     posed, inverses = np.empty_like(rig.seeds), np.empty((len(rig.seeds), 9), np.float32)
     room = np.empty(MATRIX_LANES + 15, dtype=np.float32)
@@ -71,11 +82,8 @@ def solve_correspondences(rig, bones, band_m, cell_m):
 
 def blended_transform_volume(
     rig: Rig, bones: Float32[np.ndarray, "24 12"], reach_m: float
-) -> tuple[Float32[np.ndarray, "x y z lanes"], Float32[np.ndarray, "3"], Float32[np.ndarray, "3"]]:
-    """Blended transforms on the nodes of the weight volume, where these lie, and nodes per metre.
-
-    Nodes farther from the skin than `reach_m` are left at zero.
-    """
+) -> TransformVolume:
+    """Blends bones on all nodes; those farther from the skin than `reach_m` are left at zero."""
     lanes = np.zeros((24, MATRIX_LANES), dtype=np.float32)
     lanes[:, :12] = bones
     transforms = np.zeros((*rig.weights.shape[:3], MATRIX_LANES), dtype=np.float32)

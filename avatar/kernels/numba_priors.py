@@ -12,6 +12,7 @@ import math
 import numpy as np
 
 from avatar.kernels.kernel_compiler import FAST_MATH, INLINED, compile_kernel
+from avatar.kernels.numba_rendering import sigmoid
 from avatar.kernels.operands import MAX_LOG_DENSITY
 
 F32, U32 = np.float32, np.uint32
@@ -34,18 +35,6 @@ def _opacity(log_density):
 @compile_kernel(**INLINED)
 def _sign(x):
     return F32(x > F32(0)) - F32(x < F32(0))
-
-
-@compile_kernel(**INLINED)
-def _sigmoid(x):
-    return F32(1) / (F32(1) + np.exp(-x))
-
-
-@compile_kernel(**FAST_MATH)
-def opacities(raw, value, slope):
-    """Opacity of one centimetre at each point, and its slope over log density."""
-    for i in range(raw.shape[0]):
-        value[i], slope[i] = _opacity(raw[i, 3])
 
 
 @compile_kernel(**FAST_MATH)
@@ -145,7 +134,7 @@ def color_tv(raw, weight, grad):
         if max(raw[i, 3], raw[count + i, 3]) <= F32(2.0):  # both invisible
             continue
         for q in range(3):
-            one, other = _sigmoid(raw[i, q]), _sigmoid(raw[count + i, q])
+            one, other = sigmoid(raw[i, q]), sigmoid(raw[count + i, q])
             pull = share * _sign(one - other)
             grad[i, q] += pull * one * (F32(1) - one)
             grad[count + i, q] -= pull * other * (F32(1) - other)
@@ -165,7 +154,7 @@ def toward_sources(raw, weights, weight, grad):
         opacity, source = _opacity(raw[i, 3])[0], _opacity(raw[count + i, 3])[0]
         firm = min(max(F32(0.5) + F32(SOURCE_STEEPNESS) * (source - F32(0.5)), F32(0)), F32(1))
         for q in range(3):
-            apart = _sigmoid(raw[i, q]) - _sigmoid(raw[count + i, q])
+            apart = sigmoid(raw[i, q]) - sigmoid(raw[count + i, q])
             grad[i, q] += scale * source * apart
         grad[i, 3] += scale * (opacity - firm)
 

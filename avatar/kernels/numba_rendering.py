@@ -288,7 +288,8 @@ def scatter_max_density(points, log_density, low, cells_per_m, density):
 
 
 @compile_kernel(**INLINED)
-def _sigmoid(x):
+def sigmoid(x):
+    """1 / (1 + exp(-x))."""
     return F32(1) / (F32(1) + np.exp(-x))
 
 
@@ -302,9 +303,9 @@ def _composite_ray(ray, raw, offsets, counts, sample_step_m, rendered):
         kept = np.exp(-np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * sample_step_m)
         weight = through * (F32(1) - kept)
         through *= kept
-        red += weight * _sigmoid(raw[i, 0])
-        green += weight * _sigmoid(raw[i, 1])
-        blue += weight * _sigmoid(raw[i, 2])
+        red += weight * sigmoid(raw[i, 0])
+        green += weight * sigmoid(raw[i, 1])
+        blue += weight * sigmoid(raw[i, 2])
     rendered[ray, 0] = red
     rendered[ray, 1] = green
     rendered[ray, 2] = blue
@@ -355,7 +356,7 @@ def composite_ray_loss(
         kept = np.exp(-np.exp(min(raw[i, 3], F32(MAX_LOG_DENSITY))) * sample_step_m)
         weight = through * (F32(1) - kept)
         through *= kept
-        q0, q1, q2 = _sigmoid(raw[i, 0]), _sigmoid(raw[i, 1]), _sigmoid(raw[i, 2])
+        q0, q1, q2 = sigmoid(raw[i, 0]), sigmoid(raw[i, 1]), sigmoid(raw[i, 2])
         grad_raw[i, 0] = q0
         grad_raw[i, 1] = q1
         grad_raw[i, 2] = q2

@@ -15,7 +15,6 @@ from jaxtyping import Float32, Int32, Int64
 from torch import Tensor
 
 from avatar.kernels import (
-    numba_correspondence,
     numba_field,
     numba_hash_grid,
     numba_pose,
@@ -50,9 +49,13 @@ from avatar.kernels.operands import (
     SkinningVolume,
 )
 from avatar.kernels.threads import run_blocks, run_threads
-from avatar.rig import Rig
 
 _SCRATCH = threading.local()
+NO_POSES = PosedBones(
+    SkinningVolume(torch.zeros(0, 0, 0, 24), torch.zeros(3), torch.zeros(3)),
+    torch.zeros(0, 24, 12), levels=0,
+)  # fmt: skip
+"""Stands for the poses of a step that computes no wrenches."""
 
 
 def field_forward(
@@ -98,6 +101,7 @@ def learn(
         seed: Of the draw of the gradients that are propagated, below 2³².
         is_frozen: Leaves the gradients of the network out.
     """
+    bones = poses or NO_POSES
     lists = samples.points, *priors.lists
     points = torch.cat(lists)
     ends = np.array(list(itertools.accumulate(part.shape[0] for part in lists)))
@@ -130,8 +134,8 @@ def learn(
         (ends, priors.pair_weights.numpy(), priors.weights, np.float32(priors.max_slope_per_m)),
         (table.detach().numpy(), *_network_arrays(network)),
         _level_arrays(levels),
-        poses.levels if poses else 0,
-        _pose_arrays(poses),
+        bones.levels,
+        (*_skinning_arrays(bones.skinning), bones.bones.numpy()),
         (raw, grad_raw, rendered, loss, normals, wrenches),
         (rows, grad_features, runs),
         (sums, strengths),
@@ -147,16 +151,6 @@ def learn(
         features=FeatureGradients(rows, grad_features, runs),
         strength=float(strengths.sum()) / max(total, 1),
     )
-
-
-def _pose_arrays(poses: PosedBones | None) -> tuple[np.ndarray, ...]:
-    """Weights, shape, corner and resolution of the skinning, and the bones; empty if None."""
-    if poses is None:
-        weights, low, nodes_per_m, bones = (
-            np.zeros(size, np.float32) for size in ((0, 24), (3,), (3,), (0, 24, 12))
-        )
-        return weights, np.zeros(3, np.int32), low, nodes_per_m, bones
-    return *_skinning_arrays(poses.skinning), poses.bones.numpy()
 
 
 def add_table_gradient(
@@ -226,39 +220,17 @@ def move_toward(means: Sequence[Tensor], values: Sequence[Tensor], share: float)
     run_threads(numba_hash_grid.move_toward, pairs, np.float32(share))
 
 
-def solve_correspondences(
-    rig: Rig, bones: Float32[np.ndarray, "24 12"], band_m: float, cell_m: float
-) -> tuple[Float32[np.ndarray, "3"], Int32[np.ndarray, "gx gy gz"], Float32[np.ndarray, "rows 12"]]:
-    """Corner, packed cells and roots of a pose's `CorrespondenceGrid`.
-
-    Args:
-        rig: Rig of the person.
-        bones: Body-from-canonical transforms.
-        band_m: Distance from the skin that is covered, metres.
-        cell_m: Edge of a cell, metres.
-    """
-    return numba_correspondence.solve_correspondences(rig, bones, band_m, cell_m)
-
-
 def march(
     rays: RayBatch, cells: CorrespondenceTables, grid: DensityGrid, how: MarchSettings
 ) -> RaySamples:
     """Canonical samples along rays."""
-    return _march(rays, cells, grid, how)[0]
+    return march_resumable(rays, cells, grid, how)[0]
 
 
 def march_resumable(
     rays: RayBatch, cells: CorrespondenceTables, grid: DensityGrid, how: MarchSettings
 ) -> tuple[RaySamples, Float32[Tensor, "rays"]]:
     """Marches, and returns the jitter at which rays with `max_samples` samples continue."""
-    samples, reached = _march(rays, cells, grid, how)
-    return samples, rays.jitter + reached
-
-
-def _march(
-    rays: RayBatch, cells: CorrespondenceTables, grid: DensityGrid, how: MarchSettings
-) -> tuple[RaySamples, Int32[Tensor, "rays"]]:
-    """Samples, and the step of the lattice at which each ray continues."""
     padded, padded_rows = _scratch_samples(len(rays.slots) * how.max_samples)
     count, reached = torch.empty(2, len(rays.slots), dtype=torch.int32)
     first = torch.empty(len(rays.slots), dtype=torch.int64)
@@ -274,7 +246,7 @@ def _march(
     numba_rendering.pack_samples(
         padded, padded_rows, how.max_samples, count.numpy(), points.numpy(), rows.numpy()
     )
-    return RaySamples(points, first, count, rows), reached
+    return RaySamples(points, first, count, rows), rays.jitter + reached
 
 
 def _scratch_samples(most: int) -> tuple[Float32[np.ndarray, "most 3"], Int32[np.ndarray, "most"]]:

@@ -9,6 +9,7 @@ as with OpenMP (70 µs), where threads sleep in between.
 import os
 import threading
 from collections.abc import Callable
+from queue import SimpleQueue
 from typing import Any, final
 
 import numba
@@ -68,35 +69,28 @@ class _Team:
 
     def __init__(self, threads: int) -> None:
         """Starts all threads but the caller's own."""
-        self._begin, self._end = ([threading.Lock() for _ in range(threads - 1)] for _ in "be")
-        self._work: tuple[Callable[..., Any], list[tuple[Any, ...]]] | None = None
-        self._error: BaseException | None = None
-        for lock in (*self._begin, *self._end):
-            lock.acquire()
-        for place in range(threads - 1):
-            threading.Thread(target=self._wait, args=(place,), daemon=True).start()
+        self._shares = SimpleQueue[tuple[Callable[..., Any], tuple[Any, ...]]]()
+        self._ends = SimpleQueue[BaseException | None]()
+        for _ in range(threads - 1):
+            threading.Thread(target=self._serve, daemon=True).start()
 
     def run(self, kernel: Callable[..., Any], shares: list[tuple[Any, ...]]) -> None:
         """Runs the kernel on all threads; an error of another thread is raised after the last."""
-        self._work, self._error = (kernel, shares), None
-        for lock in self._begin:
-            lock.release()
+        for share in shares[1:]:
+            self._shares.put((kernel, share))
         kernel(*shares[0])
-        for lock in self._end:
-            lock.acquire()
-        self._work = None
-        if self._error is not None:
-            raise self._error
+        errors = [self._ends.get() for _ in shares[1:]]
+        for error in filter(None, errors):
+            raise error
 
-    def _wait(self, place: int) -> None:
+    def _serve(self) -> None:
         torch.set_flush_denormal(True)
         while True:
-            self._begin[place].acquire()
+            kernel, share = self._shares.get()
+            error: BaseException | None = None
             try:
-                assert self._work is not None, "threads are woken for work alone"
-                kernel, shares = self._work
-                kernel(*shares[place + 1])
-                del kernel, shares  # nothing is kept alive while waiting
-            except BaseException as error:  # the calling thread raises it
-                self._error = error
-            self._end[place].release()
+                kernel(*share)
+            except BaseException as cause:  # the calling thread raises it
+                error = cause
+            del kernel, share  # nothing is kept alive while waiting
+            self._ends.put(error)

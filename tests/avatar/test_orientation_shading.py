@@ -6,6 +6,8 @@ import torch
 
 from avatar.avatar_model import OrientationShading
 from avatar.config import TrainConfig
+from avatar.kernels import operations
+from avatar.kernels.operands import MarchSettings
 from avatar.render import render
 from avatar.training import checkpoint
 from avatar.training.frame_stream import prepare_frame
@@ -59,10 +61,13 @@ def trainer(rig, clip):
 def test_normals_face_the_camera(trainer):
     batch = trainer.replay.sample_rays(500, trainer.generator)
     cells, field = trainer.replay.correspondences, trainer.field
-    samples = trainer.sampler.sample_rays(batch.rays, cells)
+    how = MarchSettings(CONFIG.sample_step_m, CONFIG.opaque_margin_m, CONFIG.max_samples)
+    grid = trainer.avatar.occupancy.density_grid
+    samples = operations.march(batch.rays, cells, grid, how)
     raw = field.raw_outputs_at(samples.points)
-    normals = trainer.learner.shading.body_normals(
-        batch.rays, samples, raw, cells, CONFIG.sample_step_m
+    volume = trainer.learner.shading.normals
+    normals = operations.mean_normals(
+        raw, samples, CONFIG.sample_step_m, batch.rays.slots, cells, volume
     )
     seen = normals.norm(dim=1) > 0.7
     assert seen.sum() > 50

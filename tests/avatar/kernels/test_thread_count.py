@@ -42,7 +42,7 @@ def results_of(learnt) -> dict[str, list[torch.Tensor]]:
     )  # fmt: skip
     moved = cells._replace(roots=cells.roots.clone())
     operations.update_roots(moved, [0], poses.skinning, poses.bones)
-    volume = trainer.learner.shading._normals
+    volume = trainer.learner.shading.normals
     normals = operations.mean_normals(raw, samples, 0.01, batch.rays.slots, cells, volume)
     stepped = [grad_table.clone(), *(torch.ones_like(grad_table) for _ in range(3))]
     arrays = AdamArrays(*(part.numpy().reshape(-1) for part in stepped))
