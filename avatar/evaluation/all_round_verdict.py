@@ -89,13 +89,9 @@ class AllRoundVerdict:
         known: dict[str, SharpnessVerdict] = {
             limit: word for limit, word in words.items() if word is not None
         }
-        if not known or held_out is None:
-            return cls(
-                verdict=held_out, limit=None, advice=None, seen=seen,
-                half_transparent=half_transparent, mean_cosine=mean_cosine,
-            )  # fmt: skip
         order = get_args(SharpnessVerdict)
-        worst = max(known, key=lambda limit: order.index(known[limit]))
+        worst = max(known, key=lambda limit: order.index(known[limit]), default="held_out")
+        verdict = None if held_out is None else known[worst]
         cures: dict[str, str] = {
             "filmed": f"{1.0 - (seen or 0.0):.0%} of the skin was not filmed, and is completed by "
             "what was; the rest was seen at an angle of "
@@ -107,11 +103,10 @@ class AllRoundVerdict:
             "held_out": "Faces and hands are sharper the larger the person is in the picture: "
             f"step nearer, hold still for a moment on each side, or {TRAIN_LONGER}.",
         }
-        sharp, failed = (known[worst] == word for word in ("sharp", "failed"))
         return cls(
-            verdict=known[worst],
-            limit=None if sharp else worst,
-            advice=None if sharp or failed else cures[worst],
+            verdict=verdict,
+            limit=None if verdict in (None, "sharp") else worst,
+            advice=cures[worst] if verdict in ("soft", "blurred") else None,
             seen=seen,
             half_transparent=half_transparent,
             mean_cosine=mean_cosine,

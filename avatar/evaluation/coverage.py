@@ -4,7 +4,7 @@ import base64
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
@@ -104,37 +104,6 @@ def _side_of_vertex(
     return np.where(np.abs(z) >= np.abs(across), np.where(z > 0.0, 0, 1), sideways)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class PatchView:
-    """The patches of a posed body, as a camera sees them.
-
-    `cosines` are those between the normals and the directions to the camera; `unoccluded` patches
-    face it with no other before them.
-    """
-
-    cosines: Float[np.ndarray, "patches"]
-    unoccluded: Bool[np.ndarray, "patches"]
-    pixels: Float[np.ndarray, "patches 2"]
-
-
-def view_patches(
-    patches: SkinPatches, shaped: ShapedBody, observation: Observation
-) -> PatchView | None:
-    """Project the patches in a frame's pose; None if some are behind the camera."""
-    camera, body = observation.camera, shaped.with_pose(observation.pose)
-    points, normals = pose_patches(patches, body.world_from_rest())
-    to_camera = camera.center_world - points
-    to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
-    cosines = np.einsum("pa,pa->p", to_camera, normals)
-    in_camera = points @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]
-    depths = in_camera[:, 2]
-    if depths.min() <= 0.0:
-        return None
-    plane = in_camera[:, :2] / depths[:, None] * depths.mean()
-    free = visible_points(plane, depths, cosines)
-    return PatchView(cosines=cosines, unoccluded=free, pixels=camera.project(points))
-
-
 def pose_patches(
     patches: SkinPatches, world_from_rest: Float[np.ndarray, "24 4 4"]
 ) -> tuple[Float32[np.ndarray, "patches 3"], Float32[np.ndarray, "patches 3"]]:
@@ -188,11 +157,18 @@ class Coverage:
         A patch is seen if it faces the camera (cosine above 0.3), lies inside the image, has
         no other patch before it, and the mask says that a person is there.
         """
-        view = view_patches(self.patches, self._shaped, observation)
-        if view is None:  # a person behind the camera is not in the image either
+        camera, body = observation.camera, self._shaped.with_pose(observation.pose)
+        points, normals = pose_patches(self.patches, body.world_from_rest())
+        to_camera = camera.center_world - points
+        to_camera /= np.linalg.norm(to_camera, axis=1, keepdims=True)
+        cosines = np.einsum("pa,pa->p", to_camera, normals)
+        in_camera = points @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]
+        depths = in_camera[:, 2]
+        if depths.min() <= 0.0:  # a person behind the camera is not in the image either
             return
-        column, row = np.floor(view.pixels).astype(np.int64).T
-        camera, cosines, free = observation.camera, view.cosines, view.unoccluded
+        plane = in_camera[:, :2] / depths[:, None] * depths.mean()
+        free = visible_points(plane, depths, cosines)
+        column, row = np.floor(camera.project(points)).astype(np.int64).T
         width, height = camera.size_px
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         alpha = observation.alpha[row.clip(0, height - 1), column.clip(0, width - 1)]
@@ -298,8 +274,7 @@ ADVICE_BY_SIDE = {
 """Advice about skin that faced away, by its limb and side; others have one sentence."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class UnseenRegion:
+class UnseenRegion(NamedTuple):
     """A side of a limb, or all of it, that no frame shows.
 
     Attributes:

@@ -83,13 +83,6 @@ class HeldOutFrame:
             vars(moved)["blur_calibration"] = self.blur_calibration
         return moved
 
-    def with_correspondences(self, rig: Rig) -> "HeldOutFrame":
-        """The frame with its correspondence grid, for repeated rendering."""
-        return replace(
-            self,
-            correspondences=CorrespondenceGrid.solve(rig, self.observation.pose.joint_rotations),
-        )
-
 
 def score_frame(avatar: Avatar, frame: HeldOutFrame) -> HeldOutScore:
     """Renders a held-out frame and compares it with the ground truth."""

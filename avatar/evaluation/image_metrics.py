@@ -45,11 +45,6 @@ MASK_THRESHOLD = 0.5
 """Alpha above which a pixel belongs to the person."""
 
 
-def silhouette_of(observation: Observation) -> Bool[np.ndarray, "height width"]:
-    """Pixels that show the person."""
-    return observation.alpha > MASK_THRESHOLD
-
-
 def composite_over(
     premultiplied: Float32[np.ndarray, "*shape 4"], background: float
 ) -> Float32[np.ndarray, "*shape 3"]:

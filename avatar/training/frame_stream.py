@@ -62,8 +62,8 @@ def prepare_frame(observation: Observation, rig: Rig) -> TrainingFrame:
     near = near_person_mask(observation.alpha)
     view = RayView.of(observation.camera, near)
     colors = premultiplied_rgba(observation.person_colors(), observation.alpha, near)
-    head = picture_head(observation, rig)
-    return _assemble_frame(observation.frame.index, observation.pose, view, colors, head, rig)
+    frame = rebuild_frame(observation.frame.index, observation.pose, view, colors, rig)
+    return replace(frame, head=picture_head(observation, rig))
 
 
 def rebuild_frame(
@@ -76,8 +76,19 @@ def rebuild_frame(
     head: tuple[RayView, UInt8[np.ndarray, "near 4"]] | None = None,
 ) -> TrainingFrame:
     """Prepares a frame from what is saved of it: finds its rays, and solves its warp."""
-    pixels = None if head is None else head_pixels(*head)
-    return _assemble_frame(index, pose, view, colors, pixels, rig)
+    near = view.near_person()
+    origin, body_from_camera = camera_in_body(view.camera, pose, rig)
+    return TrainingFrame(
+        index=index,
+        pose=pose,
+        correspondences=CorrespondenceGrid.solve(rig, pose.joint_rotations),
+        origin=origin,
+        body_from_camera=body_from_camera,
+        pixels=PixelRuns.of(near, around_person(near) & ~near),
+        colors=colors,
+        view=view,
+        head=None if head is None else head_pixels(*head),
+    )
 
 
 def camera_in_body(
@@ -88,30 +99,6 @@ def camera_in_body(
     camera_from_body = camera.camera_from_world[:3, :3] @ world_from_body[:3, :3]
     origin = (camera.center_world - world_from_body[:3, 3]) @ world_from_body[:3, :3]
     return origin.astype(np.float32), np.ascontiguousarray(camera_from_body.T, dtype=np.float32)
-
-
-def _assemble_frame(
-    index: int,
-    pose: BodyPose,
-    view: RayView,
-    colors: UInt8[np.ndarray, "pixels 4"],
-    head: TrainingPixels | None,
-    rig: Rig,
-) -> TrainingFrame:
-    near = view.near_person()
-    origin, body_from_camera = camera_in_body(view.camera, pose, rig)
-    pixels = PixelRuns.of(near, around_person(near) & ~near)
-    return TrainingFrame(
-        index=index,
-        pose=pose,
-        correspondences=CorrespondenceGrid.solve(rig, pose.joint_rotations),
-        origin=origin,
-        body_from_camera=body_from_camera,
-        pixels=pixels,
-        colors=colors,
-        view=view,
-        head=head,
-    )
 
 
 JOINT_ANGLE_WEIGHT = 0.5

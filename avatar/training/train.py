@@ -35,8 +35,7 @@ from avatar.events import (
 from avatar.kernels import operations
 from avatar.kernels.operands import LossSettings, PosedBones, PriorPoints, RayBatch, RaySamples
 from avatar.render import render
-from avatar.rig import Rig
-from avatar.training.frame_stream import RedundantFrame, StreamItem, TrainingFrame, rebuild_frame
+from avatar.training.frame_stream import RedundantFrame, StreamItem, rebuild_frame
 from avatar.training.pose_optimizer import FIRST_CORRECTION_STEPS
 from avatar.training.trainer import Trainer, cosine_decay
 from avatar.training.training_pixels import RayView
@@ -366,10 +365,13 @@ def warm_up_rays(trainer: Trainer) -> Trainer:
     """Compiles rendering, and of a step what is not learning; returns a trainer with one frame."""
     stand_in = _small_trainer(trainer)
     rig = stand_in.avatar.rig
-    camera = _front_camera(rig)
+    eye, size = rig.rest_joints[0] + [0.0, 0.0, 3.0], (WARMUP_IMAGE_PX, WARMUP_IMAGE_PX)
+    camera = Camera.at(eye, np.diag([1.0, -1.0, -1.0]), 1.5 * WARMUP_IMAGE_PX, size)
+    view = RayView.of(camera, np.full(size, True))
+    colors: UInt8[np.ndarray, "pixels 4"] = np.full((WARMUP_IMAGE_PX**2, 4), 255, dtype=np.uint8)
     stand_in.avatar.shading.restore(torch.tensor([1.0, 0.1, 0.0, 0.0]))
     render(stand_in.avatar, BodyPose.rest(), camera, shaded=True)
-    stand_in.add_frame(_dummy_frame(rig, camera))
+    stand_in.add_frame(rebuild_frame(0, BodyPose.rest(), view, colors, rig))
     poses = stand_in.poses  # an exact pose does not move, and nothing would have followed it
     operations.update_roots(stand_in.replay.correspondences, [0], poses.skinning, poses.bones)
     batch = stand_in.replay.sample_rays(stand_in.config.rays, stand_in.generator)
@@ -405,17 +407,3 @@ def _small_trainer(trainer: Trainer) -> Trainer:
     """A trainer of the same person, whose steps are short."""
     config = dataclasses.replace(trainer.config, rays=64, empty_space_points=16, density_tv_pairs=8)
     return Trainer(trainer.avatar.rig, config)
-
-
-def _front_camera(rig: Rig) -> Camera:
-    eye, axes = rig.rest_joints[0] + [0.0, 0.0, 3.0], np.diag([1.0, -1.0, -1.0])
-    return Camera.at(eye, axes, 1.5 * WARMUP_IMAGE_PX, (WARMUP_IMAGE_PX, WARMUP_IMAGE_PX))
-
-
-def _dummy_frame(rig: Rig, camera: Camera) -> TrainingFrame:
-    pose = BodyPose.rest()
-    width, height = camera.size_px
-    near = np.full((height, width), True)
-    colors: UInt8[np.ndarray, "pixels 4"] = np.full((near.size, 4), 255, dtype=np.uint8)
-    view = RayView.of(camera, near)
-    return rebuild_frame(0, pose, view, colors, rig)

@@ -14,7 +14,6 @@ from avatar.evaluation.image_metrics import (
     ground_truth_over,
     overall_verdict,
     psnr_of_errors,
-    silhouette_of,
 )
 from avatar.evaluation.perceptual import LPIPS_CONVENTIONS, Lpips
 from avatar.events import HeldOutScore
@@ -141,7 +140,7 @@ def _bounding_box(observation: Observation, *, margin: float = 0.0) -> tuple[sli
 
     `margin` is the width of the rim around the person, as a fraction of the box.
     """
-    silhouette, spans = silhouette_of(observation), []
+    silhouette, spans = observation.alpha > MASK_THRESHOLD, []
     for axis in (1, 0):
         where = np.flatnonzero(silhouette.any(axis=axis))
         if not where.size:

@@ -119,7 +119,7 @@ def filmed(size: int) -> Filmed:
     return Filmed(
         rig=rig,
         frames=[item for item in items if isinstance(item, TrainingFrame)],
-        held=[item.with_correspondences(rig) for item in items if isinstance(item, HeldOutFrame)],
+        held=[item for item in items if isinstance(item, HeldOutFrame)],
         footprint_m=float((camera.camera_from_world @ pelvis)[2]) / camera.focal_px[0],
     )
 
