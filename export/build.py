@@ -261,11 +261,8 @@ class _PackageDraft:
                 for tier in package.manifest.tiers
             }
             writer.add_tables(tuned.tables)  # compressed beside them
-            package = _checked_package(
-                package, {tier: player.result() for tier, player in players.items()},
-                self.views, self.exact, self.executor, warnings=list(warnings),
-                difference=difference,
-            )  # fmt: skip
+            checked = {tier: player.result() for tier, player in players.items()}
+            package = self._check(package, checked, list(warnings), difference)
             size = writer.finish(package)
         tiers = package.manifest.tiers
         return ExportReport(
@@ -275,6 +272,45 @@ class _PackageDraft:
             psnr_to_renderer={name: tier.psnr_to_renderer for name, tier in tiers.items()},
             largest_difference=max(tier.largest_difference for tier in tiers.values()),
             warnings=tuple(package.manifest.metrics["warnings"]),
+        )
+
+    def _check(
+        self,
+        package: AvatarPackage,
+        players: Mapping[str, tuple[bytes, Player]],
+        warnings: list[str],
+        difference: float | None,
+    ) -> AvatarPackage:
+        """Check every tier, its graph unless `difference` is known; add what is missing."""
+        manifest, pairs = package.manifest, list(zip(self.views, self.exact, strict=True))
+        checks, scores = dict[str, Future[float]](), dict[str, list[Future[float]]]()
+        for tier, (_, player) in players.items():
+            if difference is None:
+                checks[tier] = self.executor.submit(check_graph, player, package, tier)
+            scores[tier] = [
+                self.executor.submit(psnr_to_renderer, player, view, truth)
+                for view, truth in pairs[: {"hq": None, "lite": 1}[tier]]
+            ]
+        hq = players["hq"][1]
+        shots = [self.views[0], *((frame.pose, frame.camera) for frame in manifest.golden)]
+        preview, *golden = self.executor.map(lambda shot: hq.render(*shot), shots)
+        tiers = {
+            tier: replace(
+                info,
+                psnr_to_renderer=float(np.mean([score.result() for score in scores[tier]])),
+                largest_difference=checks[tier].result() if difference is None else difference,
+            )
+            for tier, info in manifest.tiers.items()
+        }
+        warnings = warnings + quality_warnings(tiers["hq"].psnr_to_renderer)
+        graphs = {tier: graph for tier, (graph, _) in players.items()}
+        metrics = {**manifest.metrics, "warnings": warnings}
+        return replace(
+            package,
+            manifest=replace(manifest, tiers=tiers, metrics=metrics),
+            graphs=graphs | build_coarse_graph(package),
+            golden=tuple(golden),
+            preview=encode_png(preview),
         )
 
 
@@ -310,46 +346,6 @@ def _prepare_player(package: AvatarPackage, tier: str) -> tuple[bytes, Player]:
     """Build the graph of a tier, and its player."""
     graph = serialize_graph(package, tier)
     return graph, Player(replace(package, graphs={tier: graph}), tier=tier, optimize=False)
-
-
-def _checked_package(
-    package: AvatarPackage,
-    players: Mapping[str, tuple[bytes, Player]],
-    views: Sequence[PosedView],
-    exact: Sequence[Float32[np.ndarray, "_ _ 3"]],
-    executor: Executor,
-    warnings: list[str],
-    difference: float | None,
-) -> AvatarPackage:
-    """Check every tier, its graph unless `difference` is known; add what is missing."""
-    manifest = package.manifest
-    checks, scores = dict[str, Future[float]](), dict[str, list[Future[float]]]()
-    for tier, (_, player) in players.items():
-        if difference is None:
-            checks[tier] = executor.submit(check_graph, player, package, tier)
-        scores[tier] = [
-            executor.submit(psnr_to_renderer, player, view, truth)
-            for view, truth in list(zip(views, exact, strict=True))[: {"hq": None, "lite": 1}[tier]]
-        ]
-    hq = players["hq"][1]
-    shots = [views[0], *((frame.pose, frame.camera) for frame in manifest.golden)]
-    preview, *golden = executor.map(lambda shot: hq.render(*shot), shots)
-    tiers = {
-        tier: replace(
-            info,
-            psnr_to_renderer=float(np.mean([score.result() for score in scores[tier]])),
-            largest_difference=checks[tier].result() if difference is None else difference,
-        )
-        for tier, info in manifest.tiers.items()
-    }
-    warnings = warnings + quality_warnings(tiers["hq"].psnr_to_renderer)
-    return replace(
-        package,
-        manifest=replace(manifest, tiers=tiers, metrics={**manifest.metrics, "warnings": warnings}),
-        graphs={tier: graph for tier, (graph, _) in players.items()} | build_coarse_graph(package),
-        golden=tuple(golden),
-        preview=encode_png(preview),
-    )
 
 
 def _unchecked_package(

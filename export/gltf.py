@@ -91,12 +91,8 @@ def encode_glb(
     Colors include the recording's light, so the material is unlit (KHR_materials_unlit), and matt
     for importers without that extension. The canonical pose is the bind pose and the rest pose.
     """
-    draft = _GltfBuffer()
     bends = np.concatenate([np.zeros((1, 3)), manifest.canonical_rotations])
-    skin, nodes = _skeleton(draft, mesh, manifest, bends)
-    return _encode_scene(
-        draft, mesh, manifest, skin, nodes, name, {"animations": [_animation(draft, animation)]}
-    )
+    return _encode_scene(mesh, manifest, name, bends, animation=animation)
 
 
 def encode_vrm(mesh: SkinnedMesh, manifest: Manifest, *, name: str, author: str) -> bytes:
@@ -106,8 +102,6 @@ def encode_vrm(mesh: SkinnedMesh, manifest: Manifest, *, name: str, author: str)
     unmodified, and commercially if all that it was made with allows that.
     (vrm.dev, VRMC_vrm-1.0.)
     """
-    draft = _GltfBuffer()
-    skin, nodes = _skeleton(draft, mesh, manifest, np.zeros((24, 3)))
     is_free = manifest.metrics.get("made_with", {}).get("commercial_use") == "yes"
     humanoid = {bone: {"node": FIRST_JOINT + joint} for joint, bone in VRM_BONES.items()}
     meta = {
@@ -121,21 +115,26 @@ def encode_vrm(mesh: SkinnedMesh, manifest: Manifest, *, name: str, author: str)
         "modification": "prohibited",
     }
     vrm = {"specVersion": "1.0", "meta": meta, "humanoid": {"humanBones": humanoid}}
-    return _encode_scene(
-        draft, mesh, manifest, skin, nodes, name, {"extensions": {"VRMC_vrm": vrm}}
-    )
+    return _encode_scene(mesh, manifest, name, np.zeros((24, 3)), extensions={"VRMC_vrm": vrm})
 
 
 def _encode_scene(
-    draft: "_GltfBuffer",
     mesh: SkinnedMesh,
     manifest: Manifest,
-    skin: dict[str, Any],
-    nodes: list[dict[str, Any]],
     name: str,
-    more: dict[str, Any],
+    bent: Float[np.ndarray, "24 3"],
+    *,
+    animation: SkeletonAnimation | None = None,
+    extensions: dict[str, Any] | None = None,
 ) -> bytes:
-    """Encode the mesh below its skeleton, and more entries of the file."""
+    """Encode the mesh below its skeleton, which rests in `bent`, with a motion or extensions."""
+    draft = _GltfBuffer()
+    skin, nodes = _skeleton(draft, mesh, manifest, bent)
+    more: dict[str, Any] = {}
+    if animation is not None:
+        more["animations"] = [_animation(draft, animation)]
+    if extensions is not None:
+        more["extensions"] = extensions
     content = {
         "asset": {
             "version": "2.0",

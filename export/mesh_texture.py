@@ -137,12 +137,8 @@ def _missing_colors(
 ) -> tuple[Int[np.ndarray, "seen"], Float32[np.ndarray, "seen 1"], Float32[np.ndarray, "seen 3"]]:
     """Compare a picture with the mesh, drawn by the same camera.
 
-    Args:
-        places: Of the vertices in the texture `coarse`, texels.
-        points: Of the texels, and the surface's normals there.
-
-    Returns:
-        The texels that are seen, the cosine between view and normal, and what the picture has more.
+    `places` are the vertices' in the texture `coarse`, texels. Returns the texels that are seen,
+    the cosine between view and normal, and what the picture has more.
     """
     pixels, depths = _project(camera, positions)
     faces = faces[np.argsort(-depths[faces].sum(axis=1))]  # nearer ones are drawn over farther ones

@@ -147,11 +147,7 @@ class Player:
     ) -> "Player":
         """Read a package and prepare its player.
 
-        Args:
-            path: The `.iavatar` file.
-            tier: Quality tier: "hq", or "lite" where the package has it.
-            threads: Threads for one picture; more than one rarely pays (see `render_all`).
-            provider: onnxruntime's execution provider, "cpu", "cuda", …
+        More than one of `threads` rarely pays (see `render_all`); arguments as of `Player`.
 
         Raises:
             InputError: If the file is not a sound package, or lacks the tier, or the provider is
@@ -230,12 +226,8 @@ class Player:
     ) -> Generator[UInt8[np.ndarray, "_ _ 4"], None, None]:
         """Yield the pictures of many poses and cameras in order, drawing several at a time.
 
-        The pictures do not depend on the number of workers; at most two a worker are held back.
-
-        Args:
-            shots: Poses and cameras, as of `render`.
-            workers: Threads; onnxruntime releases Python's lock while it draws.
-            samples: As of `render`.
+        The pictures do not depend on the number of workers, which are threads; at most two a worker
+        are held back. Other arguments are as of `render`.
         """
         if workers == 1:
             for pose, camera in shots:
@@ -298,12 +290,8 @@ def create_session(
 ) -> onnxruntime.InferenceSession:
     """Create a session for a graph, with threads that do not spin.
 
-    Args:
-        graph: The ONNX model.
-        tables: Its external tables by name; they must outlive the session.
-        threads: Threads for one run.
-        provider: A name from `find_provider`.
-        optimize: As of `Player`.
+    `tables` are its external tables by name, which must outlive the session; `provider` is a name
+    from `find_provider`.
     """
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads

@@ -307,10 +307,9 @@ class ResolutionLimit:
 
     def _nearest_depth_m(self, bones: Float32[np.ndarray, "24 3 4"], camera: Camera) -> float:
         """Return the least depth of skinning nodes that may be in the picture, metres."""
-        matrices = (self._node_weights.T @ bones.reshape(24, 12)).reshape(-1, 3, 4)
-        there = (
-            np.einsum("nij,nj->ni", matrices[:, :, :3], self._node_positions) + matrices[:, :, 3]
-        )
+        weights, positions = self._nodes.weights[:, 1:-1], self._nodes.positions[1:-1]
+        matrices = (weights.T @ bones.reshape(24, 12)).reshape(-1, 3, 4)
+        there = np.einsum("nij,nj->ni", matrices[:, :, :3], positions) + matrices[:, :, 3]
         there = there[there[:, 2] > self._nearest_m - NODE_RADIUS_M]
         depth = np.maximum(there[:, 2], np.float32(self._nearest_m))
         focal, size = np.array(camera.focal_px), np.array(camera.size_px)
@@ -320,12 +319,8 @@ class ResolutionLimit:
         return float(depth[seen].min()) if seen.any() else np.inf
 
     @cached_property
-    def _node_weights(self) -> Float32[np.ndarray, "24 rows"]:
-        return stored_skinning_nodes(self._skin).weights[:, 1:-1]
-
-    @cached_property
-    def _node_positions(self) -> Float32[np.ndarray, "rows 3"]:
-        return stored_skinning_nodes(self._skin).positions[1:-1]
+    def _nodes(self) -> SkinningNodes:
+        return stored_skinning_nodes(self._skin)
 
 
 def downscale_camera(camera: Camera, factor: float) -> Camera:

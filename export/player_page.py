@@ -99,12 +99,8 @@ PACKED_WASM_FILE = f"{WASM_FILE}.zlib"
 """The WebAssembly module as engine.js reads it: not all hosts compress what they send."""
 
 
-def pack_runtime(compression_level: int) -> bytes:
-    """Pack the WebAssembly module, once a process."""
-    return _compress(runtime_files()[WASM_FILE], compression_level)
-
-
 _compress = lru_cache(maxsize=1)(zlib.compress)
+"""Packs the WebAssembly module, once a process."""
 
 
 def build_page(
@@ -130,8 +126,7 @@ def player_files(motions: Mapping[str, bytes], *, compression_level: int) -> dic
     ]
     pages, runtime = static_page_files(), runtime_files()
     index = pages["index.html"].replace(b"<!-- motions -->", "".join(options).encode())
-    runtime[PACKED_WASM_FILE] = pack_runtime(compression_level)
-    del runtime[WASM_FILE]
+    runtime[PACKED_WASM_FILE] = _compress(runtime.pop(WASM_FILE), compression_level)
     # hosts such as nginx serve .mjs as application/octet-stream, which browsers do not run
     runtime["ort.js"] = runtime.pop(SCRIPT_FILE)
     return {

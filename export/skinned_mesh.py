@@ -1,6 +1,6 @@
 """A package's avatar as a mesh: vertices, colors or a texture, and skinning weights."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int32, UInt8
@@ -118,17 +118,12 @@ def extract_mesh(
     if picture_by is None:
         return mesh
     unwrapped = unwrap(positions, faces)
-    rows = unwrapped.sources
-    texture = draw_texture(unwrapped, positions[rows], normals[rows], color_at, picture_by)
-    return SkinnedMesh(
-        positions=positions[rows],
-        normals=normals[rows],
-        colors=mesh.colors[rows],
-        faces=unwrapped.faces,
-        joints=joints[rows],
-        weights=weights[rows],
-        texture=texture,
-    )
+    copied = {
+        name: getattr(mesh, name)[unwrapped.sources]
+        for name in ("positions", "normals", "colors", "joints", "weights")
+    }
+    texture = draw_texture(unwrapped, copied["positions"], copied["normals"], color_at, picture_by)
+    return replace(mesh, **copied, faces=unwrapped.faces, texture=texture)
 
 
 def _simplify(

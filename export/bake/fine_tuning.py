@@ -250,12 +250,11 @@ def fine_tune(
         return float(np.mean([targets.psnr(tables, each, codes) for targets, each in judges]))
 
     baked = codes.density.copy()
-    solver = _SirtSolver(learnt=learnt, bricks=tables.bricks, baked=baked, executor=inputs.executor)
     first = judge(codes)
     cells = None
     pixels = sum(int(targets.pixels.sum()) for targets, _ in learnt)
     for turn in range(FREE_ROUNDS + SHARED_ROUNDS):
-        update = solver.descend(codes, cells)
+        update = _sirt_round(learnt, tables.bricks, baked, codes, cells, inputs.executor)
         if turn == FREE_ROUNDS - 1:
             squared_error = 3.0 * pixels * 255.0**2 * 10.0 ** (-0.1 * first)  # of channels, 1/255²
             price = 3e-7 * squared_error  # a million such codes are worth what their bytes are
@@ -272,39 +271,35 @@ def fine_tune(
     return FineTuningResult(tables=tables, settings=inputs.settings, psnr=(first, reached))
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _SirtSolver:
-    """Lowers the squared error of rays by SIRT rounds; `baked` are the densities' first codes."""
+def _sirt_round(
+    learnt: Sequence[tuple[RenderTargets, RenderSettings]],
+    bricks: BrickTable,
+    baked: Float32[np.ndarray, "voxels"],
+    codes: VoxelCodes,
+    cells: Sequence[VoxelCells] | None,
+    executor: Executor,
+) -> SirtUpdate:
+    """Lower the squared error of rays, in place and not rounded; return single voxels' update.
 
-    learnt: Sequence[tuple[RenderTargets, RenderSettings]]
-    bricks: BrickTable
-    baked: Float32[np.ndarray, "voxels"]
-    executor: Executor
+    `baked` are the densities' first codes. Voxels of a cell have equal codes; there are `cells` for
+    each of the `brick_chunks`, or None.
+    """
 
-    def descend(self, codes: VoxelCodes, cells: Sequence[VoxelCells] | None) -> SirtUpdate:
-        """Take a round's step, in place and not rounded; return the update of single voxels.
+    def updates(learnt: tuple[RenderTargets, RenderSettings]) -> SirtUpdate:
+        targets, settings = learnt
+        return back_project(targets.segments, settings, bricks, codes, targets.target_colors)
 
-        Voxels of a cell have equal codes; there are `cells` for each of the `brick_chunks`, or
-        None.
-        """
-
-        def updates(learnt: tuple[RenderTargets, RenderSettings]) -> SirtUpdate:
-            targets, settings = learnt
-            return back_project(
-                targets.segments, settings, self.bricks, codes, targets.target_colors
-            )
-
-        update, *others = self.executor.map(updates, self.learnt)
-        while others:
-            update.add(others.pop())
-        for number, chunk in enumerate(brick_chunks(len(self.baked))):
-            single, middle = update.chunk(chunk), self.baked[chunk]
-            if cells is not None:
-                single = cells[number].sum_update(single)
-                middle = cells[number].mean_density(middle)
-            _take_step(codes.chunk(chunk), single, middle)
-        codes.color[: BRICK_SIZE**3], codes.density[: BRICK_SIZE**3] = 0.0, 0.0  # the empty brick
-        return update
+    update, *others = executor.map(updates, learnt)
+    while others:
+        update.add(others.pop())
+    for number, chunk in enumerate(brick_chunks(len(baked))):
+        single, middle = update.chunk(chunk), baked[chunk]
+        if cells is not None:
+            single = cells[number].sum_update(single)
+            middle = cells[number].mean_density(middle)
+        _take_step(codes.chunk(chunk), single, middle)
+    codes.color[: BRICK_SIZE**3], codes.density[: BRICK_SIZE**3] = 0.0, 0.0  # the empty brick
+    return update
 
 
 def _take_step(

@@ -20,6 +20,17 @@ from export.package.player_tables import BRICK_SIZE, LOG_DENSITY_RANGE
 F32, I32 = np.float32, np.int32
 
 
+@compile_kernel(nogil=True, error_model="numpy", forceinline=True)
+def _node_under(positions, normals, p, depth, low, voxel_m, shape):
+    """Return the node nearest to the place at a depth under a point of the surface."""
+    i = I32(np.rint((positions[p, 0] - normals[p, 0] * depth - low[0]) / voxel_m))
+    j = I32(np.rint((positions[p, 1] - normals[p, 1] * depth - low[1]) / voxel_m))
+    k = I32(np.rint((positions[p, 2] - normals[p, 2] * depth - low[2]) / voxel_m))
+    return (
+        min(max(i, 0), shape[0] - 1), min(max(j, 0), shape[1] - 1), min(max(k, 0), shape[2] - 1)
+    )  # fmt: skip
+
+
 @compile_kernel(nogil=True, error_model="numpy")
 def visible_depth_steps(
     density, low, voxel_m, positions, normals, step, max_steps, opaque, fraction
@@ -31,16 +42,12 @@ def visible_depth_steps(
     """
     ends = np.empty(len(positions), dtype=np.int32)
     along = np.empty(max_steps, dtype=np.float32)
-    last_i, last_j, last_k = density.shape[0] - 1, density.shape[1] - 1, density.shape[2] - 1
     for p in range(len(positions)):
         # the whole walk comes first: thin parts are enough at a fraction of their own total
         total = F32(0)
         for n in range(max_steps):
             depth = (F32(n) + F32(0.5)) * step
-            i = I32(np.rint((positions[p, 0] - normals[p, 0] * depth - low[0]) / voxel_m))
-            j = I32(np.rint((positions[p, 1] - normals[p, 1] * depth - low[1]) / voxel_m))
-            k = I32(np.rint((positions[p, 2] - normals[p, 2] * depth - low[2]) / voxel_m))
-            i, j, k = min(max(i, 0), last_i), min(max(j, 0), last_j), min(max(k, 0), last_k)
+            i, j, k = _node_under(positions, normals, p, depth, low, voxel_m, density.shape)
             total += density[i, j, k] * step  # the optical depth, Σ σ Δ
             along[n] = total
         enough = min(F32(opaque), F32(fraction) * total)
@@ -54,14 +61,10 @@ def visible_depth_steps(
 @compile_kernel(nogil=True, error_model="numpy")
 def mark_visible_nodes(visible, low, voxel_m, positions, normals, thickness, margin_m):
     """Mark the nodes along each normal, from a margin outside to the thickness inside."""
-    last_i, last_j, last_k = visible.shape[0] - 1, visible.shape[1] - 1, visible.shape[2] - 1
     for p in range(len(positions)):
         depth = -margin_m
         while depth <= thickness[p]:
-            i = I32(np.rint((positions[p, 0] - normals[p, 0] * depth - low[0]) / voxel_m))
-            j = I32(np.rint((positions[p, 1] - normals[p, 1] * depth - low[1]) / voxel_m))
-            k = I32(np.rint((positions[p, 2] - normals[p, 2] * depth - low[2]) / voxel_m))
-            i, j, k = min(max(i, 0), last_i), min(max(j, 0), last_j), min(max(k, 0), last_k)
+            i, j, k = _node_under(positions, normals, p, depth, low, voxel_m, visible.shape)
             visible[i, j, k] = True
             depth += voxel_m
 

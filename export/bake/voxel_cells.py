@@ -9,7 +9,6 @@ Differences between the voxels of a cell are 0 and hardly take bytes.
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from itertools import repeat
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64
@@ -113,11 +112,11 @@ def choose_cells(
     The normalizers of `update` tell how much each voxel shows. Voxels that were empty before tuning
     (`baked`) remain apart. `price`: the squared error, 1/255², that one code more has to save.
     """
-    weights = _error_weights(update, baked)
+    density_weights, color_weights = _error_weights(update, baked)
     apart = np.where(baked > 0, codes.density, np.float32(-1e4))
     return VoxelCells(
-        density=prune_octrees(apart[:, None], weights.density, price),
-        color=prune_octrees(codes.color, weights.color, price),
+        density=prune_octrees(apart[:, None], density_weights, price),
+        color=prune_octrees(codes.color, color_weights, price),
     )
 
 
@@ -125,32 +124,27 @@ def share_codes(
     codes: VoxelCodes, update: SirtUpdate, baked: Float32[np.ndarray, "voxels"], cells: VoxelCells
 ) -> VoxelCodes:
     """Give all voxels of a cell their weighted mean; other arguments as of `choose_cells`."""
-    weights = _error_weights(update, baked)
+    density_weights, color_weights = _error_weights(update, baked)
 
     def mean(values, weight, cell):
         total = sum_over_cells(weight, cell)
         weighted = sum_over_cells(values * weight[:, None], cell)
         return weighted / np.maximum(total, np.float32(1e-12))[:, None]
 
-    density = mean(codes.density[:, None], weights.density, cells.density)[:, 0]
-    return VoxelCodes(density, mean(codes.color, weights.color, cells.color))
+    density = mean(codes.density[:, None], density_weights, cells.density)[:, 0]
+    return VoxelCodes(density, mean(codes.color, color_weights, cells.color))
 
 
-class _ErrorWeights(NamedTuple):
-    density: Float32[np.ndarray, "voxels"]
-    color: Float32[np.ndarray, "voxels"]
-
-
-def _error_weights(update: SirtUpdate, baked: Float32[np.ndarray, "voxels"]) -> _ErrorWeights:
-    """Return the squared error, 1/255², for a change of each voxel's codes by 1."""
+def _error_weights(
+    update: SirtUpdate, baked: Float32[np.ndarray, "voxels"]
+) -> tuple[Float32[np.ndarray, "voxels"], Float32[np.ndarray, "voxels"]]:
+    """Return squared errors, 1/255², for a change of each voxel's density or color code by 1."""
     visible = baked > 0
     floor = np.where(visible, np.float32(1e-3), np.float32(0.0))  # rays
     # normalizers of densities hold the squares on black and on white, of colors in [0, 1]
     density = update.density_normalizer * np.float32(0.5 * 255.0**2)
-    return _ErrorWeights(
-        density=np.where(visible, density + floor, np.float32(1.0)),
-        color=update.color_normalizer + floor,
-    )
+    density = np.where(visible, density + floor, np.float32(1.0))
+    return density, update.color_normalizer + floor
 
 
 def share_codes_within_budget(

@@ -1,6 +1,7 @@
 """Nodes that march rays through canonical space and composite the bricks along them."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -130,20 +131,19 @@ def interpolate_color(context: GraphContext, cell: BrickTetrahedra) -> GraphValu
     return sums.cast(np.float32) * column([scale, scale / 256.0, scale])
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class SegmentValues:
+class SegmentValues(NamedTuple):
     """Segments of rays: values of the graph, one entry or column a ray.
 
     Attributes:
-        direction_camera: Unit directions in the camera's frame.
         begin, end: Distances from the camera's center, metres.
+        direction_camera: Unit directions in the camera's frame.
         start_canonical: Canonical positions at `begin`.
         direction_canonical: Canonical metres per metre along the ray, at `begin`.
     """
 
-    direction_camera: GraphValue
     begin: GraphValue
     end: GraphValue
+    direction_camera: GraphValue
     start_canonical: GraphValue
     direction_canonical: GraphValue
 
@@ -200,7 +200,7 @@ def march_segments(
     def once(turn: GraphValue, state: list[GraphValue]) -> tuple[GraphValue, list[GraphValue]]:
         light, color, *taken, number, before = state[: len(traced) + 4]
         values = state[len(traced) + 4 :]
-        segment = _newton_step(context, posed, _unpack_segment(values))
+        segment = _newton_step(context, posed, SegmentValues(*values))
         doublings = (turn + 2 - steady).maximum(0).cast(np.float32)
         last = turn > blocks - 3
         shortened = compression_scale(context, segment.direction_canonical)
@@ -226,7 +226,7 @@ def compression_scale(context: GraphContext, direction: GraphValue) -> GraphValu
 def _unfinished_rays(
     context: GraphContext, number: GraphValue, segment: SegmentValues, block: BlockValues
 ) -> list[GraphValue]:
-    """Return numbers, transmittances and remainders (`_unpack_segment`) of unfinished rays."""
+    """Return numbers, transmittances and remainders (`SegmentValues`) of unfinished rays."""
     graph = context.graph
     on = (block.transmittance > context.settings.min_transmittance) & (
         block.end < segment.end - 1e-5
@@ -240,17 +240,6 @@ def _unfinished_rays(
             for v in (segment.direction_camera, block.end_canonical, segment.direction_canonical)
         ),
     ]
-
-
-def _unpack_segment(values: list[GraphValue]) -> SegmentValues:
-    begin, end, direction_camera, start_canonical, direction_canonical = values
-    return SegmentValues(
-        direction_camera=direction_camera,
-        begin=begin,
-        end=end,
-        start_canonical=start_canonical,
-        direction_canonical=direction_canonical,
-    )
 
 
 def composite_samples(
@@ -293,14 +282,12 @@ def _newton_step(context: GraphContext, posed: GraphValue, segment: SegmentValue
     camera, derivative = skin_points(
         context, posed, locate_skinning_cell(context, segment.start_canonical)
     )
-    inverse = invert_jacobian(context, derivative, segment.direction_camera)
+    inverse = invert_jacobian(context, derivative)
+    along_ray = inverse.apply(segment.direction_camera)
     shift = inverse.apply(segment.direction_camera * segment.begin - camera)
     length = (dot(shift, shift) + 1e-20).sqrt()
     share = graph.where(inverse.trusted, (settings.max_correction_m / length).minimum(1.0), 0.0)
-    return SegmentValues(
-        direction_camera=segment.direction_camera,
-        begin=segment.begin,
-        end=segment.end,
+    return segment._replace(
         start_canonical=segment.start_canonical + shift * share,
-        direction_canonical=graph.where(inverse.trusted, inverse.ray, segment.direction_canonical),
+        direction_canonical=graph.where(inverse.trusted, along_ray, segment.direction_canonical),
     )

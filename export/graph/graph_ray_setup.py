@@ -102,11 +102,12 @@ def trace_depth_layer(
         fraction=[fraction.gather(surfel) for fraction in surfels.cell.fraction],
     )
     camera, derivative = skin_points(context, surface.posed, cell)
-    inverse = invert_jacobian(context, derivative, ray)
+    inverse = invert_jacobian(context, derivative)
+    along_ray = inverse.apply(ray)  # canonical metres per metre
     normal = vector_table(context, "normal", surfel)
-    far = dot(inverse.ray, inverse.ray) > MAX_TRUSTED_COMPRESSION**2
+    far = dot(along_ray, along_ray) > MAX_TRUSTED_COMPRESSION**2
     trusted = inverse.trusted & (surface.close_up & far).logical_not()
-    direction = graph.where(trusted, inverse.ray, -normal)
+    direction = graph.where(trusted, along_ray, -normal)
     along = dot(camera, ray)
     beside = graph.where(trusted, inverse.apply(ray * along - camera), 0.0)
     thickness = context.table_values["thickness"].gather(surfel)

@@ -159,30 +159,21 @@ class InverseJacobian:
         cofactors: Rows of the Jacobian's adjugate, per step between nodes (3 × points each).
         scale: Factor from each row of the adjugate to the inverse's, per metre; almost 0 where the
             Jacobian is not inverted (3 × points).
-        ray: Canonical metres per metre along each point's ray (3 × points).
         trusted: Whether it is inverted: the skin is neither folded nor torn apart.
     """
 
     cofactors: list[GraphValue]
     scale: GraphValue
-    ray: GraphValue
     trusted: GraphValue
 
     def apply(self, vector: GraphValue) -> GraphValue:
         """Multiply vectors by the inverse."""
-        return _apply_inverse(self.cofactors, self.scale, vector)
+        products = [dot(row, vector) for row in self.cofactors]
+        return self.scale.graph.stack(products) * self.scale
 
 
-def _apply_inverse(
-    cofactors: list[GraphValue], scale: GraphValue, vector: GraphValue
-) -> GraphValue:
-    return scale.graph.stack([dot(row, vector) for row in cofactors]) * scale
-
-
-def invert_jacobian(
-    context: GraphContext, derivative: list[GraphValue], ray: GraphValue
-) -> InverseJacobian:
-    """Invert derivatives of `skin_points`; apply the inverses to unit directions of rays."""
+def invert_jacobian(context: GraphContext, derivative: list[GraphValue]) -> InverseJacobian:
+    """Invert derivatives of `skin_points`."""
     turned = [(each.take(NEXT), each.take(AFTER_NEXT)) for each in derivative]
     cofactors = []
     for i, j in zip(NEXT, AFTER_NEXT, strict=True):
@@ -194,8 +185,7 @@ def invert_jacobian(
     trusted = (volume > 1.0 / stretch) & (volume < stretch)
     one = context.graph.where(trusted, volume, 1e30).reciprocal()
     scale = one * column(np.prod(per_m) / per_m)
-    direction = _apply_inverse(cofactors, scale, ray)
-    return InverseJacobian(cofactors=cofactors, scale=scale, ray=direction, trusted=trusted)
+    return InverseJacobian(cofactors=cofactors, scale=scale, trusted=trusted)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

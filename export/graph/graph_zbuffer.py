@@ -258,17 +258,13 @@ def keys_behind_limits(
     """
     graph, window = context.graph, hidden.window
     limit = limits.gather(hidden.cell)
-    cells, keys = hidden.cell, hidden.key
-    if sheet_slack_m(context) > 0.0:
-        near = graph.range(graph.size(keys).cast(np.int32))
-        near = near.compress(hidden.depth > limit - sheet_slack_m(context))
-        cells, keys = cells.gather(near), keys.gather(near)
-        passed = graph.full(graph.shape(window.cells + 1), np.int32(0)).scatter(cell, front_surfel)
-        same = _same_sheet(context, surfels, keys.bitwise_and(SURFEL_MASK), passed.gather(cells))
-        deeper = hidden.depth.gather(near) > limit.gather(near)
-        cells = graph.where(deeper, cells, graph.where(same, window.cells.cast(np.int32), cells))
-    else:
-        cells = graph.where(hidden.depth > limit, cells, window.cells.cast(np.int32))
+    near = graph.range(graph.size(hidden.key).cast(np.int32))
+    near = near.compress(hidden.depth > limit - sheet_slack_m(context))
+    cells, keys = hidden.cell.gather(near), hidden.key.gather(near)
+    passed = graph.full(graph.shape(window.cells + 1), np.int32(0)).scatter(cell, front_surfel)
+    same = _same_sheet(context, surfels, keys.bitwise_and(SURFEL_MASK), passed.gather(cells))
+    deeper = hidden.depth.gather(near) > limit.gather(near)
+    cells = graph.where(deeper, cells, graph.where(same, window.cells.cast(np.int32), cells))
     return _scatter_keys(context, window, cells, keys).gather(cell)
 
 

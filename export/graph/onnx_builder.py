@@ -73,7 +73,9 @@ class GraphValue:
     matmul = _operator("MatMul")
     gather = _operator("GatherElements", axis=0)  # x[places] in 1D: 5 times as fast as "Gather"
     gather_rows = _operator("Gather", axis=0)  # x[rows] of more than one dimension
+    gather_columns = _operator("GatherElements", axis=1)  # x[i, places[i]]: see `repeat_rows`
     compress = _operator("Compress", axis=0)  # x[condition] in 1D
+    compress_columns = _operator("Compress", axis=1)  # x[:, condition]
 
     def __rsub__(self, other: "Operand") -> "GraphValue":
         """Difference."""
@@ -121,16 +123,8 @@ class GraphValue:
         return self.graph.node("Gather", self, places, axis=axis)
 
     def repeat_rows(self, rows: int) -> "GraphValue":
-        """A 1D value as each of `rows` rows."""
+        """A 1D value as each of `rows` rows; as places, one column for all rows of a matrix."""
         return self.graph.node("Expand", self, self.graph.shape(rows, 1))
-
-    def gather_columns(self, places: "GraphValue") -> "GraphValue":
-        """`self[i, places[i]]` of each row i: one column for all rows of `repeat_rows`."""
-        return self.graph.node("GatherElements", self, places, axis=1)
-
-    def compress_columns(self, condition: "GraphValue") -> "GraphValue":
-        """`self[:, condition]`."""
-        return self.graph.node("Compress", self, condition, axis=1)
 
     def transpose(self, *order: int) -> "GraphValue":
         """Axes in another order."""
@@ -276,11 +270,12 @@ class GraphBuilder:
         held = [GraphValue(self, f"{prefix}_state_{i}", s.dtype) for i, s in enumerate(states)]
         more, after = body(turn, held)
         results = [self.node("Identity", go if more is None else more), *after]
+        # states of no rank: for a known one onnxruntime plans reuse, a search quadratic in nodes
         inner = helper.make_graph(
             self._nodes,
             prefix,
-            [_scalar_info(turn), _scalar_info(go), *(_tensor_info(value) for value in held)],
-            [_scalar_info(results[0]), *(_tensor_info(value) for value in results[1:])],
+            [_value_info(turn, []), _value_info(go, []), *(_value_info(v, None) for v in held)],
+            [_value_info(results[0], []), *(_value_info(v, None) for v in results[1:])],
         )
         self._nodes = before
         outputs = [GraphValue(self, f"{prefix}_result_{i}", s.dtype) for i, s in enumerate(states)]
@@ -329,13 +324,8 @@ def _names_used(nodes: Iterable[onnx.NodeProto]) -> set[str]:
     return used.union(*(_names_used(body) for body in bodies))
 
 
-def _scalar_info(value: GraphValue) -> onnx.ValueInfoProto:
-    return helper.make_tensor_value_info(value.name, ONNX_TYPES[value.dtype], [])
-
-
-def _tensor_info(value: GraphValue) -> onnx.ValueInfoProto:
-    # of no rank: for values of a known one onnxruntime plans reuse, a search quadratic in nodes
-    return helper.make_tensor_value_info(value.name, ONNX_TYPES[value.dtype], None)
+def _value_info(value: GraphValue, shape: Sequence[int] | None) -> onnx.ValueInfoProto:
+    return helper.make_tensor_value_info(value.name, ONNX_TYPES[value.dtype], shape)
 
 
 Operand = GraphValue | float | int | np.generic | np.ndarray

@@ -138,17 +138,14 @@ def _add_further_layers(
         keys, kept = keys.compress(there), kept.compress(there)
         number = number.gather(kept)
         vectors = kept.repeat_rows(3)
-        seen_from = DepthLayer(
+        seen_from = replace(
+            before,
             ray=before.ray.gather_columns(vectors),
             surfel=before.surfel.gather(kept),
             canonical_position=before.canonical_position.gather_columns(vectors),
             camera_position=before.camera_position.gather_columns(vectors),
-            color=before.color,
             transmittance=before.transmittance.gather(kept),
-            enter=before.enter,
             end=before.end.gather(kept),
-            doubtful=before.doubtful,
-            blocks=[],
         )
         layer = trace_depth_layer(context, surface, keys, seen_from.ray, seen_from)
         added = layer.color * seen_from.transmittance
