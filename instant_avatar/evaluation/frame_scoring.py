@@ -9,6 +9,7 @@ from jaxtyping import Float32
 
 from avatar.evaluation.held_out import HeldOutFrame, score_rendering
 from avatar.evaluation.image_metrics import (
+    MASK_THRESHOLD,
     SharpnessVerdict,
     composite_over,
     ground_truth_over,
