@@ -37,7 +37,7 @@ def shaped() -> ShapedBody:
 
 @pytest.fixture(scope="session", autouse=True)
 def one_actor_and_rig_per_body():
-    """The same actor in every shoot and the same rig for equal bodies: each takes a second."""
+    """The same actor, dance and rig of a body wherever they are made: each takes a second."""
     make_rig, rigs = Rig.from_shaped_body, {}
 
     def rig_of(shaped: ShapedBody, *, coarseness: float = 1.0) -> Rig:
@@ -49,6 +49,7 @@ def one_actor_and_rig_per_body():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Actor, "of", functools.cache(Actor.of))
+        patch.setattr(staging, "unfilmed_dance", functools.cache(staging.unfilmed_dance))
         patch.setattr(Rig, "from_shaped_body", rig_of)
         yield
 

@@ -1,6 +1,5 @@
 """ia-export: a package at any second, from what is on the disk."""
 
-import gzip
 import io
 import json
 import shutil
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
+from scipy.spatial import KDTree
 
 from avatar.evaluation.image_metrics import psnr
 from avatar.training import checkpoint
@@ -18,6 +18,7 @@ from export.build import write_draft
 from export.package.package_file import read_package
 from export.player import Player, compare_golden_frames, picture_on_white, premultiply
 from instant_avatar import export
+from preprocess.body.kinematics import body_from_rest
 from preprocess.poses.pose_format_registry import read_poses
 
 NODE = shutil.which("node")
@@ -91,39 +92,27 @@ def test_the_whole_person_is_in_the_views(rig):
         assert (seen < np.array(camera.size_px)).all()
 
 
-@pytest.mark.parametrize(
-    ("change", "told"),
-    [
-        (lambda run, out: (out.parent, out), "checkpoint"),
-        (lambda run, out: (out.parent / "none", out), "none does not exist"),
-        (lambda run, out: (run, out.with_suffix(".zip")), "iavatar"),
-        (lambda run, out: (run / "avatar.iavatar", out), "--to glb"),
-        (lambda run, out: (run, out.parent / "none" / "a.iavatar"), "does not exist"),
-    ],
-)
-def test_impossible_exports_are_refused_and_write_nothing(run, call_export, tmp_path, change, told):
-    folder, out = change(run, tmp_path / "a.iavatar")
-    code, said = call_export(folder, "--out", out)
-    assert code == 2
-    assert told in said.err
-    assert list(tmp_path.iterdir()) == []
+def person_in(path):
+    """The one mesh of a file, which is as tall as a person."""
+    (mesh,) = trimesh.load(path).geometry.values()
+    assert 1.4 < np.ptp(mesh.bounds[:, 1]) < 2.1
+    return mesh
 
 
 @pytest.mark.slow
-def test_a_run_becomes_a_mesh_that_dances(run, film, call_export, tmp_path):
-    out = tmp_path / "a.GLB"
-    poses = film / "truth" / "novel" / "poses.npz"
-    code, said = call_export(run, "--to", "glb", "--poses", poses, "--out", out)
+def test_a_run_becomes_a_mesh_that_dances(run, novel, call_export, tmp_path):
+    code, said = call_export(run, "--to", "glb", "--poses", novel, "--out", tmp_path / "a.GLB")
     assert code == 0, said.err
-    (mesh,) = trimesh.load(out).geometry.values()
-    low, high = mesh.bounds
-    assert 1.4 < high[1] - low[1] < 2.1  # a person's height
+    assert person_in(tmp_path / "a.GLB")
     assert [file.name for file in tmp_path.iterdir()] == ["a.GLB"]
 
 
-def test_a_mesh_dances_what_any_file_of_poses_says(run, film, call_export, tmp_path):
+def test_a_mesh_dances_what_any_file_of_poses_says_also_without_xatlas(
+    package, novel, call_export, tmp_path, monkeypatch
+):
     """AMASS's keys, which ia-play reads, say the same as our own."""
-    ours = read_poses(film / "truth" / "novel" / "poses.npz")
+    monkeypatch.setattr("instant_avatar.export.find_spec", lambda name: None)
+    ours = read_poses(novel)
     turned = np.concatenate([ours.root_rotations[:, None], ours.joint_rotations], axis=1)
     np.savez(
         tmp_path / "amass.npz",
@@ -134,37 +123,28 @@ def test_a_mesh_dances_what_any_file_of_poses_says(run, film, call_export, tmp_p
         mocap_framerate=30.0,
     )
     out = tmp_path / "a.glb"
-    words = run / "avatar.iavatar", "--to", "glb", "--poses", tmp_path / "amass.npz", "--out", out
-    code, said = call_export(*words)
+    words = package, "--to", "glb", "--triangles", 2000, "--poses", tmp_path / "amass.npz"
+    code, said = call_export(*words, "--out", out)
     assert code == 0, said.err
-    assert len(trimesh.load(out).geometry) == 1
-    code, said = call_export(*words, "--overwrite", "--person", "7")
+    assert "colors of vertices" in said.err
+    assert person_in(out)
+    assert b"COLOR_0" in out.read_bytes()
+    assert len(read_poses(out)) == len(ours)
+    code, said = call_export(*words, "--out", out, "--overwrite", "--person", "7")
     assert code == 2
     assert "7" in said.err
 
 
-def test_a_mesh_of_few_triangles_has_a_texture(run, call_export, tmp_path):
+def test_a_mesh_of_few_triangles_has_a_texture(package, call_export, tmp_path):
     pytest.importorskip("xatlas")
     out = tmp_path / "few.gltf"
-    words = ("--to", "glb", "--triangles", 2000, "--out", out)
-    code, said = call_export(run / "avatar.iavatar", *words)
+    code, said = call_export(package, "--to", "glb", "--triangles", 2000, "--out", out)
     assert code == 0, said.err
     assert "2,000 triangles" in said.err
-    (mesh,) = trimesh.load(out).geometry.values()
+    mesh = person_in(out)
     assert len(mesh.faces) == 2000
     assert mesh.visual.kind == "texture"
     assert np.asarray(mesh.visual.material.baseColorTexture)[..., :3].std() > 20.0
-
-
-def test_without_xatlas_a_mesh_of_few_triangles_has_colors(run, call_export, tmp_path, monkeypatch):
-    monkeypatch.setattr("instant_avatar.export.find_spec", lambda name: None)
-    out = tmp_path / "few.glb"
-    code, said = call_export(
-        run / "avatar.iavatar", "--to", "glb", "--triangles", 2000, "--out", out
-    )
-    assert code == 0, said.err
-    assert "colors of vertices" in said.err
-    assert b"COLOR_0" in out.read_bytes()
 
 
 @pytest.mark.slow
@@ -209,41 +189,44 @@ def test_a_package_becomes_a_still_mesh_in_color(run, call_export, tmp_path, nam
     assert colors.std(axis=0).max() > 20.0  # a shirt is no skin
 
 
-def test_splats_stand_in_the_pose_of_a_file(run, film, call_export, tmp_path):
-    poses = film / "truth" / "novel" / "poses.npz"
-    for name, words in (("a.ply", ("--poses", poses)), ("a.spz", ())):
-        words = ("--to", "splats", *words, "--out", tmp_path / name)
-        code, said = call_export(run / "avatar.iavatar", *words)
-        assert code == 0, said.err
-        assert "Gaussians" in said.err
-    head, rows = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
-    columns = head.count(b"property float")
-    posed = np.frombuffer(rows, "<f4").reshape(-1, columns)[:, :3]
-    plain = gzip.decompress((tmp_path / "a.spz").read_bytes())
-    count, fraction = int.from_bytes(plain[8:12], "little"), plain[13]
-    rest = np.frombuffer(plain, np.uint8, 9 * count, 16).reshape(-1, 3, 3) @ [1, 1 << 8, 1 << 16]
-    rest = np.where(rest >= 1 << 23, rest - (1 << 24), rest) / 2.0**fraction
-    for points in (posed, rest):
-        assert 1.4 < np.ptp(points[:, 1]) < 2.1  # a person's height
-    assert np.abs(np.ptp(posed, axis=0) - np.ptp(rest, axis=0)).max() > 0.01
+def test_splats_stand_in_the_pose_of_a_file(package, player, novel, call_export, tmp_path):
+    out = tmp_path / "a.ply"
+    code, said = call_export(package, "--to", "splats", "--poses", novel, "--out", out)
+    assert code == 0, said.err
+    assert "Gaussians" in said.err
+    head, rows = out.read_bytes().split(b"end_header\n", 1)
+    columns = np.frombuffer(rows, "<f4").reshape(-1, head.count(b"property float"))
+    gaussians = KDTree(columns[:, :3] * [1.0, -1.0, -1.0])
+    held, (pose, *_) = player.manifest, read_poses(novel)
+    for rotations, stands_so in ((pose.joint_rotations, True), (held.canonical_rotations, False)):
+        bones = body_from_rest(held.rest_joints, held.parents, rotations)
+        joints = np.einsum("jab,jb->ja", bones[:, :3, :3], held.rest_joints) + bones[:, :3, 3]
+        assert bool(gaussians.query(joints)[0].max() < 0.08) is stands_so
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("line", "told"),
     [
-        (["--to", "splats", "--out", "a.glb"], ".ply or .spz"),
-        (["--to", "splats", "--out", "a.spz", "--triangles", "1000"], "--to glb, vrm, ply or obj"),
-        (["--to", "glb", "--out", "a.ply"], ".glb"),
-        (["--to", "ply", "--out", "a.ply", "--poses", "poses.npz"], "--poses"),
-        (["--to", "glb", "--out", "a.glb", "--poses", "nowhere.npz"], "nowhere.npz"),
-        (["--to", "glb", "--out", "a.glb", "--triangles", "10"], "at least 500"),
-        (["--to", "glb", "--out", "a.glb", "--author", "Anna"], "--author requires --to vrm"),
-        (["--out", "a.iavatar", "--triangles", "1000"], "--to glb, vrm, ply or obj"),
+        (". --out a.iavatar", "checkpoint"),
+        ("none --out a.iavatar", "none does not exist"),
+        ("{run} --out a.zip", "iavatar"),
+        ("{run} --out none/a.iavatar", "does not exist"),
+        ("{package} --out a.iavatar", "--to glb"),
+        ("{package} --to splats --out a.glb", ".ply or .spz"),
+        ("{package} --to splats --out a.spz --triangles 1000", "--to glb, vrm, ply or obj"),
+        ("{package} --to glb --out a.ply", ".glb"),
+        ("{package} --to ply --out a.ply --poses poses.npz", "--poses"),
+        ("{package} --to glb --out a.glb --poses nowhere.npz", "nowhere.npz"),
+        ("{package} --to glb --out a.glb --triangles 10", "at least 500"),
+        ("{package} --to glb --out a.glb --author Anna", "--author requires --to vrm"),
+        ("{package} --out a.iavatar --triangles 1000", "--to glb, vrm, ply or obj"),
     ],
 )
-def test_meshes_that_cannot_be_are_refused(run, call_export, tmp_path, monkeypatch, words, told):
+def test_what_cannot_be_exported_is_refused_and_writes_nothing(
+    run, package, call_export, tmp_path, monkeypatch, line, told
+):
     monkeypatch.chdir(tmp_path)
-    code, said = call_export(run / "avatar.iavatar", *words)
+    code, said = call_export(*line.format(run=run, package=package).split())
     assert code == 2
     assert told in said.err
     assert list(tmp_path.iterdir()) == []

@@ -13,14 +13,18 @@ def run(*arguments):
         return stop.code
 
 
-def test_it_films_and_says_what_comes_next(tmp_path, capsys):
+def test_it_films_says_what_comes_next_and_replaces_its_own_folder_on_request(tmp_path, capsys):
     out = tmp_path / "my [c]" / ("long" * 30)
-    assert run(out, "--frames", 2, "--size", 32, "--background", "plain") == 0
+    words = (out, "--frames", 2, "--size", 32, "--background", "plain")
+    assert run(*words) == 0
     assert (out / "video.mp4").exists()
     command = capsys.readouterr().err.splitlines()[-1]
     assert shlex.split(command) == [
         "ia-ingest", str(out / "video.mp4"), "--poses", str(out / "poses.npz")
     ]  # fmt: skip
+    assert run(*words) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert run(*words, "--overwrite") == 0
 
 
 def test_a_capture_like_a_phones_names_no_preview(tmp_path, capsys):
@@ -39,11 +43,3 @@ def test_numbers_out_of_range_are_named(tmp_path, capsys, option, value):
     assert run(tmp_path / "c", option, value) == 2
     assert option in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
-
-
-def test_an_existing_folder_is_refused_with_advice(tmp_path, capsys):
-    small = ("--frames", 1, "--size", 32)
-    assert run(tmp_path / "c", *small) == 0
-    assert run(tmp_path / "c", *small) == 2
-    assert "--overwrite" in " ".join(capsys.readouterr().err.split())
-    assert run(tmp_path / "c", *small, "--overwrite") == 0

@@ -203,11 +203,6 @@ def test_a_turntable_shows_all_sides_and_ends_where_it_began(frames, player):
         assert np.abs(drawn[picture] - player.render(pose, camera)).mean() < 0.1
 
 
-def test_a_turntable_s_seconds_may_be_left_out(frames):
-    assert len(frames("--turntable", "--fps", "1")) == 6
-    assert len(frames("--turntable", "-3", "--fps", "1")) == 3
-
-
 def test_a_turntable_turns_about_a_motion_while_it_plays(frames, whole, player, novel):
     turning = frames("--poses", novel, "--turntable", "4")
     assert len(whole) == len(turning) == 12
@@ -233,10 +228,16 @@ def test_one_pose_is_one_picture(call_play, package, player, novel, tmp_path):
 
 @pytest.mark.parametrize(
     ("wishes", "count"),
-    [(["--still", 20], 1), (["--still", 20, "--turntable", "2"], 4), (["--turntable", "2"], 4)],
+    [
+        ("--turntable --fps 1", 6),
+        ("--turntable -3 --fps 1", 3),
+        ("--turntable 2 --fps 2 --close-up head", 4),
+        ("--still 20 --close-up head", 1),
+        ("--still 20 --turntable 2 --fps 2", 4),
+    ],
 )
 def test_without_poses_a_still_and_a_turntable_show_the_built_in_motion(frames, wishes, count):
-    assert len(frames(*wishes, "--close-up", "head", "--fps", "2")) == count
+    assert len(frames(*wishes.split())) == count
 
 
 def test_frames_are_clear_unless_a_background_is_wished(frames, novel, tmp_path, rng):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from capture.input_error import InputError
 from instant_avatar.animation.driving_motion import (
     DISTANCE_HEIGHTS,
     FollowingCamera,
@@ -48,38 +47,28 @@ def middle(following, pose):
         ({"orbit_deg": 90.0, "elevation_deg": 30.0}, (np.sqrt(0.75), 0.5, 0)),
     ],
 )
-def test_the_camera_stands_where_its_angles_say(player, following, wishes, direction):
+def test_the_camera_stands_where_its_angles_say_and_looks_at_the_persons_middle(
+    player, following, wishes, direction
+):
     pose, camera = canonical_pose_of(player), following(**wishes)
     pelvis = player.manifest.rest_joints[0]
     at = pelvis + camera.center_above_pelvis_m * np.array([0.0, 1.0, 0.0])
     place = camera.camera_for(pose).center_world
     away = DISTANCE_HEIGHTS * camera.height_m
     np.testing.assert_allclose(place - at, away * np.array(direction), atol=1e-9)
-
-
-def test_the_person_s_middle_stays_in_the_picture_s_middle_from_all_sides(player, following):
-    pose = canonical_pose_of(player)
-    at = middle(following(), pose)
-    for wishes in ({"orbit_deg": 77.0}, {"elevation_deg": 50.0}):
-        np.testing.assert_allclose(middle(following(**wishes), pose), at, atol=1e-9)
-        assert following(**wishes).camera_for(pose).project(at) == pytest.approx([48.0, 48.0])
+    assert camera.camera_for(pose).project(at) == pytest.approx([48.0, 48.0])
 
 
 def test_a_turntable_goes_round_once_in_its_time(player, following):
     pose = canonical_pose_of(player)
-    turning = following(turn_period_s=8.0)
-    for seconds, degrees in ((0.0, 0.0), (2.0, 90.0), (5.0, 225.0), (8.0, 0.0)):
+    for period, seconds, degrees in (
+        (8.0, 0.0, 0.0), (8.0, 2.0, 90.0), (8.0, 5.0, 225.0), (8.0, 8.0, 0.0), (-8.0, 2.0, -90.0),
+    ):  # fmt: skip
         np.testing.assert_allclose(
-            turning.camera_for(pose, seconds).camera_from_world,
+            following(turn_period_s=period).camera_for(pose, seconds).camera_from_world,
             following(orbit_deg=degrees).camera_for(pose).camera_from_world,
             atol=1e-9,
         )
-    backwards = following(turn_period_s=-8.0).camera_for(pose, 2.0)
-    np.testing.assert_allclose(
-        backwards.camera_from_world,
-        following(orbit_deg=-90.0).camera_for(pose).camera_from_world,
-        atol=1e-9,
-    )
 
 
 def test_a_close_up_keeps_its_joint_in_the_middle(player, following, bent_arm):
@@ -131,12 +120,6 @@ def test_the_camera_does_not_depend_on_where_the_trackers_world_lies(player, rng
     back = before.camera_from_world[:3, :3] @ turn.T
     np.testing.assert_allclose(after.camera_from_world[:3, :3], back, atol=1e-9)
     np.testing.assert_allclose(after.center_world, turn @ before.center_world + shift, atol=1e-9)
-
-
-def test_wishes_that_cannot_be_are_named():
-    for wishes in ({"orbit_deg": np.inf}, {"elevation_deg": np.nan}):
-        with pytest.raises(InputError, match="--"):
-            Viewpoint(**wishes)
 
 
 def motion_of(rate, count, rng, **changes):

@@ -151,6 +151,8 @@ def test_a_provider_that_is_not_there_is_named(call_play, package):
         (["--still", "12"], "0 to 11"),
         (["--close-up", "nose"], "left_hand"),
         (["--turntable", "0"], "--turntable"),
+        (["--orbit", "inf"], "--orbit"),
+        (["--elevation", "nan"], "--elevation"),
         (["--bench", "--out", "a.webm"], "leave out --out"),
         (["--bench", "--verify"], "leave out --"),
         (["--camera", "none.npz", "--orbit", "-20"], "leave out --orbit"),

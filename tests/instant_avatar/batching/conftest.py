@@ -12,34 +12,24 @@ from instant_avatar.batching.capture_discovery import BatchCapture
 from instant_avatar.batching.ingest_attempt import Attempt, record_of
 
 
-@pytest.fixture
-def named() -> Callable[..., BatchCapture]:
-    """Makes a capture of which only the name and the fingerprints count."""
-
-    def make(name: str, *, input_key: str = "input", options_key: str = "options") -> BatchCapture:
-        return BatchCapture(
-            name=name, video=f"/{name}.mp4", input_key=input_key, options_key=options_key
-        )
-
-    return make
+def named(name: str, *, input_key: str = "input", options_key: str = "options") -> BatchCapture:
+    """A capture of which only the name and the fingerprints count."""
+    return BatchCapture(
+        name=name, video=f"/{name}.mp4", input_key=input_key, options_key=options_key
+    )
 
 
-@pytest.fixture
-def ended() -> Callable[..., Attempt]:
-    """Makes the attempt of a capture that ended with an exit code."""
-
-    def make(capture: BatchCapture, code: int | None = 0, psnr: float = 30.0) -> Attempt:
-        figures = {"psnr": psnr, "verdict": "sharp"} if code == 0 else {}
-        files = {"avatar.iavatar": capture.name.encode()} if code == 0 else {"ingest.log": b"why"}
-        cause = "" if code == 0 else "no <person>"
-        record = record_of(capture, code, cause, wall_s=60.0, figures=figures)
-        return Attempt(record=record, files=files)
-
-    return make
+def ended(capture: BatchCapture, code: int | None = 0, psnr: float = 30.0) -> Attempt:
+    """The attempt of a capture that ended with an exit code."""
+    figures = {"psnr": psnr, "verdict": "sharp"} if code == 0 else {}
+    files = {"avatar.iavatar": capture.name.encode()} if code == 0 else {"ingest.log": b"why"}
+    cause = "" if code == 0 else "no <person>"
+    record = record_of(capture, code, cause, wall_s=60.0, figures=figures)
+    return Attempt(record=record, files=files)
 
 
 @pytest.fixture
-def scripted(monkeypatch, ended) -> list[str]:
+def scripted(monkeypatch) -> list[str]:
     """Attempts of ia-batch end at once: with 2 if the name has `bad` in it, with 1 if `weak`.
 
     Returns:

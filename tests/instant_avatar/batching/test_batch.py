@@ -11,6 +11,7 @@ import pytest
 
 from instant_avatar import batch
 from instant_avatar.cli import command_line
+from tests.instant_avatar.batching.conftest import ended
 
 ROOT = Path(batch.__file__).parents[1]
 HOOK = """
@@ -108,7 +109,7 @@ def test_a_broken_capture_costs_a_line_and_what_ended_is_not_learnt_again(
     assert batch.main([str(tmp_path / "films" / "a"), "--out", str(out)]) == 0
 
 
-def test_ctrl_c_keeps_what_is_done(tmp_path, copies, scripted, monkeypatch, ended):
+def test_ctrl_c_keeps_what_is_done(tmp_path, copies, scripted, monkeypatch):
     copies(tmp_path / "films", ["a", "b"])
     words = [str(tmp_path / "films"), "--out", str(tmp_path / "out")]
 

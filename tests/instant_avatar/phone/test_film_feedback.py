@@ -15,25 +15,20 @@ from preprocess.tracking.keypoints import CroppedMask, PersonKeypoints
 
 
 @pytest.fixture
-def film(tmp_path):
-    return Film("a browser", tmp_path / "anna", ".mp4", size=None, adds=False)
+def advice():
+    """The sentences for the film's page."""
+    return []
 
 
 @pytest.fixture
-def advice(film, monkeypatch):
-    """The sentences for its page."""
-    sentences: list[str] = []
+def reader(advice, tmp_path, monkeypatch):
+    film = Film("a browser", tmp_path / "anna", ".mp4", size=None, adds=False)
 
     def tell(kind, **content):
         if kind == "advice":
-            sentences.append(content["text"])
+            advice.append(content["text"])
 
     monkeypatch.setattr(film, "tell", tell)
-    return sentences
-
-
-@pytest.fixture
-def reader(film):
     return FilmFeedback(film)
 
 

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from capture.atomic_files import LIST_NAME as LIST
-from capture.input_error import InputError
 from instant_avatar.studio import staging
 from instant_avatar.studio.actor import Actor
 from instant_avatar.studio.furnished_room import FurnishedRoom
@@ -36,7 +35,8 @@ def test_the_phone_walks_an_arc_and_holds_the_person_in_the_picture(subject):
     assert 2.4 < away.min() < away.max() < 3.2
     second = np.diff(eyes, 2, axis=0)
     assert 0.002 < np.sqrt((second**2).mean()) < 0.03  # a hand that trembles
-    for row, camera in enumerate(cameras):
+    for row in range(0, 40, 3):
+        camera = cameras[row]
         assert camera.size_px == (960, 540)
         pixels = camera.project(actor.vertices(motion[row]))
         assert pixels.min() > 5.0
@@ -62,13 +62,6 @@ def test_the_cameras_are_written_to_the_ground_truth_only(capture):
         world = shaped.with_pose(truth[row]).joints()
         view = camera.camera_from_world
         np.testing.assert_allclose(inside, world @ view[:3, :3].T + view[:3, 3], atol=1e-9)
-
-
-def test_a_painted_backdrop_is_refused_where_the_camera_moves(tmp_path):
-    for background in ("plain", "clutter"):
-        config = ShootConfig(motion="walkaround", background=background)
-        with pytest.raises(InputError, match=r"room or tiles"):
-            film_capture(tmp_path / "c", config)
 
 
 def test_the_room_is_closed_and_the_floor_is_darker_about_the_feet():

@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.input_error import InputError
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
 from preprocess.body.parametric_body import load_body_model
@@ -64,11 +63,3 @@ def test_the_exact_twin_can_be_opened_and_so_can_the_novel_poses(capture):
     )
     novel = open_capture(CaptureInputs(video=truth / "novel", body=truth / "body.npz"))
     assert len([s for s in novel.observations() if isinstance(s, Observation)]) == 12
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"motion": "walkaround"}, {"background": "room"}, {"pose_noise_deg": 1.0}]
-)
-def test_what_a_phone_on_a_tripod_cannot_film_is_refused(tmp_path, wrong):
-    with pytest.raises(InputError, match="--like-a-phone"):
-        film_capture(tmp_path / "c", ShootConfig(like_a_phone=True, **wrong))
