@@ -10,9 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from capture.input_error import InputError
-from preprocess.poses.motion_builder import SMPLX_PELVIS, place_in_camera_world
+from preprocess.poses.motion_builder import SMPLX_PELVIS, fill_gaps
 from preprocess.poses.pose_format_registry import read_poses
-from tests.preprocess.poses.test_trackers import World, npz, own_camera
+from tests.preprocess.poses.test_trackers import World, assert_at_the_truth, npz
 
 
 @pytest.fixture
@@ -20,20 +20,8 @@ def world(tmp_path, truth, shaped, joblib_bytes) -> World:
     return World(tmp_path, truth, shaped.joints, joblib_bytes)
 
 
-def seen_from(w: World) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cameras that turn and move, and the truth told in the world round them: roots and places."""
-    turn = Rotation.from_rotvec(np.linspace([0.1, 0.0, 0.2], [0.3, 2.0, -0.1], 40))
-    cameras = np.tile(np.eye(4), (40, 1, 1))
-    cameras[:, :3, :3] = turn.as_matrix()
-    cameras[:, :3, 3] = np.linspace([1.0, 2.0, 3.0], [-2.0, 0.0, 4.0], 40)
-    back = turn.inv()
-    roots = (back * Rotation.from_rotvec(w.thetas[:, :3])).as_rotvec()
-    places = back.apply(w.places + w.rest[0] - cameras[:, :3, 3]) - w.rest[0]
-    return cameras, roots, places
-
-
 def slahmr(w: World) -> Path:
-    cameras, roots, places = seen_from(w)
+    cameras, roots, places = w.seen_from_cameras()
     both = {
         "trans": places, "root_orient": roots, "pose_body": w.thetas[:, 3:66],
         "betas": np.pad(w.betas[0], (0, 6)), "cam_R": cameras[:, :3, :3],
@@ -49,7 +37,7 @@ def slahmr(w: World) -> Path:
 
 
 def dpw(w: World) -> Path:
-    cameras, roots, places = seen_from(w)
+    cameras, roots, places = w.seen_from_cameras()
     poses = np.column_stack([roots, w.thetas[:, 3:]])
     content = {
         "poses": [poses], "trans": [places], "betas": [w.betas[0]], "genders": ["m"],
@@ -59,7 +47,7 @@ def dpw(w: World) -> Path:
 
 
 def emdb(w: World) -> Path:
-    cameras, roots, places = seen_from(w)
+    cameras, roots, places = w.seen_from_cameras()
     lens = {"intrinsics": np.diag([500.0, 500.0, 1.0]), "extrinsics": cameras}
     smpl = {"poses_root": roots, "poses_body": w.thetas[:, 3:], "trans": places}
     content = {
@@ -147,10 +135,7 @@ def test_a_file_gives_the_joints_that_were_written_to_a_millimetre(world, shaped
     motion = read_poses(write(world))
     assert motion.body_model == ("smplx" if write in (ex_avatar, file_a_frame) else "smpl")
     assert motion.valid.all()
-    motion = place_in_camera_world(motion, shaped, own_camera(motion), cameras_given=False)
-    away = np.linalg.norm(joints_of(motion) - joints_of(world.truth), axis=-1)
-    assert away.shape == (40, 24)
-    assert away.max() < 1e-3
+    assert_at_the_truth(motion, world, shaped, joints_of)
 
 
 def test_frames_of_a_folder_belong_to_who_is_in_their_names(world):
@@ -182,7 +167,7 @@ def test_people_whom_slahmr_lost_are_lost_and_cameras_stay_with_their_rows(world
     path = world.write("gaps.npz", npz(**arrays))
     motion = read_poses(path, person="0")
     assert "3 poses that SLAHMR or 3DPW had lost" in motion.note
-    cameras, _, _ = seen_from(world)
+    cameras, _, _ = world.seen_from_cameras()
     np.testing.assert_allclose(motion.camera_from_world, cameras)
 
 
@@ -220,8 +205,6 @@ def test_frames_whose_poses_have_other_shapes_do_not_fit_together(world):
 
 
 def test_a_motion_with_moving_cameras_of_its_own_is_not_bridged_where_a_camera_is_missing(truth):
-    from preprocess.poses.motion_builder import fill_gaps
-
     some = replace(
         truth, frames=np.arange(40) * 2, camera_from_world=np.tile(np.eye(4), (40, 1, 1))
     )

@@ -46,6 +46,16 @@ class World:
         turned = np.einsum("nab,b->na", self.matrices[:, 0], anchor - pelvis)
         return pelvis + self.places + turned
 
+    def seen_from_cameras(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Cameras that turn and move; roots and places of the truth in the world round them."""
+        turn = Rotation.from_rotvec(np.linspace([0.1, 0.0, 0.2], [0.3, 2.0, -0.1], 40))
+        cameras = np.tile(np.eye(4), (40, 1, 1))  # camera from world: x = R y + t
+        cameras[:, :3, :3] = turn.as_matrix()
+        cameras[:, :3, 3] = np.linspace([1.0, 2.0, 3.0], [-2.0, 0.0, 4.0], 40)
+        roots = (turn.inv() * Rotation.from_rotvec(self.thetas[:, :3])).as_rotvec()
+        moved = self.places + self.rest[0] - cameras[:, :3, 3]
+        return cameras, roots, turn.inv().apply(moved) - self.rest[0]
+
     def write(self, name: str, data: bytes) -> Path:
         path = self.folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -71,20 +81,16 @@ def instant_avatar(w: World) -> Path:
 
 def superset(w: World) -> Path:
     """Our own: rows in any order, one of them lost, each seen by a camera that moves."""
-    turn = Rotation.from_rotvec(np.linspace([0.1, 0.0, 0.2], [0.3, 2.0, -0.1], 40))
-    shift = np.linspace([1.0, 2.0, 3.0], [-2.0, 0.0, 4.0], 40)
-    camera = np.tile(np.eye(4), (40, 1, 1))  # camera from world: x = R y + t
-    camera[:, :3, :3], camera[:, :3, 3] = turn.as_matrix(), shift
-    pelvis = w.rest[0]
+    cameras, roots, places = w.seen_from_cameras()
     arrays = {
-        "global_orient": (turn.inv() * Rotation.from_rotvec(w.thetas[:, :3])).as_rotvec(),
+        "global_orient": roots,
         "body_pose": w.thetas[:, 3:],
-        "transl": turn.inv().apply(pelvis + w.places - shift) - pelvis,
+        "transl": places,
         "frame": np.arange(40),
         "time": np.arange(40) / 30.0,
         "valid": np.ones(40, dtype=bool),
         "K": np.tile(np.array([[500.0, 0, 320], [0, 500, 180], [0, 0, 1]]), (40, 1, 1)),
-        "camera": camera,
+        "camera": cameras,
     }
     again = {key: np.concatenate([rows, rows[:1]]) for key, rows in arrays.items()}
     again["valid"][-1], again["frame"][-1] = False, 40
@@ -296,6 +302,14 @@ def own_camera(motion: Motion) -> CameraTrack:
     return CameraTrack(cameras=(Camera.from_intrinsic(matrix, SIZE),), source="its own")
 
 
+def assert_at_the_truth(motion: Motion, world: World, shaped, joints_of) -> None:
+    """To a millimetre, as the tracker's own camera sees the joints."""
+    motion = place_in_camera_world(motion, shaped, own_camera(motion), cameras_given=False)
+    away = np.linalg.norm(joints_of(motion)[:40] - joints_of(world.truth), axis=-1)
+    assert away.shape == (40, 24)
+    assert away.max() < 1e-3
+
+
 HAVE_A_WORLD = (wham, gvhmr, prompthmr, prompthmr_numbers, superset, amass)
 """Those whose poses in the world are read as such, and two that have no others."""
 
@@ -315,9 +329,7 @@ def test_a_file_gives_the_joints_that_were_written_to_a_millimetre(
         np.testing.assert_allclose(motion.betas, world.truth.betas, atol=1e-6)
     if write in (wham, easymocap, gvhmr, amass_smplx):
         assert motion.body_model == ("smplx" if write in (gvhmr, amass_smplx) else "smpl")
-    motion = place_in_camera_world(motion, shaped, own_camera(motion), cameras_given=False)
-    away = np.linalg.norm(joints_of(motion)[:40] - joints_of(world.truth), axis=-1)
-    assert away.max() < 1e-3
+    assert_at_the_truth(motion, world, shaped, joints_of)
 
 
 def test_rows_without_numbers_have_times_or_are_matched_by_order(world):
