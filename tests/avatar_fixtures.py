@@ -146,10 +146,8 @@ def render_on_white(
     return composite_over(rgb, alpha), (alpha * 255.0 + 0.5).astype(np.uint8)
 
 
-@pytest.fixture(scope="session")
-def clip() -> Clip:
-    actor = Actor.of(1, 0)
-    camera = static_camera(actor, 72)
+def film_turning(actor: Actor, camera: Camera, *, frames: int) -> Clip:
+    """The actor, turning once before the camera."""
 
     def observed(index: int, pose: BodyPose) -> Observation:
         rgb, alpha = render_on_white(actor, pose, camera)
@@ -158,12 +156,17 @@ def clip() -> Clip:
             frame=frame, alpha=alpha.astype(np.float32) / 255.0, pose=pose, camera=camera
         )
 
-    filmed = staging.turning_motion(actor, frames=24, fps=30.0, turns=1.0, seed=0)
-    novel = staging.novel_poses(actor)
+    filmed = staging.turning_motion(actor, frames=frames, fps=30.0, turns=1.0, seed=0)
     return Clip(
         observations=[observed(i, filmed[i]) for i in range(len(filmed))],
-        novel=observed(100, novel[0]),
+        novel=observed(100, staging.novel_poses(actor)[0]),
     )
+
+
+@pytest.fixture(scope="session")
+def clip() -> Clip:
+    actor = Actor.of(1, 0)
+    return film_turning(actor, static_camera(actor, 72), frames=24)
 
 
 LEARNT_STEPS, MARK_EVERY = 400, 100
@@ -187,14 +190,17 @@ class Learnt:
     marks: list[list[HeldOutScore]]
 
 
-def untaught(rig: Rig, clip: Clip) -> tuple[Trainer, list[HeldOutFrame]]:
+COARSE = TrainConfig(
+    rays=512, sample_step_m=0.015, finest_m=0.03, levels=6, table_size=1 << 14, refine_poses=False
+)
+
+
+def untaught(
+    rig: Rig, clip: Clip, config: TrainConfig = COARSE, *, stride: int = 6
+) -> tuple[Trainer, list[HeldOutFrame]]:
     """A trainer that has a clip's frames, and those that are held out."""
-    config = TrainConfig(
-        rays=512, sample_step_m=0.015, finest_m=0.03, levels=6, table_size=1 << 14,
-        refine_poses=False,
-    )  # fmt: skip
     trainer, held = Trainer(rig, config), []
-    for item in prepare_stream(iter(clip.observations), rig, stride=6, total=None):
+    for item in prepare_stream(iter(clip.observations), rig, stride=stride, total=None):
         if isinstance(item, HeldOutFrame):
             held.append(item)
         else:

@@ -1,9 +1,21 @@
-"""Warp cells: canonical points come back from where skinning carried them."""
+"""Warp cells: points come back from where skinning carried them; samples that a cell invents."""
+
+import math
 
 import numpy as np
+import pytest
 import torch
 
-from avatar.correspondence_grid import CorrespondenceGrid
+from avatar.correspondence_grid import (
+    MAX_RAY_DISTANCE_M,
+    CorrespondenceCheck,
+    CorrespondenceGrid,
+    cull_cells,
+)
+from avatar.kernels import operations
+from avatar.kernels.operands import MarchSettings, RayBatch
+from avatar.occupancy_grid import OccupancyGrid
+from avatar.render import correspondence_tables
 from avatar.rig import CLOTHING_BAND_M
 from baselines import torch_correspondence, torch_reference
 
@@ -159,3 +171,60 @@ def test_a_wider_band_holds_all_that_a_narrow_one_holds_and_more(rig, rng, bent_
     error = nearest_root_error(wide, targets, canonical)
     assert far.sum() > 1000
     assert np.mean(error[far] < 2e-3) > 0.99
+
+
+def folded() -> np.ndarray:
+    """Elbows bent by 140°, the arms along the body, a knee drawn up."""
+    rotations = np.zeros((23, 3))
+    rotations[15], rotations[16] = (0.0, 0.0, -1.2), (0.0, 0.0, 1.2)
+    rotations[17], rotations[18] = (0.0, -2.4, 0.0), (0.0, 2.4, 0.0)
+    rotations[0], rotations[3] = (-1.6, 0.0, 0.1), (2.2, 0.0, 0.0)
+    return rotations
+
+
+@pytest.fixture(scope="module")
+def seen(rig):
+    """Samples along 4,000 parallel rays through a folded body, and how far off each is carried."""
+    rotations, generator = folded(), torch.Generator().manual_seed(0)
+    grid = OccupancyGrid(rig).density_grid
+    cells = cull_cells(CorrespondenceGrid.solve(rig, rotations), grid)
+    low = torch.from_numpy(cells.low)
+    size = torch.tensor(cells.packed_cells.shape) * cells.cell_m
+    origins = low + size * torch.rand(4000, 3, generator=generator)
+    origins[:, 2] = low[2] - 0.1
+    count = len(origins)
+    along, half = torch.tensor([0.0, 0.0, 1.0]), torch.full((count,), 0.5)
+    slots = torch.zeros(count, dtype=torch.int32)
+    rays = RayBatch(origins, along.expand(count, 3).contiguous(), slots, half)
+    samples, _ = operations.march_resumable(
+        rays, correspondence_tables(cells), grid, MarchSettings(0.01, math.inf, 400)
+    )
+    carried = posed(rig, rotations, samples.points.numpy())
+    ray = torch.repeat_interleave(torch.arange(count), samples.counts)
+    off = (carried - origins[ray])[:, :2].norm(dim=1)
+    strays = CorrespondenceCheck.for_pose(rig, rotations, cells)
+    return strays, samples, rays, off
+
+
+def test_strays_are_samples_that_skinning_carries_elsewhere(seen):
+    strays, samples, rays, off = seen
+    found = strays.find_spurious(samples, rays)
+    assert len(found) > 20
+    assert (off[found] > 0.99 * MAX_RAY_DISTANCE_M).all()
+
+
+def test_nearly_every_sample_that_is_carried_far_is_found(seen):
+    """A warp may be right in all corners of its cell and wrong between them, but hardly ever."""
+    strays, samples, rays, off = seen
+    far = off > 2.0 * MAX_RAY_DISTANCE_M
+    found = torch.zeros_like(far)
+    found[strays.find_spurious(samples, rays)] = True
+    assert (found & far).sum() > 0.98 * far.sum()
+
+
+def test_few_cells_are_doubtful_and_none_in_the_canonical_pose(rig, seen):
+    strays = seen[0]
+    assert 0 < strays.unreliable_rows.sum() < 0.2 * len(strays.unreliable_rows)
+    canonical = rig.canonical_rotations
+    cells = CorrespondenceGrid.solve(rig, canonical)
+    assert not CorrespondenceCheck.for_pose(rig, canonical, cells).unreliable_rows.any()

@@ -10,8 +10,10 @@ from scipy.spatial import KDTree
 
 from avatar.rig import Rig
 from capture.camera import Camera
-from export.bake.bake_tables import BakeConfig, bake_tables, sample_field
+from export import build
+from export.bake.bake_tables import BakeConfig
 from export.build import ExportReport, export_field
+from export.package.package_file import AvatarPackage, read_package
 from export.package.player_tables import PlayerTables
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.kinematics import body_from_rest
@@ -155,12 +157,6 @@ def coarse() -> BakeConfig:
 
 
 @pytest.fixture(scope="session")
-def tables(stand_in: StandIn, coarse: BakeConfig) -> PlayerTables:
-    grid = sample_field(stand_in.field_at, stand_in.rig, occupied=stand_in.occupied, config=coarse)
-    return bake_tables(grid, stand_in.rig, coarse)
-
-
-@pytest.fixture(scope="session")
 def views(stand_in: StandIn, bent: BodyPose) -> dict[str, tuple[BodyPose, Camera]]:
     view = camera_of(64, 80)
     return {"canonical": (stand_in.canonical, view), "bent": (bent, view)}
@@ -191,3 +187,20 @@ def exported(stand_in: StandIn, coarse: BakeConfig, views, truth, tmp_path_facto
     )
     assert isinstance(report, ExportReport)
     return report
+
+
+@pytest.fixture(scope="session")
+def package(exported: ExportReport) -> AvatarPackage:
+    return read_package(exported.path)
+
+
+@pytest.fixture(scope="session")
+def tables(package: AvatarPackage) -> PlayerTables:
+    return package.tables["hq"]
+
+
+@pytest.fixture
+def baked_already(tables: PlayerTables, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Exports of the stand-in take the tables of the package."""
+    monkeypatch.setattr(build, "sample_field", lambda *given, **more: None)
+    monkeypatch.setattr(build, "bake_tables", lambda *given: tables)

@@ -1,3 +1,5 @@
+"""The player's pictures against a reference, a volume renderer, and themselves in close-ups."""
+
 import os
 import subprocess
 import sys
@@ -19,6 +21,7 @@ from export.graph.player_graph import build_graph
 from export.package.package_file import COARSE_GRAPH, read_package
 from export.package.player_tables import QUALITY_TIERS, RenderSettings
 from export.player import PictureDifference, Player, premultiply
+from export.player_inputs import ResolutionLimit, downscale_camera, upscale_picture
 from export.skinned_mesh import LevelSet, extract_mesh, skinning_weights
 from preprocess.body.body_pose import BodyPose
 
@@ -205,6 +208,7 @@ def test_any_size_can_be_drawn(player, bent, camera, size):
     picture = player.render(bent, camera(*size))
     assert picture.shape == (size[1], size[0], 4)
     assert picture.dtype == np.uint8
+    assert max(player.render(bent, camera(*size), size=np.int64(30)).shape) == 30
 
 
 def test_moving_person_and_camera_together_changes_nothing(player, stand_in, bent, camera):
@@ -236,11 +240,7 @@ def test_an_avatar_out_of_sight_leaves_the_picture_empty(player, bent, camera):
 
 @pytest.mark.parametrize("zoom", [1.0, 3.0, 10.0, 24.0])
 def test_close_ups_have_no_gaps_between_surfels(player, stand_in, camera, zoom):
-    view = camera(160, 160, distance_m=0.75)
-    (fx, fy), (x, y) = view.focal_px, view.center_px
-    close = replace(  # about the same pixel of the chest
-        view, focal_px=(fx * zoom, fy * zoom), center_px=(x, 45.0 + (y - 45.0) * zoom)
-    )
+    close = nearer(camera(160, 160, distance_m=0.75), zoom)
     alpha = player.render(stand_in.canonical, close)[..., 3]
     assert alpha[30:60, 65:95].min() > 245
     assert zoom == 1.0 or (alpha > 245).mean() > 0.9
@@ -253,29 +253,22 @@ def test_more_samples_converge(player, bent, camera):
     assert errors[0] > errors[1] > errors[2]
 
 
-def test_inputs_that_cannot_be_drawn_are_refused(player, bent, camera):
-    with pytest.raises(InputError, match="distortion"):
-        player.render(bent, replace(camera(9, 9), distortion=(0.1,)))
-    with pytest.raises(InputError, match="samples"):
-        player.render(bent, camera(9, 9), samples=0)
-
-
 @pytest.mark.parametrize(
-    ("change", "size", "said"),
+    ("change", "asked", "said"),
     [
-        ({"focal_px": (np.nan, 100.0)}, None, "focal"),
-        ({"focal_px": (0.0, 0.0)}, None, "above 0"),
-        ({"center_px": (4.0, np.inf)}, None, "center"),
-        ({"camera_from_world": np.full((4, 4), np.nan)}, None, "camera_from_world holds NaN"),
-        ({}, 0, "size is 0"),
-        ({}, (5, -3), "size"),
+        ({"distortion": (0.1,)}, {}, "distortion"),
+        ({"focal_px": (np.nan, 100.0)}, {}, "focal"),
+        ({"focal_px": (0.0, 0.0)}, {}, "above 0"),
+        ({"center_px": (4.0, np.inf)}, {}, "center"),
+        ({"camera_from_world": np.full((4, 4), np.nan)}, {}, "camera_from_world holds NaN"),
+        ({}, {"size": 0}, "size is 0"),
+        ({}, {"size": (5, -3)}, "size"),
+        ({}, {"samples": 0}, "samples"),
     ],
 )
-def test_numbers_that_are_none_are_refused_before_they_are_drawn(
-    player, bent, camera, change, size, said
-):
+def test_inputs_that_cannot_be_drawn_are_refused(player, bent, camera, change, asked, said):
     with pytest.raises(InputError, match=said):
-        player.render(bent, replace(camera(9, 9), **change), size=size)
+        player.render(bent, replace(camera(9, 9), **change), **asked)
 
 
 @pytest.mark.parametrize(
@@ -297,10 +290,6 @@ def test_an_onnxruntime_that_is_too_old_is_named(exported, monkeypatch):
     monkeypatch.setattr(onnxruntime, "SessionOptions", Older)
     with pytest.raises(InputError, match=r"too old for the player; 1\.24 or newer"):
         Player.load(exported.path)
-
-
-def test_sizes_may_be_numpys_integers(player, bent, camera):
-    assert player.render(bent, camera(90, 60), size=np.int64(30)).shape == (20, 30, 4)
 
 
 def test_tetrahedra_reproduce_linear_colors_and_constant_density(tables):
@@ -378,3 +367,82 @@ def test_a_package_of_two_points_runs_every_graph_and_is_small(camera, tmp_path)
         drawn = Player.load(path, tier=tier).render(BodyPose.rest(), view)
         assert drawn.shape == (64, 64, 4)
         assert not drawn[..., 3].any()  # its brick is empty
+
+
+@pytest.fixture(scope="module")
+def close_ups(exported, player, tables):
+    return ResolutionLimit(tables, player.manifest.tiers["hq"].settings)
+
+
+def nearer(view, times):
+    """Enlarge the picture about the same pixel of the chest."""
+    (fx, fy), (x, y) = view.focal_px, view.center_px
+    return replace(
+        view, focal_px=(fx * times, fy * times), center_px=(x, 45.0 + (y - 45.0) * times)
+    )
+
+
+@pytest.mark.parametrize("zoom", [25.0, 60.0, 400.0])
+def test_what_surfels_cannot_cover_is_drawn_coarser_and_without_gaps(
+    player, close_ups, stand_in, camera, zoom
+):
+    view = nearer(camera(160, 160, distance_m=0.75), zoom)
+    assert close_ups.downscale_factor(player.bones(stand_in.canonical, view), view) > 1.0
+    picture = player.render(stand_in.canonical, view)
+    assert picture.shape == (160, 160, 4)
+    assert picture[..., 3].min() > 245
+
+
+def test_a_usual_picture_is_drawn_as_it_is(player, close_ups, stand_in, bent, camera):
+    for pose in (stand_in.canonical, bent):
+        for view in (camera(160, 200), camera(1080, 1080), camera(160, 160, distance_m=0.75)):
+            assert close_ups.downscale_factor(player.bones(pose, view), view) == 1.0
+
+
+def test_what_lies_behind_the_camera_makes_no_close_up(player, close_ups, stand_in, camera):
+    view = nearer(camera(160, 160), 60.0)
+    behind = replace(stand_in.canonical, root_translation=np.array([0.0, 0.0, 9.0]))
+    assert close_ups.downscale_factor(player.bones(behind, view), view) == 1.0
+
+
+def test_a_coarser_picture_enlarged_shows_what_the_finer_one_shows(player, stand_in, camera):
+    view = nearer(camera(160, 160, distance_m=0.75), 12.0)
+    fine = player.render(stand_in.canonical, view)
+    rough = upscale_picture(
+        player.render(stand_in.canonical, downscale_camera(view, 1.7)), (160, 160), 1.7
+    )
+    difference = PictureDifference.of(premultiply(fine), premultiply(rough))
+    assert np.abs(premultiply(fine) - premultiply(rough)).mean() < 1.0 / 255.0
+    assert difference.close_fraction > 0.9
+
+
+def test_enlarging_keeps_ramps_where_they_are():
+    """Pixel centers of the coarse picture lie at (i + 0.5) · times of the fine one."""
+    times, (width, height) = 2.5, (50, 20)
+    ramp = np.full((8, 20, 4), 255, dtype=np.uint8)
+    ramp[..., 0] = 5 + 10 * np.arange(20)
+    fine = upscale_picture(ramp, (width, height), times)
+    expected = 5 + 10 * ((np.arange(width) + 0.5) / times - 0.5)
+    inside = slice(2, -2)  # outside the outer pixels' centers there is nothing to interpolate
+    assert fine.shape == (height, width, 4)
+    assert np.abs(fine[:, inside, 0] - expected[inside]).max() <= 0.5
+    assert (fine[..., 1:] == 255).all()
+
+
+def test_colors_do_not_fade_towards_what_is_transparent():
+    picture = np.zeros((4, 6, 4), dtype=np.uint8)
+    picture[:, :3] = [200, 100, 50, 255]
+    fine = upscale_picture(picture, (24, 16), 4.0)
+    seen = fine[..., 3] > 8
+    assert seen.any()
+    assert not seen.all()
+    assert np.abs(fine[seen][:, :3].astype(int) - [200, 100, 50]).max() <= 1
+    assert not fine[fine[..., 3] == 0].any()
+
+
+def test_the_coarse_camera_sees_the_same_field_of_view(camera):
+    view = camera(333, 200)
+    rough = downscale_camera(view, 3.3)
+    point = view.ray_directions(np.array([[100.0, 50.0]]))
+    assert np.allclose(point, rough.ray_directions(np.array([[100.0, 50.0]]) / 3.3))
+    assert rough.size_px == (101, 61)

@@ -1,4 +1,4 @@
-"""What was seen: a body before a camera, in poses whose answer is known."""
+"""What was seen: a body before a camera, in known poses; and the coach's sentence about it."""
 
 import numpy as np
 import pytest
@@ -42,12 +42,15 @@ def test_the_left_side_is_the_persons_left(coverage):
 
 def test_who_is_seen_from_the_front_has_an_unseen_back(shaped, observed, coverage):
     coverage.add(observed())
-    parts = coverage.by_part()
+    parts, patches = coverage.by_part(), coverage.patches
     for name in ("torso", "head", "left thigh", "right shin", "left upper arm"):
         assert parts[name]["front"] > 0.8
         assert parts[name]["back"] == 0.0
     assert 0.3 < coverage.seen_share < 0.5
-    _, normals = pose_patches(coverage.patches, shaped.with_pose(observed().pose).world_from_rest())
+    areas = [float(patches.areas[patches.parts == k].sum()) for k in range(len(PART_NAMES))]
+    whole = np.average([parts[name]["seen"] for name in PART_NAMES], weights=areas)
+    assert whole == pytest.approx(coverage.seen_share, rel=1e-5)
+    _, normals = pose_patches(patches, shaped.with_pose(observed().pose).world_from_rest())
     # no skin is seen at more than 72°, and the body spans 15° of the camera's view to each side
     assert not (coverage.cosines[normals[:, 2] < np.cos(np.radians(72 + 15))] > 0.0).any()
 
@@ -110,17 +113,83 @@ def test_what_was_seen_survives_a_checkpoint(shaped, observed, coverage):
     assert np.array_equal(again.stages, coverage.stages)
     assert np.abs(again.cosines - coverage.cosines).max() < 0.5 / 255.0 + 1e-6
     assert again.seen_share == coverage.seen_share
+    of_another_body = Coverage(shaped)
+    of_another_body.merge_state(coverage.to_state() | {"stages": "BAQE"})
+    assert of_another_body.seen_share == 0.0
 
 
-def test_notes_of_another_body_count_nothing(shaped, coverage):
-    notes = Coverage(shaped).to_state() | {"stages": "BAQE"}
-    coverage.merge_state(notes)
-    assert coverage.seen_share == 0.0
+def without(
+    coverage: Coverage, where: np.ndarray, stage: VisibilityStage = VisibilityStage.FACING_AWAY
+) -> Coverage:
+    """Everything is seen squarely but some patches, which came only so far."""
+    coverage.stages[:] = np.where(where, stage, VisibilityStage.SEEN)
+    coverage.cosines[:] = np.where(where, 0.0, 1.0)
+    return coverage
 
 
-def test_shares_of_parts_make_up_the_share_of_the_whole(observed, coverage):
-    coverage.add(observed(turned=0.7))
-    patches, parts = coverage.patches, coverage.by_part()
-    areas = [float(patches.areas[patches.parts == k].sum()) for k in range(len(PART_NAMES))]
-    whole = np.average([parts[name]["seen"] for name in PART_NAMES], weights=areas)
-    assert whole == pytest.approx(coverage.seen_share, rel=1e-5)
+def here(coverage: Coverage, *parts: str, side: str | None = None) -> np.ndarray:
+    """The patches of some parts (all parts if none is named), on one side of them or on all."""
+    patches = coverage.patches
+    where = np.isin(patches.parts, [PART_NAMES.index(part) for part in parts or PART_NAMES])
+    return where if side is None else where & (patches.sides == SIDE_NAMES.index(side))
+
+
+def arm(whose: str) -> tuple[str, str, str]:
+    return f"{whose} upper arm", f"{whose} forearm", f"{whose} hand"
+
+
+@pytest.mark.parametrize(
+    ("turned", "sentence"),
+    [
+        (0.0, "Turn until your back has been seen."),
+        (np.pi, "Face the camera: your front was never seen."),
+        (-np.pi / 2, "Turn until your right side has been seen."),
+        (np.pi / 2, "Turn until your left side has been seen."),
+    ],
+)
+def test_the_side_is_the_persons_and_opposite_to_the_seen_one(observed, coverage, turned, sentence):
+    coverage.add(observed(turned=turned))
+    assert coverage_advice(coverage) == sentence
+
+
+def test_feet_below_the_picture_ask_for_a_step_back(observed, coverage):
+    for turned in np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False):
+        coverage.add(observed(turned=turned, up_m=1.0))
+    assert coverage_advice(coverage) == "Step back: no picture shows your legs."
+
+
+@pytest.mark.parametrize(
+    ("parts", "side", "sentence"),
+    [
+        (arm("left"), "under", "Raise your left arm: the underside was never seen."),
+        (arm("right"), "back", "Turn until the back of your right arm has been seen."),
+        (("left thigh", "left shin"), "right",
+         "Stand with your legs apart: the inner side was never seen."),
+        (("head",), "back", "Turn until the back of your head has been seen."),
+        (("head",), "front", "Look at the camera: your face was never seen."),
+    ],
+)  # fmt: skip
+def test_a_piece_on_one_limb_is_named_by_limb_and_side(coverage, parts, side, sentence):
+    assert coverage_advice(without(coverage, here(coverage, *parts, side=side))) == sentence
+
+
+def test_small_pieces_are_one_sentence_however_many_are_left(coverage, rng):
+    order = rng.permutation(len(coverage.patches.points))
+    said = {
+        coverage_advice(without(coverage, order < share * len(order)))
+        for share in (0.08, 0.12, 0.17)
+    }
+    assert len(said) == 1
+    assert SEEN_COMPLETELY not in said
+
+
+def test_every_sentence_is_one(coverage, rng):
+    """Any ball of unseen skin, for any reason, makes a sentence without a hole in it."""
+    points = coverage.patches.points
+    for center in points[rng.integers(0, len(points), 60)]:
+        near = np.linalg.norm(points - center, axis=1) < rng.uniform(0.1, 0.5)
+        said = coverage_advice(without(coverage, near, VisibilityStage(int(rng.integers(0, 4)))))
+        assert said[0].isupper()
+        assert said.endswith(".")
+        assert "{" not in said
+        assert "  " not in said

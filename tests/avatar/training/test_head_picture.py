@@ -13,11 +13,6 @@ from avatar.training.frame_stream import separate_held_out
 from avatar.training.training_pixels import picture_head
 
 
-def corner_of_head(camera, head_camera):
-    """Upper left corner of a picture of the head that is not reduced, in the film's pixels."""
-    return np.rint(np.subtract(camera.center_px, head_camera.center_px)).astype(int)
-
-
 def filmed(observation, factor):
     """The observation as reduced from a film whose pixels are `factor` times as many a side.
 
@@ -65,7 +60,8 @@ def test_an_enlarged_mask_follows_the_edges_of_the_film(rig, clip):
     for rgb in (person, np.full_like(person, 200)):  # the second has no edge to follow
         head = picture_head(replace(observation, filmed_rgb=rgb), rig)
         places = np.divmod(head.runs.flat_indices(), head.view.camera.size_px[0])
-        left, top = corner_of_head(observation.camera.resize(large), head.view.camera)
+        camera = observation.camera.resize(large)
+        left, top = np.rint(np.subtract(camera.center_px, head.view.camera.center_px)).astype(int)
         truth = person[places[0] + top, places[1] + left, 0] > 0
         errors.append(np.abs(head.colors[:, 3] / 255.0 - truth).mean())
     assert errors[0] < 0.7 * errors[1]

@@ -6,29 +6,23 @@ ray by them must continue it by metres, not samples.
 
 import dataclasses
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
 import torch
 
-from avatar.avatar_model import Avatar
 from avatar.config import TrainConfig
-from avatar.evaluation.held_out import HeldOutFrame, score_frame
+from avatar.evaluation.held_out import score_frame
 from avatar.evaluation.image_metrics import soft_iou
 from avatar.kernels import operations
 from avatar.kernels.numba_rendering import OPAQUE_DEPTH
 from avatar.kernels.operands import CorrespondenceTables, DensityGrid, MarchSettings, RayBatch
 from avatar.render import render
 from avatar.rig import Rig
-from avatar.training.frame_stream import TrainingFrame, prepare_stream
-from avatar.training.trainer import Trainer, cosine_decay
-from capture.source import Frame
-from instant_avatar.studio import staging
+from avatar.training.trainer import cosine_decay
 from instant_avatar.studio.actor import Actor
 from instant_avatar.studio.staging import static_camera
-from preprocess.observation import Observation
-from tests.avatar_fixtures import render_on_white
+from tests.avatar_fixtures import film_turning, untaught
 
 # --- a plane that is grazed -------------------------------------------------------------------
 
@@ -94,75 +88,27 @@ def test_a_grazing_ray_reaches_the_bottom_of_the_surfaces_cell_whatever_the_step
 # --- a person ---------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Filmed:
-    """The studio's actor turning once, made ready, and what a pixel covers on the body."""
-
-    rig: Rig
-    frames: list[TrainingFrame]
-    held: list[HeldOutFrame]
-    footprint_m: float
-
-
-def filmed(size: int) -> Filmed:
-    actor = Actor.of(1, 0)
-    rig, camera = Rig.from_shaped_body(actor.shaped), static_camera(actor, size)
-    poses = staging.turning_motion(actor, frames=20, fps=30.0, turns=1.0, seed=0)
-    observations = []
-    for index in range(len(poses)):
-        rgb, alpha = render_on_white(actor, poses[index], camera)
-        frame = Frame(index=index, time_s=index / 30.0, rgb=rgb)
-        mask = alpha.astype(np.float32) / 255.0
-        observations.append(Observation(frame=frame, alpha=mask, pose=poses[index], camera=camera))
-    items = list(prepare_stream(iter(observations), rig, stride=7, total=None))
-    pelvis = np.append(rig.rest_joints[0] + poses[0].root_translation, 1.0)
-    return Filmed(
-        rig=rig,
-        frames=[item for item in items if isinstance(item, TrainingFrame)],
-        held=[item for item in items if isinstance(item, HeldOutFrame)],
-        footprint_m=float((camera.camera_from_world @ pelvis)[2]) / camera.focal_px[0],
-    )
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Taught:
-    """An avatar after training, and the held-out frames' PSNR during it, dB."""
-
-    avatar: Avatar
-    held: list[HeldOutFrame]
-    marks: list[list[float]]
-
-    def overlaps(self) -> list[float]:
-        """Intersection over union of each held-out frame's silhouette."""
-        found = []
-        for held in self.held:
-            seen = held.observation
-            picture = render(self.avatar, seen.pose, seen.camera, cells=held.correspondences)
-            found.append(soft_iou(picture[..., 3] > 0.5, seen.alpha > 0.5))
-        return found
-
-
-def taught(clip: Filmed, steps: int, *, marks: int = 5) -> Taught:
-    """Trains a clip for a number of steps."""
-    config = TrainConfig.for_budget(30.0, footprint_m=clip.footprint_m)
-    config = dataclasses.replace(config, refine_poses=False)
-    trainer, scores = Trainer(clip.rig, config), []
-    for frame in clip.frames:
-        trainer.add_frame(frame)
-    for step in range(steps):
-        share = step / steps
-        trainer.step(rate=cosine_decay(2.0 * share - 1.0), hard_surface_share=min(1.0, 4.0 * share))
-        if trainer.steps % (steps // marks) == 0:
-            scores.append([score_frame(trainer.avatar, held).psnr for held in clip.held])
-    return Taught(avatar=trainer.avatar, held=clip.held, marks=scores)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("size", "steps", "overlap"), [(256, 250, 0.97), (540, 600, 0.98)])
 def test_silhouettes_are_the_persons_and_no_frame_falls_back_between_marks(size, steps, overlap):
     """Of frames that it has not seen."""
-    learner = taught(filmed(size), steps)
-    assert min(learner.overlaps()) >= overlap
-    scores = np.array(learner.marks)
+    actor = Actor.of(1, 0)
+    rig, camera = Rig.from_shaped_body(actor.shaped), static_camera(actor, size)
+    clip = film_turning(actor, camera, frames=20)
+    pelvis = np.append(rig.rest_joints[0] + clip.observations[0].pose.root_translation, 1.0)
+    footprint_m = float((camera.camera_from_world @ pelvis)[2]) / camera.focal_px[0]
+    config = TrainConfig.for_budget(30.0, footprint_m=footprint_m)
+    config = dataclasses.replace(config, refine_poses=False)
+    trainer, held = untaught(rig, clip, config, stride=7)
+    marks = []
+    for step in range(steps):
+        share = step / steps
+        trainer.step(rate=cosine_decay(2.0 * share - 1.0), hard_surface_share=min(1.0, 4.0 * share))
+        if trainer.steps % (steps // 5) == 0:
+            marks.append([score_frame(trainer.avatar, frame).psnr for frame in held])
+    for seen in (frame.observation for frame in held):
+        alpha = render(trainer.avatar, seen.pose, seen.camera)[..., 3]
+        assert soft_iou(alpha > 0.5, seen.alpha > 0.5) >= overlap
+    scores = np.array(marks)
     assert len(scores) == 5
     assert (np.maximum.accumulate(scores, axis=0) - scores).max() < 1.0

@@ -262,13 +262,8 @@ def test_a_head_of_more_pixels_gets_more_rays_up_to_a_bound(rig, clip):
 
 def head_numbers(frame):
     """Numbers, among the frame's training pixels, of those that its picture of the head has."""
-    (left, top), width = corner_of_head(frame), frame.view.camera.size_px[0]
+    shift = np.subtract(frame.view.camera.center_px, frame.head.view.camera.center_px)
+    (left, top), width = np.rint(shift).astype(int), frame.view.camera.size_px[0]
     row, column = np.divmod(frame.head.runs.flat_indices(), frame.head.view.camera.size_px[0])
     places = (row + top) * width + column + left
     return np.flatnonzero(np.isin(frame.pixels.flat_indices(), places))
-
-
-def corner_of_head(frame):
-    """Upper left corner of the picture of the head in a frame that is not reduced."""
-    shift = np.subtract(frame.view.camera.center_px, frame.head.view.camera.center_px)
-    return np.rint(shift).astype(int)

@@ -1,4 +1,4 @@
-"""Training: what it reaches, that it never falls back, and what it says on the way."""
+"""Training: what it reaches, that it never falls back, what it says on the way, and its time."""
 
 import dataclasses
 import itertools
@@ -28,7 +28,7 @@ from avatar.kernels.numba_shading import add_light
 from avatar.training import pose_optimizer
 from avatar.training import train as train_module
 from avatar.training.frame_stream import TrainingFrame, prepare_stream
-from avatar.training.train import train
+from avatar.training.train import TrainingClock, train
 from avatar.training.trainer import Trainer
 from capture.inbox import Inbox
 from preprocess.observation import DroppedFrame
@@ -237,19 +237,26 @@ def rates_by_frames(rig, frames, *, seconds, opens_after_s, all_came=False):
     return rates, trainer
 
 
+@pytest.mark.parametrize(
+    ("seconds", "opens_after_s", "least_steps", "ends_after_s"),
+    [
+        (0.4, 0.8, 60, 0.9),  # the last frame comes after the time that was given
+        (1.0, 0.0, 0, 1.0),  # seconds are left
+    ],
+)
 def test_after_the_last_frame_of_a_film_that_comes_rates_fall_for_a_while(
-    rig, frames, ticking, monkeypatch
+    rig, frames, ticking, monkeypatch, seconds, opens_after_s, least_steps, ends_after_s
 ):
     """Read as fast as possible, reading would come first after half of the time."""
-    monkeypatch.setattr(train_module, "LEAST_STEPS", 60)
+    monkeypatch.setattr(train_module, "LEAST_STEPS", least_steps)
     monkeypatch.setattr(train_module, "CLOSING_S", 0.1)
-    rates, trainer = rates_by_frames(rig, frames, seconds=0.4, opens_after_s=0.8)
+    rates, trainer = rates_by_frames(rig, frames, seconds=seconds, opens_after_s=opens_after_s)
     assert set(rates[1] + rates[2]) == {train_module.STREAMING_RATE_FACTOR * QUICK.learning_rate}
-    assert (np.diff(rates[3]) <= 0.0).all()
+    assert (np.diff(rates[3][1:]) <= 0.0).all()
     assert rates[3][-1] < 0.1 * QUICK.learning_rate
     assert len(rates[3]) >= train_module.MIN_STEPS_AFTER_LAST_FRAME
-    assert trainer.steps >= 60  # however short the film is
-    assert trainer.wall_seconds > 0.9  # the last frame came after the time that was given
+    assert trainer.steps >= least_steps  # however short the film is
+    assert trainer.wall_seconds >= ends_after_s
 
 
 def test_rates_fall_from_the_end_of_the_film_on_while_its_frames_still_come(
@@ -265,17 +272,6 @@ def test_rates_fall_from_the_end_of_the_film_on_while_its_frames_still_come(
     assert (np.diff(before) <= 0.0).all()
     assert rates[3][-1] < 0.1 * QUICK.learning_rate
     assert len(rates[3]) >= train_module.MIN_STEPS_AFTER_LAST_FRAME
-
-
-def test_seconds_left_after_the_last_frame_are_the_cosines(rig, frames, ticking, monkeypatch):
-    monkeypatch.setattr(train_module, "LEAST_STEPS", 0)
-    monkeypatch.setattr(train_module, "CLOSING_S", 0.1)
-    rates, trainer = rates_by_frames(rig, frames, seconds=1.0, opens_after_s=0.0)
-    assert set(rates[1] + rates[2]) == {train_module.STREAMING_RATE_FACTOR * QUICK.learning_rate}
-    falling = np.array(rates[3][1:])
-    assert (np.diff(falling) <= 0.0).all()
-    assert falling[-1] < 0.1 * QUICK.learning_rate
-    assert trainer.wall_seconds >= 1.0
 
 
 def test_a_live_source_is_left_when_the_time_is_up(rig, frames, ticking, monkeypatch):
@@ -419,3 +415,48 @@ def test_two_processes_that_compile_halves_compile_what_a_step_calls(rig, monkey
     assert set() not in compiled
     assert set(called) == {"largest_distance", "light_factors", "mean_normals"}
     assert called[-1] == "largest_distance"  # the mark of a whole first run
+
+
+@pytest.fixture
+def trainer(rig) -> Trainer:
+    config = TrainConfig(rays=64, sample_step_m=0.03, finest_m=0.05, levels=2, table_size=1 << 10)
+    return Trainer(rig, config)
+
+
+@pytest.fixture
+def spend(monkeypatch):
+    """Lets seconds go by, of which the processor is busy for half."""
+    now = [100.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(time, "process_time", lambda: now[0] / 2.0)
+
+    def spend(seconds: float) -> None:
+        now[0] += seconds
+
+    return spend
+
+
+def test_time_goes_on_from_where_an_earlier_run_stopped(trainer, spend):
+    trainer.wall_seconds, trainer.cpu_seconds = 5.0, 3.0
+    clock = TrainingClock(trainer)
+    spend(4.0)
+    assert clock.read() == trainer.wall_seconds == 9.0
+    assert trainer.cpu_seconds == 5.0
+
+
+def test_a_pause_does_not_count_before_the_clock_within_it_or_if_it_ends_badly(trainer, spend):
+    def pause(error: type[BaseException] | None = None) -> None:
+        with trainer.paused():
+            spend(60.0)
+            if error:
+                raise error
+
+    pause()
+    clock = TrainingClock(trainer)
+    spend(2.0)
+    pause()
+    with pytest.raises(KeyboardInterrupt):
+        pause(KeyboardInterrupt)
+    spend(1.0)
+    assert clock.read() == 3.0
+    assert trainer.cpu_seconds == 1.5

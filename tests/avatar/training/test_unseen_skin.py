@@ -35,15 +35,6 @@ def facing(rig, part, z):
     return (rig.seed_parts == part) & (rig.seed_normals[:, 2] * z > 0.7)
 
 
-def test_a_frame_shows_the_side_that_faces_its_camera(rig, frame):
-    evidence = SkinEvidence(rig)
-    evidence.add(frame())
-    assert evidence.seen[facing(rig, TORSO, 1.0)].mean() > 0.95
-    assert not evidence.seen[facing(rig, TORSO, -1.0)].any()
-    evidence.add(frame(turned=np.pi))
-    assert evidence.seen[facing(rig, TORSO, -1.0)].mean() > 0.95
-
-
 def test_skin_outside_the_mask_or_the_picture_is_not_seen(rig, frame):
     alpha = np.ones((200, 200), dtype=np.float32)
     alpha[:100] = 0.0
@@ -63,6 +54,7 @@ def test_a_frame_in_which_the_person_is_turned_round_shows_little(rig, frame):
     evidence, back = SkinEvidence(rig), facing(rig, TORSO, -1.0)
     evidence.add(frame(turned=np.pi))
     assert evidence.seen[back].mean() > 0.95
+    assert not evidence.seen[facing(rig, TORSO, 1.0)].any()
     front = frame()
     for _ in range(99):
         evidence.add(front)

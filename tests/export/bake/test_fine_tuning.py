@@ -190,7 +190,7 @@ def test_progress_only_grows(tuned):
 
 
 @pytest.fixture
-def exported(stand_in, renderer, coarse, views, tmp_path):
+def rewrite(stand_in, renderer, coarse, views, tmp_path):
     """Exports the stand-in, by its player's own pictures unless others are given."""
     field, path = (stand_in.field_at, stand_in.rig, stand_in.occupied), tmp_path / "avatar.iavatar"
 
@@ -201,29 +201,23 @@ def exported(stand_in, renderer, coarse, views, tmp_path):
     return export
 
 
+@pytest.mark.usefixtures("baked_already")
 @pytest.mark.parametrize("baked_first", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_ctrl_c_while_tuning_leaves_the_package_as_baked(
-    exported, tables, monkeypatch, baked_first
-):
+def test_ctrl_c_while_tuning_leaves_the_package_as_baked(rewrite, tables, baked_first):
     def interrupted(share):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(build, "bake_tables", lambda *given: tables)
-
-    (report,) = exported(progress=interrupted, baked_first=baked_first)
+    (report,) = rewrite(progress=interrupted, baked_first=baked_first)
     assert any("interrupted" in warning for warning in report.warnings) is not baked_first
     package = read_package(report.path)
     assert np.array_equal(package.tables["hq"].bricks.voxels, tables.bricks.voxels)
 
 
-def test_the_fine_tuned_package_has_the_graphs_that_were_checked_as_baked(
-    exported, tables, monkeypatch
-):
-    checked = []
-    monkeypatch.setattr(build, "bake_tables", lambda *given: tables)
-    check = build.check_graph
+@pytest.mark.usefixtures("baked_already")
+def test_the_fine_tuned_package_has_the_graphs_that_were_checked_as_baked(rewrite, monkeypatch):
+    checked, check = [], build.check_graph
     monkeypatch.setattr(build, "check_graph", lambda *given: checked.append(0) or check(*given))
-    first, tuned = exported(pictures=2, baked_first=True)
+    first, tuned = rewrite(pictures=2, baked_first=True)
     assert len(checked) == len(QUALITY_TIERS)  # each once
     assert tuned.largest_difference == first.largest_difference
 
@@ -258,7 +252,7 @@ def test_haze_about_a_faint_core_is_inside_the_surface_of_a_thick_field(stand_in
 
 @pytest.mark.slow
 def test_where_the_player_is_far_from_the_renderer_bytes_choose_the_voxels(
-    exported, renderer, tables
+    rewrite, renderer, tables
 ):
     def paler(pose, camera):
         picture = renderer(pose, camera).copy()
@@ -266,7 +260,7 @@ def test_where_the_player_is_far_from_the_renderer_bytes_choose_the_voxels(
         return picture
 
     usual, thick = (
-        read_package(next(exported(pictures=2, renderer=each)).path) for each in (renderer, paler)
+        read_package(next(rewrite(pictures=2, renderer=each)).path) for each in (renderer, paler)
     )
     voxel_m = tables.bricks.voxel_m
     assert usual.tables["hq"].bricks.voxel_m == pytest.approx(voxel_m)

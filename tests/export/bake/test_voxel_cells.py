@@ -158,18 +158,19 @@ def filled_share(gap_px, *, side, spacing_px):
     return float((shown[:, start : start + gap_px] == 0).mean())
 
 
-@pytest.mark.parametrize("gap_px", [4, 8, 12])
-def test_holes_of_up_to_three_spacings_are_filled_in_close_ups(gap_px):
-    assert filled_share(gap_px, side=5, spacing_px=4.2) == 1.0
-
-
-def test_wider_gaps_are_gaps():
-    assert filled_share(14, side=2, spacing_px=1.9) == 0.0
-
-
-def test_far_away_a_gap_is_not_filled_by_what_a_footprint_is_rounded_up_to():
-    assert filled_share(5, side=2, spacing_px=0.2) == 0.0
-    assert filled_share(2, side=2, spacing_px=0.2) == 1.0
+@pytest.mark.parametrize(
+    ("gap_px", "side", "spacing_px", "share"),
+    [
+        (4, 5, 4.2, 1.0),
+        (8, 5, 4.2, 1.0),
+        (12, 5, 4.2, 1.0),
+        (14, 2, 1.9, 0.0),
+        (2, 2, 0.2, 1.0),
+        (5, 2, 0.2, 0.0),  # far away, by what a footprint is rounded up to
+    ],
+)
+def test_holes_of_up_to_three_spacings_are_filled(gap_px, side, spacing_px, share):
+    assert filled_share(gap_px, side=side, spacing_px=spacing_px) == share
 
 
 VOXEL_M = 0.004

@@ -203,9 +203,9 @@ def test_a_player_that_differs_from_the_renderer_is_written_with_a_warning(expor
     assert read_package(report.path).manifest.metrics["warnings"] == [warning]
 
 
-def test_a_graph_that_differs_from_its_rays_is_refused(export, tables, tmp_path, monkeypatch):
+@pytest.mark.usefixtures("baked_already")
+def test_a_graph_that_differs_from_its_rays_is_refused(export, tmp_path, monkeypatch):
     right = build.build_graph
-    monkeypatch.setattr(build, "bake_tables", lambda *given: tables)
     monkeypatch.setattr(
         build,
         "build_graph",
@@ -228,14 +228,13 @@ def test_voxels_follow_the_field_within_bounds():
     assert BakeConfig.for_sample_step(0.1).voxel_m == MAX_VOXEL_M
 
 
-def test_a_full_disk_leaves_the_older_package(exported, tmp_path, monkeypatch):
+def test_a_full_disk_leaves_the_older_package(package, tmp_path, monkeypatch):
     path = tmp_path / "a.iavatar"
     path.write_bytes(b"older")
 
     def full(descriptor):
         raise OSError(28, "No space left on device")
 
-    package = read_package(exported.path)
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="space"):
         write_package(package, path)
@@ -243,12 +242,11 @@ def test_a_full_disk_leaves_the_older_package(exported, tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ["a.iavatar"]
 
 
-def test_a_stranger_with_numpy_reads_a_package_by_its_documentation(exported):
+def test_a_stranger_with_numpy_reads_a_package_by_its_documentation(exported, tables):
     text = (Path(__file__).parents[3] / "docs" / "package-format.md").read_text()
     room: dict = {}
     exec(text.split("```python\n")[1].split("```")[0], room)
     manifest, bricks, weights, places = room["read"](exported.path)
-    tables = read_package(exported.path).tables["hq"]
     assert manifest["format"] == FORMAT_VERSION
     np.testing.assert_array_equal(bricks, tables.bricks.voxels[1:, :8, :8, :8])
     np.testing.assert_allclose(weights, tables.skinning.weights[1:], atol=1e-6)
@@ -265,9 +263,7 @@ def graph_of(nodes, tensors=()):
     return helper.make_model(graph, opset_imports=imports, ir_version=9).SerializeToString()
 
 
-def test_a_graph_that_reads_a_file_of_the_machine_is_refused(
-    exported, views, tmp_path, monkeypatch
-):
+def test_a_graph_that_reads_a_file_of_the_machine_is_refused(package, tmp_path, monkeypatch):
     (tmp_path / "secret").write_bytes(bytes(range(16)))
     monkeypatch.chdir(tmp_path)
     for place in ("secret", f"../{tmp_path.name}/secret", str(tmp_path / "secret")):
@@ -277,10 +273,10 @@ def test_a_graph_that_reads_a_file_of_the_machine_is_refused(
             stolen.external_data.add(key=key, value=value)
         graph = graph_of([helper.make_node("Identity", ["stolen"], ["rgba"])], [stolen])
         with pytest.raises(InputError, match="does not run"):
-            Player(replace(read_package(exported.path), graphs={"hq": graph}))
+            Player(replace(package, graphs={"hq": graph}))
 
 
-def test_a_graph_with_a_wrong_or_too_large_output_is_refused(exported, views):
+def test_a_graph_with_a_wrong_or_too_large_output_is_refused(package, views):
     size = numpy_helper.from_array(np.array([1 << 20, 1 << 20, 4]), "size")
     endless = helper.make_node(
         "ConstantOfShape", ["size"], ["rgba"], value=helper.make_tensor("v", 6, [1], [7])
@@ -289,6 +285,6 @@ def test_a_graph_with_a_wrong_or_too_large_output_is_refused(exported, views):
     small = helper.make_node("Identity", ["one"], ["rgba"])
     for graph, message in ((graph_of([endless], [size]), "cannot draw"),
                            (graph_of([small], [one]), "instead of one 32-bit number")):  # fmt: skip
-        player = Player(replace(read_package(exported.path), graphs={"hq": graph}))
+        player = Player(replace(package, graphs={"hq": graph}))
         with pytest.raises(InputError, match=message):
             player.render(*views["bent"])
