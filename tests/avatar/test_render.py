@@ -61,22 +61,15 @@ def test_the_image_is_empty_where_the_camera_looks_past_the_person(rig, avatar, 
     assert (render(avatar, pose, away) == 0.0).all()
 
 
-def test_the_person_has_no_holes(learnt, avatar):
-    """Two pixels inside the true silhouette everything is opaque."""
+def test_the_person_has_no_holes_and_nothing_floats_beside_it(learnt, avatar):
+    """Opaque two pixels inside the true silhouette, clear four pixels outside of it."""
     for held in [*learnt.held, learnt.novel]:
         seen = held.observation
         inside = cv2.erode((seen.alpha > 0.99).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+        near = cv2.dilate((seen.alpha > 0).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
         alpha = render(avatar, seen.pose, seen.camera, cells=held.correspondences)[..., 3]
         assert inside.sum() > 80
         assert alpha[inside].min() > 0.9
-
-
-def test_nothing_floats_beside_the_person(learnt, avatar):
-    """Four pixels outside the true silhouette everything is clear."""
-    for held in [*learnt.held, learnt.novel]:
-        seen = held.observation
-        near = cv2.dilate((seen.alpha > 0).astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
-        alpha = render(avatar, seen.pose, seen.camera, cells=held.correspondences)[..., 3]
         assert alpha[~near].max() < 0.1
 
 

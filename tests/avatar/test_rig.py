@@ -85,21 +85,15 @@ def test_the_box_is_the_canonical_body_and_its_margin(rig, skin):
     np.testing.assert_allclose(rig.box_high, skin.max(axis=0) + 0.17, atol=1e-6)
 
 
-def test_weights_are_shares(rig, rng):
+def test_weights_are_shares_on_the_nodes_those_stored_and_beyond_the_box_its_borders(rig, rng):
     assert rig.weights.min() >= 0.0
     np.testing.assert_allclose(rig.weights.sum(axis=-1), 1.0, atol=1e-5)
     inside = rng.uniform(rig.box_low, rig.box_high, (1000, 3))
     np.testing.assert_allclose(rig.weights_at(inside).sum(axis=1), 1.0, atol=1e-5)
-
-
-def test_weights_on_the_nodes_are_those_that_are_stored(rig, rng):
     shape = np.array(rig.weights.shape[:3])
     node = (rng.random((200, 3)) * shape).astype(int)
     points = rig.box_low + node / (shape - 1) * (rig.box_high - rig.box_low)
     np.testing.assert_allclose(rig.weights_at(points), rig.weights[tuple(node.T)], atol=1e-4)
-
-
-def test_weights_outside_the_box_are_those_of_its_border(rig):
     beyond = np.stack([rig.box_low - 1.0, rig.box_high + 1.0]).astype(np.float64)
     expected = np.stack([rig.weights[0, 0, 0], rig.weights[-1, -1, -1]])
     np.testing.assert_array_equal(rig.weights_at(beyond), expected)

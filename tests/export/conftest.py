@@ -66,7 +66,7 @@ class StandIn:
             return best_rgb, best
         for neighbor in tree.query(points, k=9)[1][:, ::4].T:
             guess = self.rig.seeds[neighbor].astype(np.float64)
-            for _ in range(6):
+            for _ in range(4):
                 blended = _blended(self.rig, guess, bones)
                 offset = (points - blended[:, :, 3])[..., None]
                 guess = np.linalg.solve(blended[:, :, :3], offset)[..., 0]

@@ -121,28 +121,23 @@ def test_training_goes_on_where_it_stopped(rig, frames, saved):
     assert again.frames_seen == 3
 
 
-def test_a_detached_state_is_that_of_the_step_it_was_taken_at(learner, saved, tmp_path):
+def test_a_second_checkpoint_and_a_detached_state_are_those_of_their_step(learner, saved, tmp_path):
+    learner.step(rate=1.0, hard_surface_share=0.5)
     checkpoint.save(learner, saved.parent)
+    assert list(saved.parent.iterdir()) == [saved]  # it replaces the first
     detached = checkpoint.detached_state(learner)
     learner.step(rate=1.0, hard_surface_share=0.5)
     checkpoint.write_state(detached, tmp_path / "later")
     before, after = (checkpoint.load(folder)[0] for folder in (saved.parent, tmp_path / "later"))
-    assert before.steps == after.steps == learner.steps - 1
+    assert before.steps == after.steps == learner.steps - 1 == 21
     assert torch.equal(before.field.table, after.field.table)
     assert not torch.equal(before.field.table, learner.field.table)
     moments = [each.optimizer.state[each.field.table]["exp_avg"] for each in (before, after)]
     assert torch.equal(*moments)
 
 
-def test_a_second_checkpoint_replaces_the_first(learner, saved):
-    learner.step(rate=1.0, hard_surface_share=0.5)
-    checkpoint.save(learner, saved.parent)
-    assert checkpoint.load(saved.parent)[0].steps == 21
-    assert list(saved.parent.iterdir()) == [saved]
-
-
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no disk that is always full")
-def test_a_disk_that_really_is_full_is_called_so(trainer, saved, monkeypatch):
+def test_a_disk_that_really_is_full_is_called_so(trainer, kept, saved, monkeypatch):
     before, save = saved.read_bytes(), torch.save
 
     def on_a_full_disk(state, file):
@@ -150,11 +145,12 @@ def test_a_disk_that_really_is_full_is_called_so(trainer, saved, monkeypatch):
             save(state, full)
 
     monkeypatch.setattr(torch, "save", on_a_full_disk)
-    with pytest.raises(OSError, match="No space") as caught:
-        checkpoint.save(trainer, saved.parent)
-    assert caught.value.errno == errno.ENOSPC
-    assert list(saved.parent.iterdir()) == [saved]
-    assert saved.read_bytes() == before
+    for write in (lambda: checkpoint.save(trainer, saved.parent), lambda: save_frames(kept, saved)):
+        with pytest.raises(OSError, match="No space") as caught:
+            write()
+        assert caught.value.errno == errno.ENOSPC
+        assert list(saved.parent.iterdir()) == [saved]
+        assert saved.read_bytes() == before
 
 
 def test_a_folder_without_a_checkpoint_says_so(tmp_path):
@@ -282,17 +278,3 @@ def test_without_a_file_there_are_no_frames_and_a_damaged_one_is_refused(kept, t
     path.write_bytes(path.read_bytes()[:2000])
     with pytest.raises(InputError, match="cannot be read"):
         load_frames(path)
-
-
-def test_a_full_disk_leaves_the_older_file(kept, tmp_path, monkeypatch):
-    path = tmp_path / "frames.tensors"
-    path.write_bytes(b"older")
-
-    def full(state, file):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(torch, "save", full)
-    with pytest.raises(OSError, match="No space"):
-        save_frames(kept, path)
-    assert path.read_bytes() == b"older"
-    assert [file.name for file in tmp_path.iterdir()] == ["frames.tensors"]
