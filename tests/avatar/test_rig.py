@@ -235,23 +235,15 @@ def test_a_mirrored_body_has_mirrored_weights():
     np.testing.assert_allclose(weights[10, :, :, 4], 0.5, atol=1e-5)  # the plane between them
 
 
-def test_weights_fall_with_the_square_of_the_distance():
-    """One vertex against the others at three times its distance: each of those weighs a ninth."""
-    node = np.array([0.0, 0.0, 0.0])
+@pytest.mark.parametrize(("own_m", "others_m"), [(0.1, 0.3), (0.0, 0.02)])
+def test_weights_fall_with_the_square_of_the_distance(own_m, others_m):
+    """Of one vertex against all others, but a node on a vertex is not taken by it alone."""
     around = np.random.default_rng(2).normal(size=(BLENDED_VERTICES - 1, 3))
-    around *= 0.3 / np.linalg.norm(around, axis=1, keepdims=True)
-    vertices = np.concatenate([[[0.1, 0.0, 0.0]], around]) + node
-    weights = np.concatenate([one_hot(9), one_hot(2, BLENDED_VERTICES - 1)])
-    share = skinning_weight_volume(vertices, weights, -1e-4 + node, 1e-4 + node, 1e-4, 10.0)
-    np.testing.assert_allclose(share[..., 9], 1.0 / (1.0 + (BLENDED_VERTICES - 1) / 9.0), atol=1e-3)
-
-
-def test_a_node_on_a_vertex_is_not_taken_by_it_alone():
-    around = np.random.default_rng(2).normal(size=(BLENDED_VERTICES - 1, 3))
-    around *= 0.02 / np.linalg.norm(around, axis=1, keepdims=True)
-    vertices = np.concatenate([np.zeros((1, 3)), around])
+    around *= others_m / np.linalg.norm(around, axis=1, keepdims=True)
+    vertices = np.concatenate([[[own_m, 0.0, 0.0]], around])
     weights = np.concatenate([one_hot(9), one_hot(2, BLENDED_VERTICES - 1)])
     end = np.full(3, 1e-5)
     share = skinning_weight_volume(vertices, weights, -end, end, 1e-5, 10.0)
-    own, others = MIN_VERTEX_DISTANCE_M**-2, (BLENDED_VERTICES - 1) * 0.02**-2
+    own = max(own_m, MIN_VERTEX_DISTANCE_M) ** -2
+    others = (BLENDED_VERTICES - 1) * others_m**-2
     np.testing.assert_allclose(share[..., 9], own / (own + others), atol=1e-3)
