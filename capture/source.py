@@ -128,6 +128,10 @@ class PacingClock:
         self._wait: Callable[[float], object] = self._ended.wait if wait is None else wait
         self.waited_s = 0.0
 
+    def __reduce__(self) -> tuple[type["PacingClock"], tuple[()]]:
+        """Start another process's own clock."""
+        return PacingClock, ()
+
     @property
     def stopped(self) -> bool:
         """Return whether `stop` was called: every wait returns at once."""

@@ -5,6 +5,7 @@ detected from a few samples. Files that hold no readable masks raise `InputError
 """
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -98,6 +99,10 @@ class Masks:
         height, width = samples[0].shape
         self.size_px = (int(width), int(height))
         self.inverted = shows_background(samples, path) if invert is None else invert
+
+    def __reduce__(self) -> tuple[Callable[[Path], "Masks"], tuple[Path]]:
+        """Open the files again in another process."""
+        return partial(open_masks, invert=self._stated), (self.path,)
 
     def _binarize_ids(self, stored: Float32[np.ndarray, "_ _"]) -> Float32[np.ndarray, "_ _"]:
         """Alpha of a stored mask: any object, if the files hold object numbers."""

@@ -39,6 +39,7 @@ def started(monkeypatch):
 
 
 def set_index(monkeypatch, index):
+    monkeypatch.setattr(start_up, "is_first_run", lambda: False)
     file = SimpleNamespace(_load_index=lambda: index)
     kernel = SimpleNamespace(_cache=SimpleNamespace(_cache_file=file))
     monkeypatch.setattr(numba_pose, "largest_distance", kernel)

@@ -1,5 +1,7 @@
 """Tests for masks in every container and polarity."""
 
+import pickle
+
 import cv2
 import numpy as np
 import pytest
@@ -88,7 +90,8 @@ def test_one_archive_or_array_is_read_like_a_folder(write, tmp_path):
     for name in ("m.npz", "m.npy"):
         masks = open_masks(tmp_path / name)
         assert masks.count == 2
-        np.testing.assert_array_equal(masks.alpha(1, SIZE), expected.alpha(1, SIZE))
+        sent = pickle.loads(pickle.dumps(masks))  # to another process
+        np.testing.assert_array_equal(sent.alpha(1, SIZE), expected.alpha(1, SIZE))
 
 
 def test_inverted_masks_are_detected_unless_stated(write):
@@ -97,7 +100,7 @@ def test_inverted_masks_are_detected_unless_stated(write):
     found = open_masks(folder)
     assert found.inverted
     np.testing.assert_allclose(found.alpha(0, SIZE), upright, atol=1e-6)
-    told = open_masks(folder, invert=False)
+    told = pickle.loads(pickle.dumps(open_masks(folder, invert=False)))
     np.testing.assert_allclose(told.alpha(0, SIZE), 1 - upright, atol=1e-6)
     assert open_masks(write([person()], "other"), invert=True).inverted
 
