@@ -259,13 +259,13 @@ def _tone_map_strip(
     light = np.take(_linear_light_lut(curve), rgb >> 4)
     if curve == HLG:  # the display's gamma of 1.2 for the luminance (ITU-R BT.2100)
         luma = light @ np.array([0.2627, 0.6780, 0.0593], np.float32)
-        light *= np.power(np.maximum(luma, 1e-6), np.float32(0.2))[..., None]
-    light *= np.float32(PEAK_NITS / WHITE_NITS)
+        light *= np.power(np.maximum(luma, 1e-6), 0.2)[..., None]
+    light *= PEAK_NITS / WHITE_NITS
     light = cv2.transform(light, BT709_FROM_BT2020)
     brightest = np.maximum(light[..., 0], np.maximum(light[..., 1], light[..., 2]))
-    brightest = np.maximum(brightest, np.float32(1e-6))
+    brightest = np.maximum(brightest, 1e-6)
     light *= (_compress_highlights(brightest) / brightest)[..., None]
-    codes = np.clip(light * np.float32(LUT_SIZE - 1), 0.0, LUT_SIZE - 1).astype(np.uint16)
+    codes = np.clip(light * (LUT_SIZE - 1), 0.0, LUT_SIZE - 1).astype(np.uint16)
     return np.take(_srgb_lut(), codes)
 
 
@@ -276,7 +276,7 @@ def _compress_highlights(light: Float32[np.ndarray, "..."]) -> Float32[np.ndarra
     the knee, 1 at the peak.
     """
     room, span = 1.0 - TONE_MAP_KNEE, PEAK_NITS / WHITE_NITS - TONE_MAP_KNEE
-    t = (light - np.float32(TONE_MAP_KNEE)) / np.float32(room)
+    t = (light - TONE_MAP_KNEE) / room
     bent = TONE_MAP_KNEE + room * t / (1.0 + t * (1.0 - room / span))
     return np.where(t > 0.0, np.minimum(bent, 1.0), light).astype(np.float32)
 

@@ -84,7 +84,7 @@ class SilhouetteObjective:
         if row is None:
             return float("nan")
         camera = geometry.camera_at(sample.camera_row, self.size_px)
-        alpha = np.float32(1.0) - sample.alpha if geometry.masks_inverted else sample.alpha
+        alpha = 1.0 - sample.alpha if geometry.masks_inverted else sample.alpha
         drawn = splat_silhouette(self.posed_points(geometry.motion, row), camera)
         return soft_iou(
             drawn, components_touching(alpha, drawn) if geometry.keeps_person_only else alpha
@@ -137,7 +137,7 @@ def components_touching(alpha: AlphaMask, body: Bool[np.ndarray, "height width"]
     own[0] = False
     if not own.any():
         return alpha
-    return np.where(np.isin(labels, np.flatnonzero(own)), alpha, np.float32(0.0))
+    return np.where(np.isin(labels, np.flatnonzero(own)), alpha, 0.0)
 
 
 def _box_fill(alpha: Bool[np.ndarray, "height width"]) -> float:

@@ -35,8 +35,8 @@ def color_density(
     squared: Float32[np.ndarray, "*pixels"], variance: Float32[np.ndarray, "*pixels"]
 ) -> Float32[np.ndarray, "*pixels"]:
     """Density of a color at a squared distance from its mean; 1 at the peak of σ = 16 levels."""
-    ratio = np.float32(256.0) / variance
-    return np.exp(np.float32(-0.5) * squared / variance) * ratio * np.sqrt(ratio)
+    ratio = 256.0 / variance
+    return np.exp(-0.5 * squared / variance) * ratio * np.sqrt(ratio)
 
 
 class PlateColors(NamedTuple):
@@ -64,10 +64,10 @@ class PlateColors(NamedTuple):
             squared += expected * mean
             texture -= cv2.blur(expected, window) ** 2
         off = cv2.blur(off * weight, window)
-        texture /= np.maximum(share, np.float32(0.01))
+        texture /= np.maximum(share, 0.01)
         texture += cv2.blur(squared, window)
-        textured = texture > np.float32(3.0 * 7.0**2) * share  # a deviation of 7 levels a channel
-        alike = off < np.float32(0.2) * texture
+        textured = texture > 3.0 * 7.0**2 * share  # a deviation of 7 levels a channel
+        alike = off < 0.2 * texture
         return self.known & (share > 0.7) & textured & alike
 
 
@@ -81,16 +81,16 @@ def plate_density(
     """
     # least squares: gain = color · mean / |mean|²
     dot = colors[0] * mean[0] + colors[1] * mean[1] + colors[2] * mean[2]
-    length = np.maximum(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2, np.float32(1.0))
-    gain = np.clip(dot / length, np.float32(SHADOW_GAIN[0]), np.float32(SHADOW_GAIN[1]))
+    length = np.maximum(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2, 1.0)
+    gain = np.clip(dot / length, SHADOW_GAIN[0], SHADOW_GAIN[1])
     plain, shaded = np.zeros((2, len(dot)), np.float32)
     for color, expected in zip(colors, mean, strict=True):
         plain += (color - expected) ** 2
         shaded += (color - gain * expected) ** 2
     return (
-        np.float32(0.9) * color_density(plain, variance)
-        + np.float32(0.1) * color_density(shaded, variance)  # shaded or lit by the person
-        + np.float32(0.00025)
+        0.9 * color_density(plain, variance)
+        + 0.1 * color_density(shaded, variance)  # shaded or lit by the person
+        + 0.00025
     )
 
 
@@ -135,22 +135,22 @@ class BackgroundPlate:
         """The background in some rows and columns of the aligned frame."""
         frames = self._frames[part]
         # The mean of a few frames is uncertain itself.
-        variance = np.maximum(self._variance[part], np.float32(6.0**2))  # at least 6 levels
-        variance *= np.float32(1.0) + np.float32(2.0) / np.maximum(frames, np.float32(1.0))
+        variance = np.maximum(self._variance[part], 6.0**2)  # at least 6 levels
+        variance *= 1.0 + 2.0 / np.maximum(frames, 1.0)
         mean = self._mean[:, part[0], part[1]] * self._gain[:, None, None]
         return PlateColors(frames >= MIN_SEEN_FRAMES, mean, variance)
 
     def update(self, image: Channels, background: PixelMask) -> None:
         """Average the sure background of the aligned frame into the plate."""
         self._frames += background
-        share = background / np.clip(self._frames, np.float32(1.0), np.float32(30.0))
+        share = background / np.clip(self._frames, 1.0, 30.0)
         squared = np.zeros_like(self._variance)
         for seen, mean, gain in zip(image, self._mean, self._gain, strict=True):
             off = seen / gain - mean
             mean += off * share
             squared += off * off
         # Welford 1962: the variance takes the squared deviation across the old and the new mean.
-        squared *= (np.float32(1.0) - share) / np.float32(3.0)
+        squared *= (1.0 - share) / 3.0
         self._variance += share * (squared - self._variance)
 
     def _rescale(self, shape: tuple[int, int]) -> None:

@@ -123,7 +123,7 @@ class Masks:
             stored = cv2.resize(
                 stored, size_px, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
             )
-        alpha = np.float32(1.0) - stored if self.inverted else stored
+        alpha = 1.0 - stored if self.inverted else stored
         if self._stated is None and (_coverage(alpha) > MAX_PERSON_FRACTION).all():
             raise InputError(
                 f"mask {row} in {self.path} covers most of the image and of its rim, unlike the "
@@ -201,7 +201,7 @@ class _MaskVideo:
             raise InputError(f"Frame {row} of the masks {self._video.path} cannot be decoded.")
         gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
         # black up to 16 (compression rings around edges), white from 239 on
-        self._last = np.clip((gray - np.float32(16.0)) / np.float32(223.0), 0.0, 1.0)
+        self._last = np.clip((gray - 16.0) / 223.0, 0.0, 1.0)
         return self._last
 
 
@@ -256,13 +256,13 @@ def _to_alpha(stored: Shaped[np.ndarray, "..."], path: Path) -> AlphaMask:
     return np.clip(stored.astype(np.float32) / _full_scale(stored), 0.0, 1.0)
 
 
-def _full_scale(stored: Shaped[np.ndarray, "height width"]) -> np.float32:
+def _full_scale(stored: Shaped[np.ndarray, "height width"]) -> float:
     """The stored number that means alpha 1."""
     if stored.dtype.kind == "f":
-        return np.float32(1.0 if stored.max() < 1.5 else 255.0)
+        return 1.0 if stored.max() < 1.5 else 255.0
     if stored.max() <= 1:
-        return np.float32(1.0)
-    return np.float32(65535.0 if stored.dtype == np.uint16 else 255.0)
+        return 1.0
+    return 65535.0 if stored.dtype == np.uint16 else 255.0
 
 
 def _readable(read: MaskReader, rows: list[int]) -> list[AlphaMask]:

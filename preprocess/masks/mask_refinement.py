@@ -132,19 +132,19 @@ class MaskRefiner:
         band = band._replace(person=band.person & ~shown, background=band.background | shown)
         at = band.rows, band.columns
         front, back = self._color_frequencies(band)
-        ratio = np.float32(0.75) * np.log(front / back)
+        ratio = 0.75 * np.log(front / back)
         known = plate.known[at]
         rows, columns = band.rows[known], band.columns[known]
         behind = plate_density(
             band.colors[:, known], plate.mean[:, rows, columns], plate.variance[rows, columns]
         )
         # 32: twice the density of a bin of 16 levels in `color_density`'s unit
-        ratio[known] += np.log(np.float32(32.0) * front[known] / behind)
-        prior = np.clip(band.prior[at], np.float32(0.01), np.float32(0.99))
-        odds = prior / (np.float32(1.0) - prior)
-        odds *= np.exp(np.clip(ratio, np.float32(-8.0), np.float32(8.0)))
+        ratio[known] += np.log(32.0 * front[known] / behind)
+        prior = np.clip(band.prior[at], 0.01, 0.99)
+        odds = prior / (1.0 - prior)
+        odds *= np.exp(np.clip(ratio, -8.0, 8.0))
         alpha = band.inside.astype(np.float32)
-        alpha[at] = odds / (np.float32(1.0) + odds)
+        alpha[at] = odds / (1.0 + odds)
         alpha[shown] = 0.0
         return _without_islands(alpha, band.inside)
 
@@ -160,8 +160,8 @@ class MaskRefiner:
         ).astype(np.float32)
         kept = np.float32(0.9) if self._histograms.any() else np.float32(0.0)
         self._histograms = kept * self._histograms + (np.float32(1.0) - kept) * now
-        total = np.maximum(self._histograms.sum(axis=1, keepdims=True), np.float32(1e-3))
-        front, back = self._histograms / total + np.float32(3e-4)
+        total = np.maximum(self._histograms.sum(axis=1, keepdims=True), 1e-3)
+        front, back = self._histograms / total + 3e-4
         bins = _color_bins(band.colors)
         return front[bins], back[bins]
 

@@ -231,7 +231,7 @@ def alpha_channel_mask(frame: Frame, size_px: tuple[int, int]) -> AlphaMask:
         raise InputError("the picture has no alpha channel")
     if not has_cutout_alpha(frame.alpha):
         raise InputError("the picture's alpha channel is opaque, unlike that of others")
-    alpha = frame.alpha.astype(np.float32) / np.float32(255.0)
+    alpha = frame.alpha.astype(np.float32) / 255.0
     if frame.size_px == size_px:
         return alpha
     return cv2.resize(alpha, size_px, interpolation=cv2.INTER_AREA)

@@ -68,10 +68,10 @@ def person_colors(
     there = rows // 2, columns // 2
     mixed, shown = opacity[rows, columns][:, None], image[rows, columns]
     mean = share[there][:, None]
-    near = person[there] / np.maximum(mean, np.float32(1e-3))
-    far = (both[there] - person[there]) / np.maximum(1.0 - mean, np.float32(1e-3))
+    near = person[there] / np.maximum(mean, 1e-3)
+    far = (both[there] - person[there]) / np.maximum(1.0 - mean, 1e-3)
     near += mixed * (shown - mixed * near - (1.0 - mixed) * far)
-    image[rows, columns] = np.clip(near, np.float32(0.0), np.float32(255.0))
+    image[rows, columns] = np.clip(near, 0.0, 255.0)
     return found
 
 
@@ -135,17 +135,17 @@ def _weigh_borders(
     """Alpha of each pixel for each width and displacement of the border, and its weight."""
     wide = widths_px[:, None]
     across = pixels.away[:, None, None] / wide + BORDER_SHIFTS_PX / np.sqrt(wide)
-    tried = np.clip(np.float32(0.5) - across, np.float32(0.0), np.float32(1.0))
+    tried = np.clip(0.5 - across, 0.0, 1.0)
     off, apart, noise, spread = (each[:, None, None] for each in pixels[1:])
     # |I - (a F + (1 - a) B)|² = |off - a apart|², for each displacement's a
-    squared = (off**2).sum(axis=-1) - np.float32(2.0) * tried * (off * apart).sum(axis=-1)
+    squared = (off**2).sum(axis=-1) - 2.0 * tried * (off * apart).sum(axis=-1)
     squared += tried**2 * (apart**2).sum(axis=-1)
-    noisy = noise * (np.float32(1.0) - tried) ** 2 + np.float32(1.0)
+    noisy = noise * (1.0 - tried) ** 2 + 1.0
     likely = 1e-4 + (1.0 - OUTLIER_PROBABILITY) * _color_likelihood(squared, noisy, tried, spread)
-    likely += OUTLIER_PROBABILITY * _color_likelihood(squared, noisy, tried, np.float32(50.0))
-    weight = np.float32(0.6) * np.log(likely)  # errors of neighboring pixels are correlated
+    likely += OUTLIER_PROBABILITY * _color_likelihood(squared, noisy, tried, 50.0)
+    weight = 0.6 * np.log(likely)  # errors of neighboring pixels are correlated
     # a sharp border is off by 0.35 px (σ); shift and σ grow with the root of its width
-    weight -= np.float32(0.5) * (BORDER_SHIFTS_PX / np.float32(0.35)) ** 2
+    weight -= 0.5 * (BORDER_SHIFTS_PX / 0.35) ** 2
     return tried, np.exp(weight, out=weight)
 
 
@@ -164,7 +164,7 @@ def _width_shares(pixels: _BorderPixels) -> Float32[np.ndarray, "widths"]:
         belongs = likelihoods * shares
         shares = (belongs / belongs.sum(axis=1, keepdims=True)).mean(axis=0)
     shares *= expected
-    shares[0] += np.float32(1.0) - expected
+    shares[0] += 1.0 - expected
     return shares
 
 
@@ -172,12 +172,12 @@ def _color_likelihood(
     squared: Float32[np.ndarray, "*tried"],
     noise: Float32[np.ndarray, "*tried"],
     alpha: Float32[np.ndarray, "*tried"],
-    spread: Float32[np.ndarray, "..."] | np.float32,
+    spread: Float32[np.ndarray, "..."] | float,
 ) -> Float32[np.ndarray, "*tried"]:
     """Density of a color at a squared distance from the mixture, up to a factor."""
     variance = noise + (alpha * spread) ** 2
-    ratio = np.float32(16.0) / variance
-    return np.exp(np.float32(-0.5) * squared / variance) * ratio * np.sqrt(ratio)
+    ratio = 16.0 / variance
+    return np.exp(-0.5 * squared / variance) * ratio * np.sqrt(ratio)
 
 
 def border_distance_px(alpha: Plane) -> Plane:
@@ -225,7 +225,7 @@ def _fit_windows(
         return product
 
     # a = (Σ + tolerance² 1)⁻¹ cov(color, alpha), and b = mean(alpha) - a · mean(color)
-    rr, gg, bb = (covariance(i, i) + np.float32(tolerance**2) for i in range(3))
+    rr, gg, bb = (covariance(i, i) + tolerance**2 for i in range(3))
     rg, rb, gb = covariance(0, 1), covariance(0, 2), covariance(1, 2)
     red, green, blue = (covariance(i, 3) for i in range(3))  # become the slopes a
     # Gauss's elimination of the symmetric system, in place.
@@ -263,7 +263,7 @@ def apply_coefficients(
 
 def steepen(alpha: Plane) -> Plane:
     """Steepen a mask around 1/2."""
-    return np.clip(np.float32(2.0) * alpha - np.float32(0.5), np.float32(0.0), np.float32(1.0))
+    return np.clip(2.0 * alpha - 0.5, 0.0, 1.0)
 
 
 def move_border(image: Channels, alpha: Plane, plate: PlateColors) -> Plane:
@@ -275,16 +275,16 @@ def move_border(image: Channels, alpha: Plane, plate: PlateColors) -> Plane:
         cv2.resize(each, half_px, interpolation=cv2.INTER_AREA)
         for each in (sure.astype(np.float32), *image)
     )
-    inverse = np.float32(1.0) / np.maximum(cv2.blur(weight, window), np.float32(1e-6))
+    inverse = 1.0 / np.maximum(cv2.blur(weight, window), 1e-6)
     front = [cv2.blur(plane * weight, window) * inverse for plane in planes]
     total = planes[0] ** 2 + planes[1] ** 2 + planes[2] ** 2
     spread = cv2.blur(total * weight, window) * inverse
     spread -= front[0] ** 2 + front[1] ** 2 + front[2] ** 2
     # colors that the window's mean misses deviate by 14 levels
-    spread = np.sqrt(np.maximum(spread, np.float32(0.0)) / np.float32(3.0) + 14.0**2)
+    spread = np.sqrt(np.maximum(spread, 0.0) / 3.0 + 14.0**2)
     spread[inverse > 1e5] = np.inf
     person = cv2.resize(cv2.merge(front), size_px)
-    behind = np.where(plate.known, np.sqrt(plate.variance), np.float32(np.inf))
+    behind = np.where(plate.known, np.sqrt(plate.variance), np.inf)
     colors, before = (np.moveaxis(each, 0, 2) for each in (image, plate.mean))
     known = cv2.resize(spread.astype(np.float32), size_px, interpolation=cv2.INTER_NEAREST)
     return refine_border(colors, alpha, (before, behind), (person, known)) - alpha
@@ -302,4 +302,4 @@ def enlarge_alpha(
     alpha = full(coefficients[3])
     for channel, slope in zip(cv2.split(np.ascontiguousarray(rgb)), coefficients, strict=False):
         alpha = alpha + cv2.multiply(channel, full(slope), dtype=cv2.CV_32F)
-    return np.clip(steepen(alpha) + full(moved), np.float32(0.0), np.float32(1.0))
+    return np.clip(steepen(alpha) + full(moved), 0.0, 1.0)

@@ -46,9 +46,9 @@ class OnnxNetwork:
     ) -> dict[str, Float32[np.ndarray, "..."]]:
         """Run the network on an image scaled to [`low`, `high`]; its outputs by their names."""
         values = picture.astype(np.float32)
-        values *= np.float32((high - low) / 255)
+        values *= (high - low) / 255
         if low:
-            values += np.float32(low)
+            values += low
         outputs = self._session.run(None, {self._image: values[None]})
         return {
             name: np.asarray(output)[0] for name, output in zip(self._outputs, outputs, strict=True)

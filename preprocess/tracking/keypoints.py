@@ -54,9 +54,10 @@ class CroppedMask:
         scale = np.array(size_px) / np.array(frame_px)
         there = self.image_from_crop * scale[:, None]
         there[:, 2] += 0.5 * there[:, :2].sum(axis=1) - 0.5  # to OpenCV's pixels, middles at 0
-        return cv2.warpAffine(self.values, there, size_px, flags=cv2.INTER_LINEAR).astype(
-            np.float32
-        ) / np.float32(255.0)
+        return (
+            cv2.warpAffine(self.values, there, size_px, flags=cv2.INTER_LINEAR).astype(np.float32)
+            / 255.0
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
