@@ -42,11 +42,6 @@ def find_parts(folders: Iterable[Path]) -> list[Path]:
     return [path for folder in folders for name in names if (path := folder / name).exists()]
 
 
-def resolve_pose_path(path: Path) -> Path:
-    """The pose file of a capture folder, if `path` is one; else `path` itself."""
-    return _first_existing([path], POSE_FILE_NAMES) or path
-
-
 def find_own_poses(video: Path) -> Path | None:
     """The poses in a capture folder; None if there are none, or `video` is no folder."""
     return _first_existing([video], POSE_FILE_NAMES)

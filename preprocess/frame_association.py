@@ -58,25 +58,11 @@ def associate_by_time(
 
     Times of poses are in any order, NaN where unknown; the frame rate says how near a row must be.
     """
-    row_of = _nearest_row(times_s, _frame_interval_s(source))
-    _check_time_matches(times_s, source, row_of)
-    return row_of
-
-
-def _frame_interval_s(source: FrameSource) -> float | None:
-    """Time from one selected frame to the next, as the container claims."""
-    if not source.duration_s or not source.frame_count:
-        return None
-    return source.duration_s / source.frame_count
-
-
-def _check_time_matches(
-    times_s: Float[np.ndarray, "poses"], source: FrameSource, row_of: Callable[[float], int | None]
-) -> None:
-    """Raise an InputError if hardly any frame has a pose at its time."""
-    step, count = _frame_interval_s(source), source.frame_count
-    if step is None or count is None:
-        return
+    count = source.frame_count
+    if not source.duration_s or not count:
+        return _nearest_row(times_s, None)
+    step = source.duration_s / count  # from one selected frame to the next, as the container claims
+    row_of = _nearest_row(times_s, step)
     start = source.selection.start * step / source.selection.step
     found = {row_of(start + step * number) for number in range(count)} - {None}
     most = min(count, len(times_s))
@@ -88,6 +74,7 @@ def _check_time_matches(
             f"{start + step * count:.3g} s; `time` was expected in seconds since the video's first "
             "frame. Is it in milliseconds, or by another clock?"
         )
+    return row_of
 
 
 def _nearest_row(

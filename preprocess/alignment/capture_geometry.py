@@ -212,21 +212,14 @@ def sanity_warnings(geometry: CaptureGeometry, frames: list[int]) -> Iterator[st
     if len(motion.betas) and np.abs(motion.betas).max() > 6.0:
         yield f"A shape coefficient is {np.abs(motion.betas).max():.1f}; people have -3 to 3."
     yield from _jump_warnings(geometry)
-    seen = view_coverage(geometry)
+    roots = Rotation.from_rotvec(motion.root_rotations[motion.valid])
+    eyes = geometry.camera_centers()[geometry.camera_rows()[motion.valid]]
+    seen = view_sector_share(roots.inv().apply(eyes - motion.root_translations[motion.valid]))
     if seen < MIN_VIEW_COVERAGE:
         yield (
             f"The video shows the person from only {seen:.0%} of the directions around them; what "
             "it does not show cannot be learnt. Film the person turning around once."
         )
-
-
-def view_coverage(geometry: CaptureGeometry) -> float:
-    """Fraction of the directions around the body from which a camera sees it."""
-    valid = geometry.motion.valid
-    roots = Rotation.from_rotvec(geometry.motion.root_rotations[valid])
-    eyes = geometry.camera_centers()[geometry.camera_rows()[valid]]
-    seen = roots.inv().apply(eyes - geometry.motion.root_translations[valid])
-    return view_sector_share(seen)
 
 
 def view_sector_share(to_cameras: Float[np.ndarray, "views 3"]) -> float:
@@ -236,11 +229,11 @@ def view_sector_share(to_cameras: Float[np.ndarray, "views 3"]) -> float:
     return len(np.unique(sector.clip(0, VIEW_SECTORS - 1))) / VIEW_SECTORS
 
 
-def find_jumps(geometry: CaptureGeometry) -> tuple[list[int], float]:
-    """Frames before which the root jumps; the fraction of poses that repeat the one before."""
+def _jump_warnings(geometry: CaptureGeometry) -> Iterator[str]:
+    """Say before which frames the root jumps, and how many poses repeat the one before."""
     motion = geometry.motion
     if motion.valid.sum() < 3:
-        return [], 0.0
+        return
     rows = np.flatnonzero(motion.valid)
     rows = rows[np.argsort(geometry.row_frames[rows], kind="stable")]
     near = np.diff(geometry.row_frames[rows]) <= 1.5 * frame_step(geometry.row_frames)
@@ -248,13 +241,8 @@ def find_jumps(geometry: CaptureGeometry) -> tuple[list[int], float]:
     roots = Rotation.from_rotvec(motion.root_rotations[rows])
     turned = (roots[:-1].inv() * roots[1:]).magnitude()
     jumped = near & (_outliers(moved, least=0.25) | _outliers(turned, least=np.deg2rad(40.0)))
-    still = near & (moved == 0.0) & (turned == 0.0)
+    still = (near & (moved == 0.0) & (turned == 0.0)).sum() / max(1, near.sum())
     after = [int(geometry.row_frames[row]) for row in rows[1:][jumped]]
-    return after, float(still.sum() / max(1, near.sum()))
-
-
-def _jump_warnings(geometry: CaptureGeometry) -> Iterator[str]:
-    after, still = find_jumps(geometry)
     if after:
         times = "once" if len(after) == 1 else f"{len(after)} times"
         yield (

@@ -383,7 +383,11 @@ class CorrectionSearch:
         for _, correction in scored[MAX_CANDIDATES:]:
             if correction.cause not in {each.cause for each in kept}:
                 kept.append(correction)
-        return evaluate(kept, geometry, self.objective)
+        found = [(each, self.objective.frame_scores(each.apply(geometry))) for each in kept]
+        return [
+            CorrectionCandidate(correction=each, mean_score=mean_with_missing(s), frame_scores=s)
+            for each, s in found
+        ]
 
     def _score_coarsely(
         self, corrections: Iterable[Correction], geometry: CaptureGeometry
@@ -401,17 +405,6 @@ class CorrectionSearch:
             return ()
         fitted = fit_to_keypoints(geometry, self.objective.keypoints)
         return (c for c in fitted if self.mask_count or c.cause != "video_crop")
-
-
-def evaluate(
-    corrections: Iterable[Correction], geometry: CaptureGeometry, objective: CaptureObjective
-) -> list[CorrectionCandidate]:
-    """Score each correction, applied to the geometry alone."""
-    scored = [(each, objective.frame_scores(each.apply(geometry))) for each in corrections]
-    return [
-        CorrectionCandidate(correction=each, mean_score=mean_with_missing(s), frame_scores=s)
-        for each, s in scored
-    ]
 
 
 def best_per_cause(candidates: Iterable[CorrectionCandidate]) -> tuple[CorrectionCandidate, ...]:

@@ -178,15 +178,19 @@ def sample_masks(
     size_px = _scaled_size(source.size_px, longer=256.0)
     camera_row = associate_cameras(cameras, source)
     masks.check()
-    found, refused = _read_masks(masks, frames, size_px)
-    found = [(index, alpha) for index, alpha in found if (alpha > 0.5).any()]
-    if not found:
+    samples, refused = list[MaskSample](), list[str]()
+    for index in frames:
+        try:
+            alpha = masks.read(index, size_px)
+        except InputError as cause:
+            refused.append(str(cause))
+            continue
+        if (alpha > 0.5).any():
+            samples.append(MaskSample(index=index, camera_row=camera_row(index), alpha=alpha))
+    if not samples:
         raise InputError(
             f"None of the masks of {len(frames)} frames of {source.path} shows a person."
         )
-    samples = [
-        MaskSample(index=index, camera_row=camera_row(index), alpha=alpha) for index, alpha in found
-    ]
     samples = reduce_masks(samples, source.size_px, person_px)
     return SilhouetteObjective(samples=samples, skin=skin, rejections=tuple(refused))
 
@@ -205,19 +209,6 @@ def reduce_masks(
     return tuple(replace(each, alpha=_resize_alpha(each.alpha, small)) for each in samples)
 
 
-def _read_masks(
-    masks: MaskSource, frames: Sequence[int], size_px: tuple[int, int]
-) -> tuple[list[tuple[int, Float32[np.ndarray, "_ _"]]], list[str]]:
-    """The usable masks, and why others cannot be used."""
-    found, refused = [], []
-    for index in frames:
-        try:
-            found.append((index, masks.read(index, size_px)))
-        except InputError as cause:
-            refused.append(str(cause))
-    return found, refused
-
-
 def _scaled_size(size_px: tuple[int, int], longer: float) -> tuple[int, int]:
     scale = min(1.0, longer / max(size_px))
     return max(8, round(size_px[0] * scale)), max(8, round(size_px[1] * scale))
@@ -233,12 +224,8 @@ def _resize_alpha(alpha: Float32[np.ndarray, "_ _"], size_px: tuple[int, int]) -
 
 def mask_warnings(objective: SilhouetteObjective | None, height_px: int) -> Iterator[str]:
     """Describe what is implausible in masks, for people; `height_px` is that of the images."""
-    if objective is not None:
-        yield from _unusable_mask_warnings(objective)
-        yield from _framing_warnings(objective, height_px)
-
-
-def _unusable_mask_warnings(objective: SilhouetteObjective) -> Iterator[str]:
+    if objective is None:
+        return
     looked = len(objective.rejections) + len(objective.samples)
     if objective.rejections:
         first = objective.rejections[0].rstrip(".")
@@ -251,9 +238,6 @@ def _unusable_mask_warnings(objective: SilhouetteObjective) -> Iterator[str]:
             "The masks are boxes, not outlines: all that is in them will be learnt as the person. "
             "Leave them out (--masks segmenter:blazepose), or give a segmenter's."
         )
-
-
-def _framing_warnings(objective: SilhouetteObjective, height_px: int) -> Iterator[str]:
     alphas = [sample.alpha > 0.5 for sample in objective.samples]
     touching = sum(a[0].any() or a[:, 0].any() or a[:, -1].any() or a[-1].any() for a in alphas)
     if touching > 0.2 * len(alphas):

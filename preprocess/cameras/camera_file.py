@@ -192,11 +192,8 @@ def assume_static_camera(motion: Motion, size_px: tuple[int, int]) -> CameraTrac
             f"No camera was given; the tracker's focal length of {intrinsic[0, 0]:.0f} px is used."
         )
         return CameraTrack(cameras=(camera,), source="focal length of the tracker", note=note)
-    focal = DEFAULT_FOCAL_RATIO * max(size_px)
-    camera = Camera.from_intrinsic(
-        RelativeFocalLength(ratio=DEFAULT_FOCAL_RATIO).intrinsic_matrix(size_px), size_px
-    )
-    note = f"No camera was given; a focal length of {focal:.0f} px is assumed."
+    camera = _phone_camera(size_px)
+    note = f"No camera was given; a focal length of {camera.focal_px[0]:.0f} px is assumed."
     if motion.assumed_focal is not None:
         note += (
             f" The tracker's own ({motion.assumed_focal.ratio:.1f} times the "
@@ -204,6 +201,11 @@ def assume_static_camera(motion: Motion, size_px: tuple[int, int]) -> CameraTrac
             "again."
         )
     return CameraTrack(cameras=(camera,), source=ASSUMED_CAMERA_SOURCE, note=note)
+
+
+def _phone_camera(size_px: tuple[int, int]) -> Camera:
+    phone = RelativeFocalLength(ratio=DEFAULT_FOCAL_RATIO)
+    return Camera.from_intrinsic(phone.intrinsic_matrix(size_px), size_px)
 
 
 def assume_camera(video: Path, named: str | None, source: FrameSource) -> Camera:
@@ -214,8 +216,7 @@ def assume_camera(video: Path, named: str | None, source: FrameSource) -> Camera
     """
     path = find_cameras(video, named)
     if path is None:
-        phone = RelativeFocalLength(ratio=DEFAULT_FOCAL_RATIO).intrinsic_matrix(source.size_px)
-        return Camera.from_intrinsic(phone, source.size_px)
+        return _phone_camera(source.size_px)
     cameras = read_cameras(path, source.size_px, None if source.live else source)
     return replace(cameras[0], camera_from_world=np.eye(4))
 

@@ -201,7 +201,9 @@ def place_in_camera_world(
     if motion.space == "camera":
         motion = _refocus_motion(motion, shaped, cameras[0])
         if cameras.is_moving or not np.allclose(cameras[0].camera_from_world, np.eye(4)):
-            worlds = [invert_rigid(_camera_of(motion, row, cameras)) for row in range(len(motion))]
+            numbers = range(len(motion)) if motion.frames is None else motion.frames.tolist()
+            seen = [cameras[min(number, len(cameras.cameras) - 1)] for number in numbers]
+            worlds = [invert_rigid(camera.camera_from_world) for camera in seen]
             motion = transform_motion(motion, np.stack(worlds), shaped.joints[0])
         return replace(motion, space="world")
     if motion.camera_from_world is not None and not cameras_given:
@@ -241,17 +243,6 @@ def transform_motion(
     )
 
 
-def refocus_translation(
-    joints: Float[np.ndarray, "24 3"], intrinsic: Float[np.ndarray, "3 3"], camera: Camera
-) -> Float[np.ndarray, "3"]:
-    """Shift of a body in the tracker's camera so that the true one sees it where that one did.
-
-    The tracker's K is that for images of the true camera's size.
-    """
-    pixels = joints[:, :2] / joints[:, 2:] * intrinsic[[0, 1], [0, 1]] + intrinsic[:2, 2]
-    return place_by_pixels(joints, pixels, camera)
-
-
 def place_by_pixels(
     joints: Float[np.ndarray, "joints 3"], pixels: Float[np.ndarray, "joints 2"], camera: Camera
 ) -> Float[np.ndarray, "3"]:
@@ -272,21 +263,21 @@ def place_by_pixels(
 
 
 def _refocus_motion(motion: Motion, shaped: ShapedBody, camera: Camera) -> Motion:
-    """The motion as the true camera sees it, if the tracker took another focal length."""
+    """The motion as the true camera sees it where the tracker's own, of another K, did."""
     intrinsic = tracker_intrinsic_matrix(motion, camera.size_px)
     if intrinsic is None:
         return motion
     off = np.abs(intrinsic - camera.intrinsic)[:2]
     if (off <= 0.01 * max(camera.focal_px)).all():
         return motion
-    shifted = motion.root_translations.copy()
+    shifted, focal, center = (
+        motion.root_translations.copy(),
+        np.diag(intrinsic)[:2],
+        intrinsic[:2, 2],
+    )
     for row in np.flatnonzero(motion.valid):
         joints = shaped.with_pose(motion[int(row)]).joints()
         if (joints[:, 2] > 0.0).all():
-            shifted[row] += refocus_translation(joints, intrinsic, camera)
+            pixels = joints[:, :2] / joints[:, 2:] * focal + center
+            shifted[row] += place_by_pixels(joints, pixels, camera)
     return replace(motion, root_translations=shifted)
-
-
-def _camera_of(motion: Motion, row: int, cameras: CameraTrack) -> Float[np.ndarray, "4 4"]:
-    frame = row if motion.frames is None else int(motion.frames[row])
-    return cameras[min(frame, len(cameras.cameras) - 1)].camera_from_world

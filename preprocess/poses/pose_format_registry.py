@@ -10,7 +10,7 @@ import numpy as np
 from capture.image_folder import refuse_pipe
 from capture.input_error import InputError, counted
 from preprocess.body.body_pose import Motion
-from preprocess.capture_inputs import resolve_pose_path
+from preprocess.capture_inputs import find_own_poses
 from preprocess.file_content import explain_damage, read_untrusted_file
 from preprocess.poses import body_joints, skeleton_files, tracker_files
 from preprocess.poses.motion_builder import MAX_GAP_FRAMES, MotionByPerson, fill_gaps
@@ -44,7 +44,7 @@ def read_poses(path: Path, *, person: str | None = None, prefer_world: bool = Fa
     A person is named by the file's own number or name; `prefer_world` reads poses in the world
     rather than in a camera, to drive an avatar.
     """
-    path = resolve_pose_path(path)
+    path = find_own_poses(path) or path
     refuse_pipe(path)
     content = read_untrusted_file(path)
     tool, people = _recognize(content, path, prefer_world)

@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from capture.camera import Camera
-from capture.source import FrameSource
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -144,18 +143,6 @@ class CameraSolution:
     frame_status: Int[np.ndarray, "frames"]
     keyframe_count: int
     costs: dict[str, float] = field(default_factory=dict)
-
-    @classmethod
-    def static(
-        cls, source: FrameSource, background_motion: float, keyframe_count: int
-    ) -> "CameraSolution":
-        """The finding that the camera of some frames stood still."""
-        frames = source.frames_in_file
-        return cls(
-            is_static=True, background_motion=background_motion, gates=(), model=None,
-            camera_from_solved=np.zeros((frames, 4, 4)),
-            frame_status=np.full(frames, MISSING, dtype=np.int64), keyframe_count=keyframe_count,
-        )  # fmt: skip
 
     def lens(self, size_px: tuple[int, int]) -> Camera:
         """The lens, for images of the frames' size."""

@@ -117,7 +117,12 @@ def _solve(
     keys = write_keyframes(chosen, folder / "images", folder / "masks")
     background_motion = measure_background_motion(keys)
     if background_motion <= MAX_STATIC_MOTION:  # not of a background that was lost
-        return CameraSolution.static(source, background_motion, len(keys))
+        frames = source.frames_in_file
+        return CameraSolution(
+            is_static=True, background_motion=background_motion, gates=(), model=None,
+            camera_from_solved=np.zeros((frames, 4, 4)),
+            frame_status=np.full(frames, MISSING, dtype=np.int64), keyframe_count=len(keys),
+        )  # fmt: skip
     ratio, longer_px = settings.focal_ratio, max(keys[0].gray.shape)
     workspace = ColmapWorkspace(
         images=folder / "images", masks=folder / "masks", database=folder / "matches.db",

@@ -17,7 +17,12 @@ from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import rotation_matrices
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.tracking.keypoints import HIPS, KeypointTrack
-from preprocess.tracking.video_tracking import MIN_FRAMES, PROBLEM_BITS, TrackingProblem
+from preprocess.tracking.video_tracking import (
+    MIN_FRAMES,
+    PROBLEM_BITS,
+    TrackingProblem,
+    find_runs,
+)
 
 MIN_IOU = 0.7
 """Least mean IoU of body and mask of poses that are good enough for an avatar."""
@@ -237,10 +242,8 @@ def _missed(
     tracked: Int[np.ndarray, "rows"],
 ) -> dict[int, float]:
     """Degree to which each frame without a pose may show the person, in [0, 1], by its number."""
-    lost = ~np.isin(numbers, tracked)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], lost, [False]])))
     weights: dict[int, float] = {}
-    for first, end in edges.reshape(-1, 2):
+    for first, end in find_runs(~np.isin(numbers, tracked)):
         length_s = times_s[end - 1] - times_s[first]
         degree = 1.0 / (1.0 + length_s**2)  # half in a gap of 1 s; in longer ones they are away
         weights.update(dict.fromkeys(numbers[first:end].tolist(), float(degree)))

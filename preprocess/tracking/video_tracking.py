@@ -233,13 +233,18 @@ def mark_passers_by(track: KeypointTrack) -> KeypointTrack:
     bit, frames = PROBLEM_BITS[TrackingProblem.CROWDED], track.frames
     crowded, landings = (track.problems & bit) > 0, frames[_hip_jumps(track)]
     marked = crowded.copy()
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], crowded, [False]])))
-    for first, last in frames[edges.reshape(-1, 2) - [0, 1]]:
+    for first, last in frames[find_runs(crowded) - [0, 1]]:
         before = landings[(landings >= first - 20) & (landings <= first)]
         after = landings[(landings > last) & (landings <= last + 20)]
         start, end = min(before, default=first), max(after, default=last + 1)
         marked |= (frames >= start) & (frames < end)
     return replace(track, problems=track.problems | marked * bit)
+
+
+def find_runs(flags: Bool[np.ndarray, "rows"]) -> Int[np.ndarray, "runs 2"]:
+    """First row and end of each run of rows that are flagged."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]])))
+    return edges.reshape(-1, 2)
 
 
 def _hip_jumps(track: KeypointTrack) -> Bool[np.ndarray, "rows"]:
