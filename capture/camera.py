@@ -6,6 +6,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+Vector3 = Float[np.ndarray, "3"]
+"""A place, a direction or an axis-angle."""
+
+Matrix3 = Float[np.ndarray, "3 3"]
+"""A rotation, or a camera's matrix K."""
+
+Transform = Float[np.ndarray, "4 4"]
+"""A rigid transform."""
+
+PointsInPlane = Float[np.ndarray, "*batch 2"]
+"""Points of an image, pixels, or of the plane at depth 1."""
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Camera:
@@ -25,15 +37,15 @@ class Camera:
     focal_px: tuple[float, float]
     center_px: tuple[float, float]
     size_px: tuple[int, int]
-    camera_from_world: Float[np.ndarray, "4 4"]
+    camera_from_world: Transform
     distortion: tuple[float, ...] = ()
 
     @classmethod
     def from_intrinsic(
         cls,
-        intrinsic: Float[np.ndarray, "3 3"],
+        intrinsic: Matrix3,
         size_px: tuple[int, int],
-        camera_from_world: Float[np.ndarray, "4 4"] | None = None,
+        camera_from_world: Transform | None = None,
         distortion: Sequence[float] = (),
     ) -> "Camera":
         """A camera from its 3x3 matrix K; at the world's origin if no pose is given."""
@@ -46,13 +58,7 @@ class Camera:
         )
 
     @classmethod
-    def at(
-        cls,
-        eye: Float[np.ndarray, "3"],
-        axes: Float[np.ndarray, "3 3"],
-        focal_px: float,
-        size_px: tuple[int, int],
-    ) -> "Camera":
+    def at(cls, eye: Vector3, axes: Matrix3, focal_px: float, size_px: tuple[int, int]) -> "Camera":
         """A camera at a place, metres, with its right, down and forward axes in the world as rows.
 
         Its principal point is the image's middle.
@@ -67,13 +73,13 @@ class Camera:
         )
 
     @property
-    def intrinsic(self) -> Float[np.ndarray, "3 3"]:
+    def intrinsic(self) -> Matrix3:
         """The 3x3 matrix K."""
         (fx, fy), (cx, cy) = self.focal_px, self.center_px
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
     @property
-    def center_world(self) -> Float[np.ndarray, "3"]:
+    def center_world(self) -> Vector3:
         """The camera's position, metres."""
         rotation, translation = self.camera_from_world[:3, :3], self.camera_from_world[:3, 3]
         return -rotation.T @ translation
@@ -103,9 +109,7 @@ class Camera:
         width, height = (max(1, round(side * scale)) for side in self.size_px)
         return self.resize((width, height))
 
-    def ray_directions(
-        self, pixels: Float[np.ndarray, "*batch 2"]
-    ) -> Float[np.ndarray, "*batch 3"]:
+    def ray_directions(self, pixels: PointsInPlane) -> Float[np.ndarray, "*batch 3"]:
         """Unit directions in the world of the rays through `pixels` (x, y).
 
         All rays start at `center_world`.
@@ -118,7 +122,7 @@ class Camera:
         in_world = in_camera @ self.camera_from_world[:3, :3]
         return in_world / np.linalg.norm(in_world, axis=-1, keepdims=True)
 
-    def project(self, points_world: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 2"]:
+    def project(self, points_world: Float[np.ndarray, "*batch 3"]) -> PointsInPlane:
         """Project points of the world to (x, y) in pixels; meaningless behind the camera."""
         rotation, translation = self.camera_from_world[:3, :3], self.camera_from_world[:3, 3]
         in_camera = points_world @ rotation.T + translation
@@ -127,7 +131,7 @@ class Camera:
             plane = self._distort(plane)
         return plane * np.array(self.focal_px) + np.array(self.center_px)
 
-    def _undistort(self, pixels: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+    def _undistort(self, pixels: PointsInPlane) -> PointsInPlane:
         """Pixels as points of the plane at depth 1, as a lens without distortion sees them."""
         import cv2  # heavy, and only needed for lenses that bend
 
@@ -135,7 +139,7 @@ class Camera:
         plane = cv2.undistortPoints(flat, self.intrinsic, np.array(self.distortion))
         return np.asarray(plane).reshape(pixels.shape)
 
-    def _distort(self, plane: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
+    def _distort(self, plane: PointsInPlane) -> PointsInPlane:
         """Points of the plane at depth 1, moved to where the lens bends them."""
         import cv2  # heavy, and only needed for lenses that bend
 

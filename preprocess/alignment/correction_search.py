@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from capture.camera import Matrix3, Vector3
 from preprocess.alignment.capture_geometry import CaptureGeometry, relative_change
 from preprocess.alignment.corrections import (
     CAUSES,
@@ -50,11 +51,11 @@ MIRRORED_JOINTS = [
 """Row of each joint's other side among the 23 joint rotations."""
 CatalogEntries = Iterator[tuple[str, str, GeometryChange]]
 """Causes, what was wrong, and the changes that undo it."""
-Rotation3 = Float[np.ndarray, "3 3"]
+Rotation3 = Matrix3
 
 
 def body_corrections(
-    geometry: CaptureGeometry, pelvis: Float[np.ndarray, "3"], frames: int
+    geometry: CaptureGeometry, pelvis: Vector3, frames: int
 ) -> Iterator[Correction]:
     """Every discrete mistake between body and masks; focal lengths and sizes are fitted instead.
 
@@ -154,7 +155,7 @@ def _turn_entries(geometry: CaptureGeometry) -> CatalogEntries:
             yield cause, description, partial(change, turn=turn)
 
 
-def _pose_entries(motion: Motion, pelvis: Float[np.ndarray, "3"]) -> CatalogEntries:
+def _pose_entries(motion: Motion, pelvis: Vector3) -> CatalogEntries:
     """Other units, signs and origins, and left and right exchanged."""
 
     def about_origin(motion: Motion, sign: float) -> Motion:
@@ -342,7 +343,7 @@ class CorrectionSearch:
     """
 
     objective: CaptureObjective
-    pelvis: Float[np.ndarray, "3"]
+    pelvis: Vector3
     frames: int
     mask_count: int
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from capture.camera import Vector3
 from preprocess.alignment.capture_geometry import FULL_WINDOW, CaptureGeometry
 from preprocess.alignment.keypoint_objective import KeypointObjective
 
@@ -147,7 +148,7 @@ def shift_principal_point(right_px: float, down_px: float) -> Correction:
     )
 
 
-def divide_distances(factor: float, pelvis: Float[np.ndarray, "3"]) -> Correction:
+def divide_distances(factor: float, pelvis: Vector3) -> Correction:
     """A person who is too small (factor above 1) or too large for where the poses put them.
 
     Images show only the ratio of size and distance, and the size is the body's own: distances are

@@ -6,6 +6,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from capture.camera import Matrix3, Vector3
 from preprocess.body.kinematics import slerp
 from preprocess.tracking.keypoints import KeypointTrack
 
@@ -23,8 +24,8 @@ class BodyPose:
         joint_rotations: Axis-angle of joints 1 … 23 relative to their parents, radians.
     """
 
-    root_rotation: Float[np.ndarray, "3"]
-    root_translation: Float[np.ndarray, "3"]
+    root_rotation: Vector3
+    root_translation: Vector3
     joint_rotations: Float[np.ndarray, "23 3"]
 
     @classmethod
@@ -63,7 +64,7 @@ class RelativeFocalLength:
     ratio: float
     reference: Literal["longer side", "diagonal"] = "longer side"
 
-    def intrinsic_matrix(self, size_px: tuple[int, int]) -> Float[np.ndarray, "3 3"]:
+    def intrinsic_matrix(self, size_px: tuple[int, int]) -> Matrix3:
         """The camera matrix K for images of a size (width, height)."""
         width, height = size_px
         unit = max(size_px) if self.reference == "longer side" else float(np.hypot(width, height))
@@ -114,7 +115,7 @@ class Motion:
     body_model: str
     frames: Int[np.ndarray, "poses"] | None = None
     times_s: Float[np.ndarray, "poses"] | None = None
-    intrinsic: Float[np.ndarray, "3 3"] | None = None
+    intrinsic: Matrix3 | None = None
     assumed_focal: RelativeFocalLength | None = None
     anchor: RootAnchor = "pelvis"
     space: PoseSpace = "world"

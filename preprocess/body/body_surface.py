@@ -14,10 +14,17 @@ from capture.source import AlphaMask
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.parametric_body import ShapedBody
 
+Silhouette = Bool[np.ndarray, "height width"]
+"""Pixels that a body covers."""
 
-def vertex_normals(
-    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> Float[np.ndarray, "vertices 3"]:
+Faces = Int[np.ndarray, "faces 3"]
+"""Vertices of each triangle."""
+
+Vertices = Float[np.ndarray, "vertices 3"]
+"""Places of a mesh, metres, or directions there."""
+
+
+def vertex_normals(vertices: Vertices, faces: Faces) -> Vertices:
     """Outward unit normals, area-weighted over the triangles around each vertex."""
     doubled, corners = _doubled_area_vectors(vertices, faces), faces.ravel()
     normals = np.column_stack(
@@ -29,19 +36,14 @@ def vertex_normals(
     return normals / (np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12)
 
 
-def vertex_areas(
-    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> Float[np.ndarray, "vertices"]:
+def vertex_areas(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "vertices"]:
     """Each vertex's share of the surface, m²: a third of every triangle around it."""
     thirds = np.linalg.norm(_doubled_area_vectors(vertices, faces), axis=1) / 6.0
     return np.bincount(faces.ravel(), np.repeat(thirds, 3), minlength=len(vertices))
 
 
 def smooth_over_surface(
-    vertices: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
-    values: Float[np.ndarray, "vertices channels"],
-    sigma_m: float,
+    vertices: Vertices, faces: Faces, values: Float[np.ndarray, "vertices channels"], sigma_m: float
 ) -> Float[np.ndarray, "vertices channels"]:
     """Averages values over about `sigma_m` metres of the surface.
 
@@ -63,9 +65,7 @@ def smooth_over_surface(
     return splu(system.tocsc()).solve(areas[:, None] * values)
 
 
-def _doubled_area_vectors(
-    vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
-) -> Float[np.ndarray, "faces 3"]:
+def _doubled_area_vectors(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "faces 3"]:
     """Normal of each triangle, twice its area long."""
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
     return np.cross(b - a, c - a)
@@ -197,14 +197,12 @@ class SkinPoints:
         blended = (self.weights @ transforms.reshape(24, 12).astype(np.float32)).reshape(-1, 3, 4)
         return np.einsum("pab,pb->pa", blended[:, :, :3], self.rest) + blended[:, :, 3]
 
-    def draw(self, pose: BodyPose, camera: Camera) -> Bool[np.ndarray, "height width"]:
+    def draw(self, pose: BodyPose, camera: Camera) -> Silhouette:
         """The pixels that the body covers (`splat_silhouette`)."""
         return splat_silhouette(self.posed(pose), camera)
 
 
-def splat_silhouette(
-    points_world: Float[np.ndarray, "points 3"], camera: Camera
-) -> Bool[np.ndarray, "height width"]:
+def splat_silhouette(points_world: Float[np.ndarray, "points 3"], camera: Camera) -> Silhouette:
     """The pixels that dense points of a surface in front of the camera cover.
 
     Holes of a pixel or two between the points are closed.
@@ -234,7 +232,7 @@ def _project(
     return projected
 
 
-def soft_iou(body: Bool[np.ndarray, "height width"], alpha: AlphaMask) -> float:
+def soft_iou(body: Silhouette, alpha: AlphaMask) -> float:
     """Soft intersection over union of a silhouette and a mask, in [0, 1].
 
     The sum over the pixels of the smaller value over the sum of the larger.
@@ -244,7 +242,7 @@ def soft_iou(body: Bool[np.ndarray, "height width"], alpha: AlphaMask) -> float:
     return both / union if union > 0.0 else 0.0
 
 
-def signed_distance_px(mask: Bool[np.ndarray, "height width"]) -> AlphaMask:
+def signed_distance_px(mask: Silhouette) -> AlphaMask:
     """Distance of each pixel's center from a shape's border, px; negative inside."""
     hard = mask.astype(np.uint8)
     outside = cv2.distanceTransform(1 - hard, cv2.DIST_L2, 5)

@@ -5,6 +5,17 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from capture.camera import Matrix3, Transform, Vector3
+
+JointPlaces = Float[np.ndarray, "24 3"]
+"""A place, or a vector, for each of the 24 joints."""
+
+Rotations = Float[np.ndarray, "*batch 3 3"]
+"""Rotation matrices."""
+
+Vectors = Float[np.ndarray, "*batch 3"]
+"""Vectors, or axis-angles in radians."""
+
 JOINT_NAMES = (
     "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2",
     "left_ankle", "right_ankle", "spine3", "left_foot", "right_foot", "neck", "left_collar",
@@ -18,9 +29,7 @@ PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18,
 """Parent of each joint, before its children; -1 for the root."""
 
 
-def rotation_matrices(
-    axis_angles: Float[np.ndarray, "*batch 3"],
-) -> Float[np.ndarray, "*batch 3 3"]:
+def rotation_matrices(axis_angles: Vectors) -> Rotations:
     """Rotation matrices of axis-angle vectors in radians (Rodrigues' formula)."""
     axis_angles = np.asarray(axis_angles, dtype=np.float64)
     angle = np.linalg.norm(axis_angles, axis=-1)[..., None, None]
@@ -31,7 +40,7 @@ def rotation_matrices(
     return np.eye(3) + sine * cross + cosine * (cross @ cross)
 
 
-def cross_matrices(vectors: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3 3"]:
+def cross_matrices(vectors: Vectors) -> Rotations:
     """The matrices that multiply by the cross product."""
     x, y, z = np.moveaxis(vectors, -1, 0)
     zero = np.zeros_like(x)
@@ -39,12 +48,12 @@ def cross_matrices(vectors: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, 
     return cross.reshape(*vectors.shape, 3)
 
 
-def unit_vectors(vectors: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+def unit_vectors(vectors: Vectors) -> Vectors:
     """Vectors of length 1; 0 stays."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
 
-def shortest_turn(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
+def shortest_turn(a: Vector3, b: Vector3) -> Matrix3:
     """The rotation by the least angle that takes direction a to direction b."""
     a, b = unit_vectors(a), unit_vectors(b)
     axis = np.cross(a, b)
@@ -55,9 +64,7 @@ def shortest_turn(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> Float
     return rotation_matrices(axis / sine * np.arctan2(sine, a @ b))
 
 
-def rigid_transform(
-    rotation: Float[np.ndarray, "*batch 3 3"], translation: Float[np.ndarray, "*batch 3"]
-) -> Float[np.ndarray, "*batch 4 4"]:
+def rigid_transform(rotation: Rotations, translation: Vectors) -> Float[np.ndarray, "*batch 4 4"]:
     """Transforms x ↦ R x + t as 4x4 matrices."""
     transform = np.zeros((*translation.shape[:-1], 4, 4))
     transform[..., :3, :3], transform[..., :3, 3] = rotation, translation
@@ -111,10 +118,8 @@ def descendant_matrix(parents: Int[np.ndarray, "joints"]) -> Float[np.ndarray, "
 
 
 def world_from_body(
-    pelvis: Float[np.ndarray, "3"],
-    root_rotation: Float[np.ndarray, "3"],
-    root_translation: Float[np.ndarray, "3"],
-) -> Float[np.ndarray, "4 4"]:
+    pelvis: Vector3, root_rotation: Vector3, root_translation: Vector3
+) -> Transform:
     """The root's rigid motion: turn about the rest pelvis J0, then shift (SMPL's convention)."""
     rotation = rotation_matrices(root_rotation)
     return rigid_transform(rotation, pelvis + root_translation - rotation @ pelvis)
@@ -124,9 +129,7 @@ SUPPORTED_JOINT_COUNTS = (22, 24, 52, 55)
 """Numbers of joints that a pose may have: without hands, SMPL, SMPL+H, SMPL-X."""
 
 
-def axis_angles_from_matrices(
-    matrices: Float[np.ndarray, "*batch 3 3"],
-) -> Float[np.ndarray, "*batch 3"]:
+def axis_angles_from_matrices(matrices: Rotations) -> Vectors:
     """Axis-angles of the rotations nearest to 3x3 matrices; NaN for what is none."""
     from scipy.spatial.transform import Rotation  # the player runs without scipy
 

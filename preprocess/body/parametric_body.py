@@ -12,9 +12,16 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float64, Int, Shaped
 
+from capture.camera import Transform
 from capture.input_error import InputError
 from preprocess.body.body_pose import BodyPose, Motion
-from preprocess.body.kinematics import PARENTS, body_from_rest, rotation_matrices, world_from_body
+from preprocess.body.kinematics import (
+    PARENTS,
+    JointPlaces,
+    body_from_rest,
+    rotation_matrices,
+    world_from_body,
+)
 from preprocess.file_content import explain_damage, read_npz, read_pickled_arrays
 
 
@@ -36,7 +43,7 @@ class BodyModel:
     template: Float[np.ndarray, "vertices 3"]
     faces: Int[np.ndarray, "faces 3"]
     weights: Float[np.ndarray, "vertices 24"]
-    joints: Float[np.ndarray, "24 3"]
+    joints: JointPlaces
     parents: Int[np.ndarray, "24"]
     shape_directions: Float[np.ndarray, "vertices 3 betas"]
     joint_directions: Float[np.ndarray, "24 3 betas"]
@@ -61,7 +68,7 @@ class ShapedBody:
 
     body: BodyModel
     vertices: Float[np.ndarray, "vertices 3"]
-    joints: Float[np.ndarray, "24 3"]
+    joints: JointPlaces
 
     @property
     def height_m(self) -> float:
@@ -101,7 +108,7 @@ class PosedBody:
         shaped = self.shaped
         return body_from_rest(shaped.joints, shaped.body.parents, self.pose.joint_rotations)
 
-    def world_from_body(self) -> Float[np.ndarray, "4 4"]:
+    def world_from_body(self) -> Transform:
         """The root's rigid motion."""
         pose = self.pose
         return world_from_body(self.shaped.joints[0], pose.root_rotation, pose.root_translation)
@@ -119,7 +126,7 @@ class PosedBody:
         world_from_rest = np.einsum("vj,jab->vab", body.weights, self.world_from_rest())
         return np.einsum("vab,vb->va", world_from_rest[:, :3, :3], rest) + world_from_rest[:, :3, 3]
 
-    def joints(self) -> Float[np.ndarray, "24 3"]:
+    def joints(self) -> JointPlaces:
         """Posed joints in the world, metres."""
         transforms, rest = self.world_from_rest(), self.shaped.joints
         return np.einsum("jab,jb->ja", transforms[:, :3, :3], rest) + transforms[:, :3, 3]
@@ -147,7 +154,7 @@ def with_smpl_joints(shaped: ShapedBody) -> ShapedBody:
 
 
 @cache
-def smpl_rest_joints() -> Float[np.ndarray, "24 3"]:
+def smpl_rest_joints() -> JointPlaces:
     """Rest joints of SMPL's mean shape, metres (public; see data/LICENSE-body24.md)."""
     text = (files("preprocess") / "data" / "smpl_rest_joints.json").read_text(encoding="utf-8")
     return np.array(json.loads(text)["neutral"], dtype=np.float64)

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from capture.input_error import InputError
 from preprocess.body.body_pose import Motion
 from preprocess.body.body_surface import smooth_over_surface, vertex_normals
-from preprocess.body.kinematics import HEAD_JOINT
+from preprocess.body.kinematics import HEAD_JOINT, JointPlaces
 from preprocess.body.parametric_body import (
     BodyModel,
     ShapedBody,
@@ -105,7 +105,7 @@ def _outward_directions(shaped: ShapedBody) -> Float[np.ndarray, "vertices 3"]:
 
 def _lengthen(
     shaped: ShapedBody, group: tuple[int, ...]
-) -> tuple[Float[np.ndarray, "vertices 3"], Float[np.ndarray, "24 3"]]:
+) -> tuple[Float[np.ndarray, "vertices 3"], JointPlaces]:
     """Displacement of vertices and joints per unit of log length of the bones that end in a group.
 
     A vertex moves with its bone's joint and, in proportion to its place along the bone, with the

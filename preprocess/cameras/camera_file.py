@@ -4,9 +4,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
 
-from capture.camera import Camera, same_aspect_ratio
+from capture.camera import Camera, Matrix3, same_aspect_ratio
 from capture.image_folder import refuse_pipe
 from capture.input_error import InputError
 from capture.source import FrameSource
@@ -221,9 +220,7 @@ def assume_camera(video: Path, named: str | None, source: FrameSource) -> Camera
     return replace(cameras[0], camera_from_world=np.eye(4))
 
 
-def tracker_intrinsic_matrix(
-    motion: Motion, size_px: tuple[int, int]
-) -> Float[np.ndarray, "3 3"] | None:
+def tracker_intrinsic_matrix(motion: Motion, size_px: tuple[int, int]) -> Matrix3 | None:
     """The tracker's K for images of a size; None if it is not known.
 
     A K whose principal point is the middle of a larger or smaller image belongs to such a one.

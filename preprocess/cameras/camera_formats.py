@@ -32,7 +32,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from capture.camera import Camera
+from capture.camera import Camera, Transform
 from capture.image_folder import natural_sort_key
 from capture.input_error import InputError
 from preprocess.body.kinematics import rigid_transform
@@ -97,12 +97,12 @@ def image_name(stored: str) -> str:
     return str(path.with_suffix("")) if path.name else ""
 
 
-def invert_rigid(transform: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+def invert_rigid(transform: Transform) -> Transform:
     """The inverse of a rotation and shift."""
     return rigid_transform(transform[:3, :3].T, -transform[:3, :3].T @ transform[:3, 3])
 
 
-def camera_from_opengl(world_from_camera: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+def camera_from_opengl(world_from_camera: Transform) -> Transform:
     """OpenCV's camera-from-world of a world-from-camera matrix with OpenGL's camera axes."""
     return OPENCV_FROM_OPENGL @ invert_rigid(world_from_camera)
 
@@ -322,13 +322,13 @@ def _read_transforms(content: dict[str, Any], size_px: tuple[int, int] | None) -
 
 
 def _transforms_camera(
-    numbers: dict[str, Any], applied: Float[np.ndarray, "4 4"], size_px: tuple[int, int] | None
+    numbers: dict[str, Any], applied: Transform, size_px: tuple[int, int] | None
 ) -> Camera:
     """One frame's camera; what the frame does not say, the file does."""
     lens = "a fisheye" if numbers.get("is_fisheye") else numbers.get("camera_model", "OPENCV")
     if lens not in (
         "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV_FULL",
-        "perspective",
+        "perspective"
     ):  # fmt: skip
         raise ValueError(
             f"camera model {lens}; undistort the images first (cv2.fisheye.undistortImage, or "

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.kinematics import (
     PARENTS,
+    JointPlaces,
     axis_angles_from_matrices,
     cross_matrices,
     rigid_transform,
@@ -41,9 +42,7 @@ class PosedJoints(NamedTuple):
     turns: Float[np.ndarray, "frames 24 3 3"]
     places: Float[np.ndarray, "frames 24 3"]
 
-    def world_from_rest(
-        self, rest_joints: Float[np.ndarray, "24 3"]
-    ) -> Float[np.ndarray, "frames 24 4 4"]:
+    def world_from_rest(self, rest_joints: JointPlaces) -> Float[np.ndarray, "frames 24 4 4"]:
         """Transforms that carry points of the rest pose with their joints."""
         return rigid_transform(
             self.turns, self.places - (self.turns @ rest_joints[..., None])[..., 0]
@@ -124,9 +123,7 @@ class ClipPoses:
         return np.concatenate([turned.reshape(-1, 72), shifted], axis=1)
 
     def independent_count(
-        self,
-        rest_joints: Float[np.ndarray, "24 3"],
-        camera_rotations: Float[np.ndarray, "frames 3 3"],
+        self, rest_joints: JointPlaces, camera_rotations: Float[np.ndarray, "frames 3 3"]
     ) -> float:
         """Number of frames that would tell as much of the person if their errors were independent.
 
@@ -141,9 +138,7 @@ class ClipPoses:
         shared = float(np.exp(-0.5 * squares / 0.1**2).sum())
         return len(seen) ** 2 / (len(seen) + shared)
 
-    def joints(
-        self, rest_joints: Float[np.ndarray, "24 3"], parents: Int[np.ndarray, "24"]
-    ) -> PosedJoints:
+    def joints(self, rest_joints: JointPlaces, parents: Int[np.ndarray, "24"]) -> PosedJoints:
         """World rotations and positions of the joints, for a person's rest joints."""
         turns, places = np.empty_like(self.rotations), np.empty((len(self.rotations), 24, 3))
         for joint, parent in enumerate(parents):
@@ -290,9 +285,7 @@ class HumanPosePrior:
         return np.broadcast_to(np.diag(POSE_SIGMA), equations.blocks.shape)
 
 
-def _add_human(
-    equations: ChainEquations, poses: ClipPoses, sigma: Float[np.ndarray, "24 3"]
-) -> None:
+def _add_human(equations: ChainEquations, poses: ClipPoses, sigma: JointPlaces) -> None:
     """Adds priors of the joints' axis-angles around their means."""
     # The residual v - mean has the Jacobian J = J_r⁻¹(v): JᵀΣ⁻¹J step = -JᵀΣ⁻¹(v - mean).
     vectors = rotation_vectors(poses.rotations)
@@ -308,7 +301,7 @@ def _add_human(
     equations.right[:, :72] += (right * units).reshape(-1, 72)
 
 
-def _human_priors() -> tuple[Float[np.ndarray, "24 3"], Float[np.ndarray, "24 3"]]:
+def _human_priors() -> tuple[JointPlaces, JointPlaces]:
     mean, sigma = np.zeros((24, 3)), np.full((24, 3), SIGMA_FREE)
     for left, (middle, spread) in LEFT_PRIORS.items():
         mean[left], mean[left + 1] = middle, np.array(middle) * (1.0, -1.0, -1.0)
@@ -318,7 +311,7 @@ def _human_priors() -> tuple[Float[np.ndarray, "24 3"], Float[np.ndarray, "24 3"
     return mean, sigma
 
 
-def _sigma_beside_given(given: ClipPoses) -> Float[np.ndarray, "24 3"]:
+def _sigma_beside_given(given: ClipPoses) -> JointPlaces:
     """Standard deviations of the joints beside given poses, by how far these are from the means.
 
     A joint that given poses turn far, on one side or the other, is not one that hardly turns.

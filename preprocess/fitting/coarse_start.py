@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 from scipy.optimize import least_squares
 
+from capture.camera import Vector3
 from capture.source import AlphaMask
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.alignment.silhouette_objective import MaskSample, SilhouetteObjective, mean_score
@@ -152,7 +153,7 @@ def _find_start(
 
 
 def _place(
-    geometry: CaptureGeometry, shaped: ShapedBody, divisor: float, shift_m: Float[np.ndarray, "3"]
+    geometry: CaptureGeometry, shaped: ShapedBody, divisor: float, shift_m: Vector3
 ) -> CaptureGeometry:
     """Divide each pelvis's distance from its own camera, then shift it in the root's axes."""
     eyes = geometry.camera_centers()[geometry.camera_rows()]

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from capture.source import ASSUMED_FPS
-from preprocess.body.kinematics import JOINT_NAMES, rotation_matrices
+from preprocess.body.kinematics import JOINT_NAMES, JointPlaces, rotation_matrices
 from preprocess.body.parametric_body import load_body_model
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.fitting.clip_poses import POSE_SIGMA, ClipPoses, GivenPosePrior, HumanPosePrior
@@ -66,7 +66,7 @@ def fit_joints(
     places: Float[np.ndarray, "rows points 3"],
     times_s: Float[np.ndarray, "rows"],
     turns: Float[np.ndarray, "rows 24 3 3"] | None = None,
-    offsets_m: Float[np.ndarray, "24 3"] = SAME_JOINTS,
+    offsets_m: JointPlaces = SAME_JOINTS,
 ) -> FittedJoints:
     """Fit the embedded body to the joints of another one over time.
 
@@ -100,7 +100,7 @@ class _JointFitter:
         places: Float[np.ndarray, "rows points 3"],
         times_s: Float[np.ndarray, "rows"],
         turns: Float[np.ndarray, "rows 24 3 3"] | None,
-        offsets_m: Float[np.ndarray, "24 3"],
+        offsets_m: JointPlaces,
     ) -> None:
         self._places, self._times, self._turns = places, times_s, turns
         self.space = ProportionSpace.around(load_body_model().with_shape())
@@ -115,7 +115,7 @@ class _JointFitter:
         self._precision = sigma**-2
 
     @property
-    def rest_joints(self) -> Float[np.ndarray, "24 3"]:
+    def rest_joints(self) -> JointPlaces:
         """Rest joints of the present proportions, metres."""
         return self.space.shaped.joints + self.space.joint_directions @ self.coefficients
 

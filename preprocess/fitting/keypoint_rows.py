@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from capture.camera import Camera
-from preprocess.body.kinematics import descendant_matrix
+from preprocess.body.kinematics import JointPlaces, descendant_matrix
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.fitting.clip_poses import ClipPoses, PosedJoints
 from preprocess.tracking.keypoints import HIPS, MIN_PRESENCE, MIRRORED_POINTS, KeypointTrack
@@ -100,7 +100,7 @@ class ClipKeypoints:
         track: KeypointTrack,
         numbers: Sequence[int],
         cameras: Sequence[Camera],
-        rest_joints: Float[np.ndarray, "24 3"],
+        rest_joints: JointPlaces,
     ) -> "ClipKeypoints":
         """Select a track's key points in some frames, seen by cameras of the reduced masks' size.
 
@@ -127,7 +127,7 @@ class ClipKeypoints:
         )
 
 
-def _world_scale(track: KeypointTrack, rest_joints: Float[np.ndarray, "24 3"]) -> float:
+def _world_scale(track: KeypointTrack, rest_joints: JointPlaces) -> float:
     """Size of a track's points in space, relative to the person."""
     ratios = [
         np.linalg.norm(track.world_m[:, end] - track.world_m[:, start], axis=1)
@@ -176,7 +176,7 @@ class AttachedPoints:
     def place(
         self,
         poses: ClipPoses,
-        rest_joints: Float[np.ndarray, "24 3"],
+        rest_joints: JointPlaces,
         rotations: Float[np.ndarray, "frames 3 3"],
         translations: Float[np.ndarray, "frames 3"],
     ) -> PlacedPoints:
@@ -233,7 +233,7 @@ class KeypointModel:
     def compare(
         self,
         poses: ClipPoses,
-        rest_joints: Float[np.ndarray, "24 3"],
+        rest_joints: JointPlaces,
         cameras: ClipCameras,
         found: ClipKeypoints,
         factors: Float[np.ndarray, "frames"],

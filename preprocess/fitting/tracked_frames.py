@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 from typing import final
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float32
 
-from capture.camera import Camera
+from capture.camera import Camera, Vector3
 from capture.source import shrink_to_longer_side
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.parametric_body import ShapedBody
@@ -123,7 +123,7 @@ class StreamPoseFitter:
         return found
 
 
-def _at_distance_of(pose: BodyPose, other: BodyPose, pelvis: Float[np.ndarray, "3"]) -> BodyPose:
+def _at_distance_of(pose: BodyPose, other: BodyPose, pelvis: Vector3) -> BodyPose:
     """A pose moved along its view, from a camera at the origin, to the distance of another."""
     place, away = pelvis + pose.root_translation, (pelvis + other.root_translation)[2]
     return replace(pose, root_translation=place * (away / max(float(place[2]), 1e-3)) - pelvis)

@@ -20,13 +20,16 @@ from capture.source import AlphaMask, FrameSelection
 from capture.video import VIDEO_SUFFIXES, DecodedFrame, VideoFile
 from preprocess.file_content import read_npz
 
+StoredMask = Float32[np.ndarray, "_ _"]
+"""A mask as stored, in [0, 1]."""
+
 MAX_PERSON_FRACTION = 0.5
 """Largest fraction of the image's rim that a person covers."""
 MAX_OBJECTS = 32
 """Largest object number of masks that hold object numbers."""
 
 
-def shows_background(samples: list[Float32[np.ndarray, "_ _"]], path: Path) -> bool:
+def shows_background(samples: list[StoredMask], path: Path) -> bool:
     """Check whether masks are 1 on the background: on most of the image's rim."""
     shares = np.array([_coverage(mask) for mask in samples])
     usable = shares[(shares[:, 0] > 0.0) & (shares[:, 0] < 1.0)]
@@ -38,7 +41,7 @@ def shows_background(samples: list[Float32[np.ndarray, "_ _"]], path: Path) -> b
     return bool(np.median(usable[:, 1]) > MAX_PERSON_FRACTION)
 
 
-def check_are_masks(samples: list[Float32[np.ndarray, "_ _"]], path: Path) -> None:
+def check_are_masks(samples: list[StoredMask], path: Path) -> None:
     """Raise InputError for photographs, depth maps and the like: masks are mostly 0 or 1."""
     between = [float(((mask > 0.1) & (mask < 0.9)).mean()) for mask in samples]
     if np.median(between) > MAX_PERSON_FRACTION:
@@ -48,7 +51,7 @@ def check_are_masks(samples: list[Float32[np.ndarray, "_ _"]], path: Path) -> No
         )
 
 
-def are_object_ids(samples: list[Float32[np.ndarray, "_ _"]]) -> bool:
+def are_object_ids(samples: list[StoredMask]) -> bool:
     """Check whether masks hold object numbers 1, 2, … of 255 rather than brightness."""
     if max(float(mask.max()) for mask in samples) > MAX_OBJECTS / 255.0:
         return False
@@ -104,7 +107,7 @@ class Masks:
         """Open the files again in another process."""
         return partial(open_masks, invert=self._stated), (self.path,)
 
-    def _binarize_ids(self, stored: Float32[np.ndarray, "_ _"]) -> Float32[np.ndarray, "_ _"]:
+    def _binarize_ids(self, stored: StoredMask) -> StoredMask:
         """Alpha of a stored mask: any object, if the files hold object numbers."""
         return (stored > 0.0).astype(np.float32) if self._numbers else stored
 

@@ -12,8 +12,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from capture.camera import Matrix3, Vector3
 from preprocess.body.body_pose import DIAGONAL_FOCAL, Motion, PoseSpace
-from preprocess.body.kinematics import JOINT_NAMES, axis_angles_from_matrices, rotation_matrices
+from preprocess.body.kinematics import (
+    JOINT_NAMES,
+    JointPlaces,
+    axis_angles_from_matrices,
+    rotation_matrices,
+)
 from preprocess.fitting.joint_fitting import (
     COMPARED_JOINTS,
     POINT_NAMES,
@@ -250,7 +256,7 @@ class _Item(NamedTuple):
     body: str
     places: Float[np.ndarray, "rows points 3"]
     in_camera: bool
-    intrinsic: Float[np.ndarray, "3 3"] | None
+    intrinsic: Matrix3 | None
 
 
 def _find_people(node: Any, frame: int | None = None, person: str | None = None) -> Iterator[_Item]:
@@ -355,7 +361,7 @@ def _columns(body: str, names: list[str] | None) -> dict[str, int]:
     return {point: one for point, one in placed.items() if isinstance(one, int)}
 
 
-def _offsets_m(body: str) -> Float[np.ndarray, "24 3"]:
+def _offsets_m(body: str) -> JointPlaces:
     """Where a body has its joints, from ours in our rest pose, metres."""
     offsets = np.zeros((24, 3))
     for point, place in OFFSETS_CM.get(body, {}).items():
@@ -365,9 +371,7 @@ def _offsets_m(body: str) -> Float[np.ndarray, "24 3"]:
     return offsets / 100.0
 
 
-def _intrinsic(
-    node: dict[str, Any], moved: Float[np.ndarray, "rows 1 3"]
-) -> Float[np.ndarray, "3 3"] | None:
+def _intrinsic(node: dict[str, Any], moved: Float[np.ndarray, "rows 1 3"]) -> Matrix3 | None:
     """The camera that shows the key points in space where those in the image are."""
     if not {"pred_keypoints_3d", "pred_keypoints_2d"} <= node.keys():
         return None
@@ -433,7 +437,7 @@ def _read_soma(content: Any, prefer_world: bool) -> JointTrack | None:
     )  # fmt: skip
 
 
-def _soma_rest() -> dict[str, tuple[str, Float[np.ndarray, "3"]]]:
+def _soma_rest() -> dict[str, tuple[str, Vector3]]:
     """Parent and place at rest of SOMA's joints on both sides, metres."""
     rest = {}
     for name, (parent, *place) in SOMA_REST_CM.items():

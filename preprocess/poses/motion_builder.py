@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
-from capture.camera import Camera
+from capture.camera import Camera, Matrix3, Vector3
 from preprocess.body.body_pose import Motion, PoseSpace, RelativeFocalLength, RootAnchor
 from preprocess.body.kinematics import (
+    JointPlaces,
     axis_angles_from_matrices,
     rotation_matrices,
     stack_axis_angles,
@@ -108,7 +109,7 @@ def _median_betas(betas: Any) -> Float[np.ndarray, "betas"]:
     return np.median(rows, axis=0)
 
 
-def _median_intrinsic(intrinsic: Any) -> Float[np.ndarray, "3 3"] | None:
+def _median_intrinsic(intrinsic: Any) -> Matrix3 | None:
     if intrinsic is None:
         return None
     matrix = np.asarray(intrinsic, dtype=np.float64)
@@ -212,7 +213,7 @@ def place_in_camera_world(
     return motion
 
 
-def anchor_at_pelvis(motion: Motion, joints: Float[np.ndarray, "24 3"]) -> Motion:
+def anchor_at_pelvis(motion: Motion, joints: JointPlaces) -> Motion:
     """The same poses with `root_translations` as SMPL has them, for a body's rest joints.
 
     world = R (x - a) + t is R (x - J0) + J0 + t' with t' = t + R (J0 - a) - J0.
@@ -231,7 +232,7 @@ def anchor_at_pelvis(motion: Motion, joints: Float[np.ndarray, "24 3"]) -> Motio
 
 
 def transform_motion(
-    motion: Motion, a_from_b: Float[np.ndarray, "poses 4 4"], pelvis: Float[np.ndarray, "3"]
+    motion: Motion, a_from_b: Float[np.ndarray, "poses 4 4"], pelvis: Vector3
 ) -> Motion:
     """The same poses in another world, x' = A x + b a row: t' = A (J0 + t) + b - J0."""
     turn, shift = a_from_b[:, :3, :3], a_from_b[:, :3, 3]
@@ -245,7 +246,7 @@ def transform_motion(
 
 def place_by_pixels(
     joints: Float[np.ndarray, "joints 3"], pixels: Float[np.ndarray, "joints 2"], camera: Camera
-) -> Float[np.ndarray, "3"]:
+) -> Vector3:
     """Shift of a body so that a camera sees its joints at given pixels.
 
     Linear least squares over the joints, rows f t_x - (u - c) t_z = (u - c) z - f x. Joints are in
@@ -270,11 +271,8 @@ def _refocus_motion(motion: Motion, shaped: ShapedBody, camera: Camera) -> Motio
     off = np.abs(intrinsic - camera.intrinsic)[:2]
     if (off <= 0.01 * max(camera.focal_px)).all():
         return motion
-    shifted, focal, center = (
-        motion.root_translations.copy(),
-        np.diag(intrinsic)[:2],
-        intrinsic[:2, 2],
-    )
+    shifted = motion.root_translations.copy()
+    focal, center = np.diag(intrinsic)[:2], intrinsic[:2, 2]
     for row in np.flatnonzero(motion.valid):
         joints = shaped.with_pose(motion[int(row)]).joints()
         if (joints[:, 2] > 0.0).all():

@@ -13,16 +13,21 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from capture.camera import Matrix3
 from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import (
     JOINT_NAMES,
     PARENTS,
+    JointPlaces,
     axis_angles_from_matrices,
     shortest_turn,
     unit_vectors,
 )
 from preprocess.body.parametric_body import load_body_model
 from preprocess.poses.motion_builder import build_motion
+
+Parents = Int[np.ndarray, "joints"]
+"""Parent of each joint; -1 for a root."""
 
 LIMB_NAMES = {
     "hip": ("upleg", "upperleg", "thigh", "hip"),
@@ -50,7 +55,7 @@ class SkeletonMotion:
     """
 
     names: Sequence[str]
-    parents: Int[np.ndarray, "joints"]
+    parents: Parents
     offsets: Float[np.ndarray, "joints 3"]
     rest_rotations: Float[np.ndarray, "joints 3 3"]
     rotations: Float[np.ndarray, "poses joints 3 3"]
@@ -108,7 +113,7 @@ class SkeletonMotion:
         )
 
 
-def match_joints(names: Sequence[str], parents: Int[np.ndarray, "joints"]) -> dict[str, int | None]:
+def match_joints(names: Sequence[str], parents: Parents) -> dict[str, int | None]:
     """The joint of a skeleton for each of SMPL's, in order; None where one may be missing."""
     plain = [_plain(name) for name in names]
 
@@ -140,7 +145,7 @@ def match_joints(names: Sequence[str], parents: Int[np.ndarray, "joints"]) -> di
     return matched
 
 
-def _match_axis(matched: dict[str, int | None], parents: Int[np.ndarray, "joints"]) -> None:
+def _match_axis(matched: dict[str, int | None], parents: Parents) -> None:
     """Give SMPL's three spine joints and its neck the joints between pelvis, chest and head."""
     arm, head = _chain(matched["left_shoulder"], parents), _chain(matched["head"], parents)
     chest = next((joint for joint in head if joint in arm), None)  # the nearest one to both
@@ -155,7 +160,7 @@ def _match_axis(matched: dict[str, int | None], parents: Int[np.ndarray, "joints
     matched["neck"] = between[-1] if between else None
 
 
-def _chain(joint: int | None, parents: Int[np.ndarray, "joints"]) -> list[int]:
+def _chain(joint: int | None, parents: Parents) -> list[int]:
     """A joint and its ancestors, up to the root."""
     chain: list[int] = []
     while joint is not None and joint >= 0:
@@ -183,7 +188,7 @@ def _plain(name: str) -> str:
 
 
 def _forward(
-    parents: Int[np.ndarray, "joints"],
+    parents: Parents,
     rotations: Float[np.ndarray, "poses joints 3 3"],
     translations: Float[np.ndarray, "poses joints 3"],
 ) -> tuple[Float[np.ndarray, "poses joints 3 3"], Float[np.ndarray, "poses joints 3"]]:
@@ -197,7 +202,7 @@ def _forward(
     return turned, places
 
 
-def find_upright(points: Float[np.ndarray, "poses 24 3"]) -> Float[np.ndarray, "3 3"]:
+def find_upright(points: Float[np.ndarray, "poses 24 3"]) -> Matrix3:
     """The rotation that turns the axis from feet to shoulders to y, by the median over a motion."""
     feet, shoulders = (
         points[:, [JOINT_NAMES.index(f"{side}_{joint}") for side in ("left", "right")]].mean(axis=1)
@@ -209,12 +214,12 @@ def find_upright(points: Float[np.ndarray, "poses 24 3"]) -> Float[np.ndarray, "
     return shortest_turn(up, np.array([0.0, 1.0, 0.0]))
 
 
-def _leg_length(points: Float[np.ndarray, "24 3"]) -> float:
+def _leg_length(points: JointPlaces) -> float:
     joints = [JOINT_NAMES.index(f"left_{name}") for name in ("hip", "knee", "ankle")]
     return float(np.linalg.norm(np.diff(points[joints], axis=0), axis=1).sum())
 
 
-def _check_limbs(points: Float[np.ndarray, "24 3"]) -> None:
+def _check_limbs(points: JointPlaces) -> None:
     """Refuse bones of lengths that no person has: a program may give joints others' names."""
     start, end = np.array(LIMBS).T
     lengths = np.linalg.norm(points[end] - points[start], axis=-1).reshape(2, 2, 2)
@@ -256,9 +261,7 @@ LIMBS = tuple(
 """Bones of the limbs: a joint and its child."""
 
 
-def _nearest_to_rest(
-    points: Float[np.ndarray, "poses 24 3"], target: Float[np.ndarray, "24 3"]
-) -> int:
+def _nearest_to_rest(points: Float[np.ndarray, "poses 24 3"], target: JointPlaces) -> int:
     """The pose whose limbs have most nearly the directions of SMPL's at rest."""
     rows = np.unique(np.linspace(0, len(points) - 1, 200).round().astype(int))
     start, end = np.array(LIMBS).T
@@ -270,7 +273,7 @@ def _nearest_to_rest(
 
 
 def _match_rest(
-    points: Float[np.ndarray, "24 3"], target: Float[np.ndarray, "24 3"], columns: Sequence[int]
+    points: JointPlaces, target: JointPlaces, columns: Sequence[int]
 ) -> Float[np.ndarray, "24 3 3"]:
     """SMPL's joint rotations, in the world, that bring its limbs onto those of a reference pose.
 

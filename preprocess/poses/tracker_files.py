@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from capture.camera import Matrix3, Vector3
 from preprocess.body.body_pose import DIAGONAL_FOCAL, Motion, RelativeFocalLength
 from preprocess.body.kinematics import rigid_transform
 from preprocess.frame_association import frame_numbers_from_names
@@ -175,7 +176,7 @@ def _tram_person(rows: dict[str, Any], camera: Any) -> Motion:
     )
 
 
-def _tram_intrinsic(held: Any) -> Float[np.ndarray, "3 3"] | None:
+def _tram_intrinsic(held: Any) -> Matrix3 | None:
     """Camera matrix K of `img_focal` and `img_center`; None where one is missing."""
     if not isinstance(held, dict) or held.get("img_focal") is None:
         return None
@@ -295,9 +296,7 @@ def _link_people(frames: list[dict[str, Any]], numbers: Any) -> MotionByPerson:
     return {name: _romp_person(rows, rows["frame_id"]) for name, rows in people.items()}
 
 
-def nearest_person(
-    place: Float[np.ndarray, "3"], last: dict[str, Float[np.ndarray, "3"]], taken: set[str]
-) -> str | None:
+def nearest_person(place: Vector3, last: dict[str, Vector3], taken: set[str]) -> str | None:
     """The nearest person of the frames before; depth counts a third: it is the least certain."""
     gaps = {
         name: float(np.linalg.norm((place - before) * np.array([1.0, 1.0, 1.0 / 3.0])))

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
-from capture.camera import Camera
+from capture.camera import Camera, Transform
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -40,7 +40,7 @@ class SparseModel:
     pixels: Float[np.ndarray, "observations 2"]
     only_turns: bool = False
 
-    def camera(self, camera_from_world: Float[np.ndarray, "4 4"]) -> Camera:
+    def camera(self, camera_from_world: Transform) -> Camera:
         """The lens as a camera with a pose."""
         return Camera(
             focal_px=(self.focal_px, self.focal_px),

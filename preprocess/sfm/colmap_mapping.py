@@ -25,11 +25,14 @@ from capture.input_error import InputError, install_command
 from capture.source import Frame, FrameSource, shrink_to_longer_side
 from preprocess.sfm.camera_solution import SparseModel
 
+PersonPixels = Bool[np.ndarray, "height width"]
+"""Pixels of the person in an image."""
+
 MAX_KEYFRAMES = 60
 """Most key frames of a video."""
 MIN_KEYFRAMES = 8
 """Fewest key frames that can be solved."""
-PersonMaskFn = Callable[[Frame, tuple[int, int]], Bool[np.ndarray, "height width"] | None]
+PersonMaskFn = Callable[[Frame, tuple[int, int]], PersonPixels | None]
 """Pixels of the person in a frame, in an image of a given size; None if unknown."""
 
 
@@ -39,7 +42,7 @@ class SfmKeyframe:
 
     index: int
     gray: UInt8[np.ndarray, "height width"]
-    person_mask: Bool[np.ndarray, "height width"]
+    person_mask: PersonPixels
 
     @property
     def name(self) -> str:
@@ -96,7 +99,7 @@ def select_keyframes(
         yield best[1]
 
 
-def dilate_person(person: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+def dilate_person(person: PersonPixels) -> PersonPixels:
     """The person with a margin all round."""
     side = 2 * max(1, round(0.015 * max(person.shape))) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))

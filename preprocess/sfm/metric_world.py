@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from capture.camera import Camera
+from capture.camera import Camera, Matrix3, Vector3
 from capture.input_error import InputError
 from capture.source import FrameSource
 from preprocess.alignment.capture_geometry import CaptureGeometry
@@ -49,7 +49,7 @@ class FloorPlane:
     known.
     """
 
-    normal: Float[np.ndarray, "3"]
+    normal: Vector3
     offset: float
     points: int
 
@@ -58,13 +58,13 @@ class FloorPlane:
         return places @ self.normal + self.offset
 
 
-def mean_camera_up(model: SparseModel) -> Float[np.ndarray, "3"]:
+def mean_camera_up(model: SparseModel) -> Vector3:
     """Up as the cameras hold their images: minus the mean of their y axes."""
     up = -model.camera_from_world[:, 1, :3].mean(axis=0)
     return up / np.linalg.norm(up)
 
 
-def fit_floor_plane(model: SparseModel, up: Float[np.ndarray, "3"]) -> FloorPlane | None:
+def fit_floor_plane(model: SparseModel, up: Vector3) -> FloorPlane | None:
     """The largest plane below the cameras that is nearly level and has next to nothing below it.
 
     RANSAC (Fischler & Bolles 1981) over triples of points, then least squares over near points;
@@ -96,9 +96,7 @@ def fit_floor_plane(model: SparseModel, up: Float[np.ndarray, "3"]) -> FloorPlan
     return None if best is None else _refine_plane(points, best, up, near)
 
 
-def _plane_through(
-    three: Float[np.ndarray, "3 3"], up: Float[np.ndarray, "3"]
-) -> tuple[Float[np.ndarray, "3"], float] | None:
+def _plane_through(three: Matrix3, up: Vector3) -> tuple[Vector3, float] | None:
     normal = np.cross(three[1] - three[0], three[2] - three[0])
     length = float(np.linalg.norm(normal))
     if length < 1e-12:
@@ -112,7 +110,7 @@ def _plane_through(
 def _refine_plane(
     points: Float[np.ndarray, "points 3"],
     inside: Bool[np.ndarray, "points"],
-    up: Float[np.ndarray, "3"],
+    up: Vector3,
     near: float,
 ) -> FloorPlane:
     """Least squares over the points of the plane, three times."""
@@ -239,9 +237,7 @@ def _fit_scale_huber(
     return scale
 
 
-def upright_axes(
-    up: Float[np.ndarray, "3"], towards_camera: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "3 3"]:
+def upright_axes(up: Vector3, towards_camera: Vector3) -> Matrix3:
     """Rotation from the solved world into one with y along `up`."""
     level = towards_camera - up * (towards_camera @ up)
     if np.linalg.norm(level) < 1e-9:  # the camera is right above
@@ -254,7 +250,7 @@ def to_metric_world(
     camera_from_solved: Float[np.ndarray, "cameras 4 4"],
     scale: float,
     floor: FloorPlane,
-    person: Float[np.ndarray, "3"],
+    person: Vector3,
 ) -> Float[np.ndarray, "cameras 4 4"]:
     """The same cameras in the metric world; all arguments are of the solved one, in its unit.
 
@@ -368,7 +364,7 @@ def _person_in_cameras(
 
 def _estimate_up(
     solved: CameraSolution, motion: Motion, frames: Int[np.ndarray, "poses"], usable: np.ndarray
-) -> Float[np.ndarray, "3"]:
+) -> Vector3:
     """Up as the person stands, unless the cameras are held quite otherwise."""
     assert solved.model is not None
     held = mean_camera_up(solved.model)

@@ -15,21 +15,24 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.spatial.transform import Rotation
 
-from capture.camera import Camera
+from capture.camera import Camera, Transform
 from capture.source import FrameSource
 from preprocess.body.kinematics import rigid_transform
 from preprocess.sfm.camera_solution import SparseModel
 from preprocess.sfm.colmap_mapping import SfmKeyframe, to_grayscale
 
+SpacePoints = Float[np.ndarray, "points 3"]
+"""Points of the solved world, or directions."""
+
+ImagePoints = Float[np.ndarray, "points 2"]
+"""Points of an image, pixels."""
+
 GrayImage = UInt8[np.ndarray, "height width"]
 
 
 def track_points(
-    start: GrayImage,
-    picture: GrayImage,
-    pixels: Float[np.ndarray, "points 2"],
-    guess: Float[np.ndarray, "points 2"] | None = None,
-) -> tuple[Float[np.ndarray, "points 2"], Bool[np.ndarray, "points"]]:
+    start: GrayImage, picture: GrayImage, pixels: ImagePoints, guess: ImagePoints | None = None
+) -> tuple[ImagePoints, Bool[np.ndarray, "points"]]:
     """Places of an image's points in another one, and which were tracked there and back.
 
     The first pixel's centre is at (0.5, 0.5). `guess` holds likely places, by default the old ones.
@@ -57,12 +60,8 @@ def detect_corners(
 
 
 def _optical_flow(
-    start: GrayImage,
-    picture: GrayImage,
-    pixels: Float[np.ndarray, "points 2"],
-    guess: Float[np.ndarray, "points 2"],
-    levels: int,
-) -> tuple[Float[np.ndarray, "points 2"], Bool[np.ndarray, "points"]]:
+    start: GrayImage, picture: GrayImage, pixels: ImagePoints, guess: ImagePoints, levels: int
+) -> tuple[ImagePoints, Bool[np.ndarray, "points"]]:
     """OpenCV's, whose first pixel's centre is at (0, 0)."""
     there, status, _ = cv2.calcOpticalFlowPyrLK(
         start, picture, (pixels - 0.5).astype(np.float32)[:, None],
@@ -90,7 +89,7 @@ class ResectionResult:
             projection by its own camera, pixels; by the key frame's number.
     """
 
-    cameras: dict[int, Float[np.ndarray, "4 4"]]
+    cameras: dict[int, Transform]
     keyframe_errors_px: dict[int, float]
 
 
@@ -133,9 +132,7 @@ def resect_intermediate_frames(
     return ResectionResult(cameras=placed, keyframe_errors_px=bridges)
 
 
-def resect_camera(
-    points: Float[np.ndarray, "points 3"], pixels: Float[np.ndarray, "points 2"], lens: Camera
-) -> Float[np.ndarray, "4 4"] | None:
+def resect_camera(points: SpacePoints, pixels: ImagePoints, lens: Camera) -> Transform | None:
     """The camera that sees known points where they were seen; None if most contradict it.
 
     Some pixels may be wrong; of `lens` only the intrinsics and the distortion count.
@@ -161,9 +158,7 @@ def resect_camera(
     return rigid_transform(np.asarray(cv2.Rodrigues(turn)[0]), np.asarray(shift)[:, 0])
 
 
-def resect_turn(
-    directions: Float[np.ndarray, "points 3"], pixels: Float[np.ndarray, "points 2"], lens: Camera
-) -> Float[np.ndarray, "4 4"] | None:
+def resect_turn(directions: SpacePoints, pixels: ImagePoints, lens: Camera) -> Transform | None:
     """The camera at the origin that sees known directions where they were seen; else None."""
     if len(directions) < MIN_PNP_POINTS:
         return None
@@ -184,8 +179,8 @@ class _KeyframePoints:
     frame: int
     grey: GrayImage
     camera: Camera
-    points: Float[np.ndarray, "points 3"]
-    pixels: Float[np.ndarray, "points 2"]
+    points: SpacePoints
+    pixels: ImagePoints
 
     @classmethod
     def of(cls, model: SparseModel, row: int, key: SfmKeyframe) -> "_KeyframePoints":

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from scipy.sparse import coo_array
 from scipy.spatial.transform import Rotation
 
+from capture.camera import Matrix3
 from preprocess.body.kinematics import cross_matrices
 from preprocess.sfm.camera_solution import SparseModel
 from preprocess.sfm.colmap_mapping import STATED_FOCAL_TOLERANCE, SfmKeyframe
@@ -33,7 +34,7 @@ class _Track:
     corners: Int[np.ndarray, "points"]
     start: Float[np.ndarray, "points 2"]
     end: Float[np.ndarray, "points 2"]
-    homography: Float[np.ndarray, "3 3"]
+    homography: Matrix3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -27,6 +27,9 @@ from preprocess.tracking.blazepose_networks import (
 from preprocess.tracking.keypoints import MIN_PRESENCE
 from preprocess.tracking.video_tracking import TrackingProblem, touched_borders
 
+GrayPicture = UInt8[np.ndarray, "rows columns"]
+"""A reduced image, or a mask of it."""
+
 CELL_PX = 24
 """Side of the squares of which each has one corner that is followed, px: all parts of the picture
 count alike, however much stronger a title's corners are."""
@@ -275,15 +278,13 @@ class _Shift:
     plane: float
 
 
-def _reduced_gray(rgb: RgbImage) -> UInt8[np.ndarray, "rows columns"]:
+def _reduced_gray(rgb: RgbImage) -> GrayPicture:
     scale = min(1.0, 480 / max(rgb.shape[:2]))
     gray = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     return cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
 
 
-def _corners(
-    gray: UInt8[np.ndarray, "rows columns"], mask: UInt8[np.ndarray, "rows columns"]
-) -> Float32[np.ndarray, "corners 1 2"]:
+def _corners(gray: GrayPicture, mask: GrayPicture) -> Float32[np.ndarray, "corners 1 2"]:
     """The sharpest corner of each square of the background that has one, (column, row)."""
     sharpness = np.where(mask > 0, cv2.cornerMinEigenVal(gray, blockSize=3), 0.0)
     corners = []
@@ -296,11 +297,7 @@ def _corners(
     return np.array(corners, np.float32).reshape(-1, 1, 2)
 
 
-def _shift(
-    one: UInt8[np.ndarray, "rows columns"],
-    other: UInt8[np.ndarray, "rows columns"],
-    mask: UInt8[np.ndarray, "rows columns"],
-) -> _Shift | None:
+def _shift(one: GrayPicture, other: GrayPicture, mask: GrayPicture) -> _Shift | None:
     """The motion of the background between two images; None if it cannot be followed."""
     corners = _corners(one, mask)
     if len(corners) < MIN_CORNERS:

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from capture.camera import Camera
+from capture.camera import Camera, Matrix3, Vector3
 from preprocess.body.body_pose import BodyPose, Motion
 from preprocess.body.kinematics import axis_angles_from_matrices, shortest_turn, unit_vectors
 from preprocess.body.parametric_body import ShapedBody
@@ -144,9 +144,7 @@ def lift_pose(world_m: Float[np.ndarray, "33 3"], shaped: ShapedBody) -> BodyPos
     )
 
 
-def _trunk_turn(
-    rest: Float[np.ndarray, "4 3"], found: Float[np.ndarray, "4 3"]
-) -> Float[np.ndarray, "3 3"]:
+def _trunk_turn(rest: Float[np.ndarray, "4 3"], found: Float[np.ndarray, "4 3"]) -> Matrix3:
     """The rotation that takes one trunk nearest to another (Kabsch 1976)."""
     a, b = rest - rest.mean(axis=0), found - found.mean(axis=0)
     u, _, v = np.linalg.svd(b.T @ a)
@@ -154,12 +152,8 @@ def _trunk_turn(
 
 
 def _limb_turn(
-    rest: Float[np.ndarray, "3"],
-    hinge: Float[np.ndarray, "3"],
-    parent: Float[np.ndarray, "3 3"],
-    first: Float[np.ndarray, "3"],
-    second: Float[np.ndarray, "3"],
-) -> Float[np.ndarray, "3 3"]:
+    rest: Vector3, hinge: Vector3, parent: Matrix3, first: Vector3, second: Vector3
+) -> Matrix3:
     """World rotation of a limb's first bone, so that its hinge bends it where it is bent to.
 
     `rest` and `hinge` are the bone and the axis of the hinge at its end, at rest; `parent` is the

@@ -24,6 +24,9 @@ from preprocess.tracking.video_tracking import (
     find_runs,
 )
 
+Rows = Bool[np.ndarray, "rows"]
+"""Rows of a track that something holds for."""
+
 MIN_IOU = 0.7
 """Least mean IoU of body and mask of poses that are good enough for an avatar."""
 MIN_PERSON_PX = 96.0
@@ -213,14 +216,12 @@ def grade_tracking(
 
 
 def _reasons_by_frame(
-    keypoints: KeypointTrack,
-    frame_times_s: Mapping[int, float],
-    disagreeing: Bool[np.ndarray, "rows"],
+    keypoints: KeypointTrack, frame_times_s: Mapping[int, float], disagreeing: Rows
 ) -> dict[int, list[str]]:
     """Reasons why frames are doubtful, by their numbers."""
     reasons: dict[int, list[str]] = {}
 
-    def note(rows: Bool[np.ndarray, "rows"], reason: str) -> None:
+    def note(rows: Rows, reason: str) -> None:
         for number in keypoints.frames[rows].tolist():
             reasons.setdefault(int(number), []).append(reason)
 
@@ -250,9 +251,7 @@ def _missed(
     return weights
 
 
-def _disagreeing(
-    keypoints: KeypointTrack, iou_of_frame: Mapping[int, float]
-) -> Bool[np.ndarray, "rows"]:
+def _disagreeing(keypoints: KeypointTrack, iou_of_frame: Mapping[int, float]) -> Rows:
     """Rows whose IoU, interpolated between graded frames, is low or far below the film's usual."""
     numbers = [number for number in sorted(iou_of_frame) if np.isfinite(iou_of_frame[number])]
     if not numbers:
@@ -264,22 +263,20 @@ def _disagreeing(
     return np.interp(keypoints.frames, numbers, ious) < least
 
 
-def _frames_to_leave_out(
-    keypoints: KeypointTrack, disagreeing: Bool[np.ndarray, "rows"]
-) -> tuple[int, ...]:
+def _frames_to_leave_out(keypoints: KeypointTrack, disagreeing: Rows) -> tuple[int, ...]:
     """Frames in which another person is near, or body and mask disagree; none if most are such."""
     numbers, doubtful = keypoints.frames, disagreeing | _crowded(keypoints)
     return tuple(numbers[doubtful].tolist()) if doubtful.sum() <= 0.5 * len(doubtful) else ()
 
 
-def _crowded(keypoints: KeypointTrack) -> Bool[np.ndarray, "rows"]:
+def _crowded(keypoints: KeypointTrack) -> Rows:
     """Rows in which another person is near."""
     if keypoints.problems is None:
         return np.zeros(len(keypoints), dtype=bool)
     return (keypoints.problems & PROBLEM_BITS[TrackingProblem.CROWDED]) > 0
 
 
-def _jumps(keypoints: KeypointTrack) -> Bool[np.ndarray, "rows"]:
+def _jumps(keypoints: KeypointTrack) -> Rows:
     """Rows on both sides of a cut in which the person goes on in another place."""
     jumps = np.zeros(len(keypoints), dtype=bool)
     if len(keypoints) < 16:  # a few photographs have no times
