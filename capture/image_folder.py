@@ -72,11 +72,7 @@ def read_image(path: Path) -> tuple[RgbImage, UInt8[np.ndarray, "height width"] 
 
 
 def write_png(path: Path, picture: UInt8[np.ndarray, "..."]) -> None:
-    """Write a gray, RGB or RGBA image as PNG.
-
-    Raises:
-        OSError: If the disk is full, which OpenCV's own writer does not say.
-    """
+    """Write a gray, RGB or RGBA image; OpenCV's own writer does not say if the disk is full."""
     if picture.ndim == 3:
         kind = cv2.COLOR_RGB2BGR if picture.shape[2] == 3 else cv2.COLOR_RGBA2BGRA
         picture = cv2.cvtColor(picture, kind)

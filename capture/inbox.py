@@ -40,8 +40,8 @@ class Inbox(Generic[Item]):
     ) -> None:
         """Start the producer; at most `capacity` items wait.
 
-        `all_came` tells whether the producer is at its last items, though some are still to come.
-        `on_drop` receives each item that is dropped, on the producer's thread.
+        `all_came` tells whether the producer is at its last items; `on_drop` receives what is
+        dropped, on the producer's thread.
         """
         self.paced, self.live, self.ends_run = paced, live, ends_run
         self.all_came, self.dropped, self._on_drop = all_came, 0, on_drop

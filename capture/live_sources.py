@@ -53,15 +53,9 @@ class CameraDevice(FrameSource):
     live = paced = skippable = True
 
     def __init__(self, address: str, selection: FrameSelection, pace: PacingClock) -> None:
-        """Open it and wait for its first image.
+        """Open it by the part of the argument behind `camera:`, and wait for its first image.
 
-        Args:
-            address: The part of the argument behind `camera:`.
-            pace: The clock of those who wait for poses or masks of its images; closing ends it.
-
-        Raises:
-            InputError: If there is no such camera.
-            OSError: If it exists and is in use (EBUSY), or may not be opened (EACCES).
+        An OSError if it exists and is in use (EBUSY), or may not be opened (EACCES).
         """
         super().__init__(Path(CAMERA_PREFIX + address), selection, pace)
         self._inbox: Inbox[Frame] | None = None
@@ -185,17 +179,10 @@ class WatchedImageFolder(FrameSource):
         idle_s: float = IDLE_TIMEOUT_S,
         watch_s: float | None = None,
     ) -> None:
-        """Wait for the first image.
+        """Wait for the first image; an InputError if none has come after `idle_s` seconds.
 
-        Args:
-            path: The folder, which may be empty.
-            selection: Counted in the order of arrival.
-            pace: Its clock; stopping it ends the watch.
-            idle_s: The source ends when no new image has come for this time, seconds.
-            watch_s: Images that come later than this after the first are not waited for, seconds.
-
-        Raises:
-            InputError: If there is no such folder, or no image in it after `idle_s`.
+        The selection is counted in the order of arrival. The source ends when no new image has come
+        for `idle_s`; images that come later than `watch_s` after the first are not waited for.
         """
         if not path.is_dir():
             raise InputError(f"{path} is no folder; --live watches a folder of images that grows.")

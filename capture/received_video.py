@@ -197,10 +197,7 @@ class ReceivedVideo(FrameSource):
     ) -> None:
         """Wait for the first frame; an InputError if none can be decoded.
 
-        Args:
-            path: The video, beside which lies its note.
-            pace: Its clock; stopping it ends the video.
-            idle_s: The video ends when no byte has come for this time, seconds.
+        The video ends when no byte has come for `idle_s` seconds.
         """
         super().__init__(path, selection, pace)
         self._reader = _GrowingReader(path, pace, idle_s)

@@ -118,12 +118,9 @@ def open_live_source(
 ) -> FrameSource:
     """Open a camera, a folder that another program writes images to, or a video that is received.
 
-    Args:
-        path: The folder, or the video; a capture folder's images lie in its `images/`.
-        camera: Number or address of a camera instead.
-        idle_s: Time without a new image after which a folder ends, seconds.
-        watch_s: Time after which a folder ends even so; None: never.
-        rotate: Degrees by which images are turned clockwise.
+    A capture folder's images lie in its `images/`; `camera` is the number or address of a camera
+    instead. Waiting times are as in `WatchedImageFolder`; images are turned clockwise by `rotate`
+    degrees.
     """
     selection = FrameSelection.of(frames)
     source: FrameSource

@@ -21,13 +21,7 @@ Pixels = UInt8[np.ndarray, "height width channels"]
 
 @dataclass(frozen=True, kw_only=True)
 class VideoCodec:
-    """One way to encode a video.
-
-    Attributes:
-        name: FFmpeg's name of the encoder.
-        pixel_format: FFmpeg's name of the pixel format.
-        description: What is written and where it plays, for the user.
-    """
+    """One way to encode a video, by FFmpeg's names; described for the user."""
 
     name: str
     pixel_format: str
@@ -69,14 +63,9 @@ FFV1 = VideoCodec(name="ffv1", pixel_format="bgr0", description="FFV1, which is 
 
 
 def write_video(path: Path, images: Iterable[Pixels], fps: float, codec: VideoCodec) -> int:
-    """Write images of one size as a video; return their number.
+    """Write images of one size, RGB or RGBA with straight alpha, as a video; return their number.
 
-    Args:
-        path: File to write; its suffix selects the container.
-        images: RGB, or RGBA with straight alpha.
-
-    Raises:
-        OSError: If the disk is full.
+    The file's suffix selects the container. An OSError if the disk is full.
     """
     count = 0
     with open_video_writer(path, fps, codec) as write:

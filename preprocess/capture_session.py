@@ -246,12 +246,9 @@ class Capture:
 
 
 class ObservationSource:
-    """Where a training session gets its observations from.
+    """Where a training session gets its observations from: frames, as they are delivered.
 
-    Attributes:
-        capture: What the frames are joined with, and where that comes from.
-        frames: The frames, as they are delivered.
-        join: Joins the next frame with its pose, mask and camera.
+    `join` joins the next one with its pose, mask and camera, which are those of the capture.
     """
 
     def __init__(

@@ -321,11 +321,9 @@ class CorrectionCandidate:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CorrectionResult:
-    """The mistakes found in a capture, and the geometry without them.
+    """The mistakes found in a capture, by their gain, and the geometry without them.
 
-    Attributes:
-        corrections: The corrections, the one with the largest gain first.
-        candidates: The best candidate of each cause in the first round, best first.
+    `candidates` are the best of each cause in the first round, best first.
     """
 
     corrections: tuple[Correction, ...]
@@ -337,9 +335,7 @@ class CorrectionResult:
 class CorrectionSearch:
     """The corrections that are tried, and their scores.
 
-    Attributes:
-        pelvis: Rest position of the pelvis.
-        mask_count: Number of masks; 0 if images and masks cannot disagree.
+    The pelvis is at rest; `mask_count` is 0 if images and masks cannot disagree.
     """
 
     objective: CaptureObjective

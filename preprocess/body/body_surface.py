@@ -85,12 +85,11 @@ def visible_points(
     Args:
         image_points: Image coordinates, scaled to metres at the body.
         depth: Distance from the camera along its axis, metres.
-        cosine: Of the angle between a point's normal and the direction to the camera. Points that
-            face away occlude nothing.
+        cosine: Of the angle between normal and view; points that face away occlude nothing.
         cell_m: Edge of a cell: no less than the points' spacing.
         tolerance_m: Largest distance behind the nearest point of its cell, beyond its own slope.
-        margin_cells: Cells by which clothes and errors of the pose may widen limbs: a point that
-            lies farther than 0.1 m behind another so near in the image is hidden, too.
+        margin_cells: Cells by which clothes and errors of the pose may widen limbs: what lies 0.1 m
+            behind another point so near in the image is hidden, too.
     """
     cell = np.floor((image_points - image_points.min(axis=0)) / cell_m).astype(np.int64)
     columns = int(cell[:, 1].max()) + 1

@@ -31,11 +31,8 @@ ASSUMED_CAMERA_SOURCE = f"{DEFAULT_FOCAL_RATIO} x longer side"
 class CameraTrack:
     """The cameras of a capture, already of the frames' size.
 
-    Attributes:
-        cameras: One for all frames, or one for each in order.
-        source: Their origin, for the report.
-        note: Changes that made them fit, if any.
-        frames_without_camera: Numbers of frames that have no camera and cannot be used.
+    There is one for all frames, or one for each in order; frames without one cannot be used. The
+    report says their origin (`source`) and the changes that made them fit (`note`).
     """
 
     cameras: tuple[Camera, ...]

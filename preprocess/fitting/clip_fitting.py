@@ -35,11 +35,8 @@ HELD_PRECISION = 1e9
 class EvidenceWeights(NamedTuple):
     """Weights of a clip's evidence against its priors.
 
-    Attributes:
-        outline_rows: Independent distances along one outline, each with a standard deviation of a
-            pixel of the reduced masks; neighbors on it err alike.
-        keypoints: Factor of the key points' precision in the image, where an outline tells the
-            pose, too.
+    An outline counts as `outline_rows` independent distances, each with a standard deviation of a
+    pixel of the reduced masks; `keypoints` is a factor of the key points' precision beside it.
     """
 
     outline_rows: float = 60.0

@@ -70,11 +70,7 @@ class MaskSource:
 
 
 class GivenMasks(MaskSource):
-    """Masks that are read, and refined where the images show that they need it.
-
-    Attributes:
-        refine: Refines them, by what it has learnt from the frames that were seen.
-    """
+    """Masks that are read, and refined where the frames that were seen show that they need it."""
 
     is_given = True
 
@@ -109,11 +105,7 @@ class GivenMasks(MaskSource):
 
 @final
 class StoredMasks(GivenMasks):
-    """Masks of a file or a folder.
-
-    Attributes:
-        files: The masks as stored.
-    """
+    """Masks of a file or a folder."""
 
     def __init__(
         self, files: Masks, source: FrameSource, refine: GivenMaskRefiner = UNREFINED

@@ -48,7 +48,6 @@ def build_motion(
         betas: One row, or one row a pose: then their median.
         frames: The frames' numbers; of a number that comes twice the first row counts.
         lost: Rows that the tracker itself calls lost.
-        body_model, space, anchor: See `Motion`.
         lens: The camera matrix K, or one per pose; or the focal length that the tracker assumed.
     """
     is_assumed = isinstance(lens, RelativeFocalLength)

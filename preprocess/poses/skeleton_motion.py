@@ -42,16 +42,10 @@ LIMB_NAMES = {
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SkeletonMotion:
-    """A skeleton and its motion, as a file holds them.
+    """A skeleton and its motion, as a file holds them: in its parent's axes, each after its parent.
 
-    Attributes:
-        names: Of the joints, each after its parent.
-        parents: -1 for a root.
-        offsets: Place of each joint in its parent's axes at rest, in the file's unit.
-        rest_rotations: Of each joint in its parent's axes at rest.
-        rotations: Of each joint in its parent's axes.
-        translations: Place of each joint in its parent's axes, in the file's unit.
-        times_s: Time of each pose, seconds.
+    Rotations, and places in the file's unit, are those at rest (`offsets`, `rest_rotations`) and
+    those of each pose (`translations`, `rotations`).
     """
 
     names: Sequence[str]

@@ -125,11 +125,10 @@ class CameraSolution:
     """Cameras in a world of unknown scale, or the finding that the camera stood still.
 
     Attributes:
-        is_static: Whether the camera stood still; then there is no model.
         background_motion: Largest shift of the background, as a fraction of the image's longer
             side; NaN if it was lost.
         gates: The gates that the solution has passed.
-        model: The key frames' cameras and the points; None if it stood still.
+        model: The key frames' cameras and the points; None if the camera stood still.
         camera_from_solved: One for every frame of the file.
         frame_status: MISSING, INTERPOLATED, PLACED or KEY for each of them.
         costs: Wall and core seconds, and the peak of memory in MB.

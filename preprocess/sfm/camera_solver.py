@@ -64,11 +64,9 @@ MIN_TRACKED_KEYFRAMES = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class SolverSettings:
-    """Settings of a solution.
+    """Settings of a solution, which does not depend on the number of threads.
 
-    Attributes:
-        focal_ratio: Known focal length as a fraction of the image's longer side, if any.
-        threads: Threads for features; the result does not depend on it.
+    `focal_ratio` is the focal length as a fraction of the image's longer side, if it is known.
     """
 
     focal_ratio: float | None = None

@@ -133,12 +133,7 @@ ProgressFn = Callable[[float], None]
 class ColmapWorkspace:
     """Key frames on disk and the database that features and matches go to.
 
-    Attributes:
-        images: Folder of images named by their frame's number.
-        masks: Folder of an 8-bit image for each, 0 where pixels are ignored.
-        names, size_px: Names, width and height of the images.
-        focal_px: The known focal length, else None.
-        threads: Of extraction and matching.
+    Masks are 8-bit images, 0 where pixels are ignored; `focal_px` is the focal length, if known.
     """
 
     images: Path

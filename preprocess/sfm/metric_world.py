@@ -128,11 +128,8 @@ def _refine_plane(
 class PersonInCameras:
     """The person in the cameras' own frames, one row for each frame with a pose and a camera.
 
-    Attributes:
-        world_from_camera: Rotations R_iᵀ.
-        centers: Cameras in the solved world's unit.
-        pelvis_positions: Pelvis in the camera, metres.
-        soles: Skin of both feet in the camera, metres.
+    Pelvis and soles, the skin of both feet, are in the camera, metres; cameras have the rotations
+    R_iᵀ and are at `centers`, in the solved world's unit.
     """
 
     world_from_camera: Float[np.ndarray, "frames 3 3"]

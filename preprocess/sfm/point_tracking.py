@@ -81,12 +81,10 @@ MIN_INLIER_FRACTION = 0.5
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ResectionResult:
-    """Result of placing frames by tracked points.
+    """Camera-from-world of frames placed by tracked points, and errors, by the frames' numbers.
 
-    Attributes:
-        cameras: Camera-from-world by the frame's number; key frames' own are not among them.
-        keyframe_errors_px: Median distance of points that were tracked into a key frame from their
-            projection by its own camera, pixels; by the key frame's number.
+    Errors are the median distances of points that were tracked into a key frame from their
+    projection by its own camera, pixels.
     """
 
     cameras: dict[int, Transform]

@@ -86,12 +86,7 @@ class PersonKeypoints:
 class KeypointTrack:
     """Key points of one person over time, one row a frame in which the person was found.
 
-    The arrays of key points are as in `PersonKeypoints`.
-
-    Attributes:
-        frames: Number of each row's frame, counted from 0.
-        times_s: Time of each row's frame, seconds, if known.
-        problems: Problems of each row, as the sum of `PROBLEM_BITS`, if known.
+    They are as in `PersonKeypoints`; `problems` are sums of `PROBLEM_BITS`.
     """
 
     frames: Int[np.ndarray, "rows"]
