@@ -233,7 +233,8 @@ def mark_passers_by(track: KeypointTrack) -> KeypointTrack:
     bit, frames = PROBLEM_BITS[TrackingProblem.CROWDED], track.frames
     crowded, landings = (track.problems & bit) > 0, frames[_hip_jumps(track)]
     marked = crowded.copy()
-    for first, last in frames[find_runs(crowded) - [0, 1]]:
+    runs = find_runs(crowded)
+    for first, last in zip(frames[runs[:, 0]], frames[runs[:, 1] - 1], strict=True):
         before = landings[(landings >= first - 20) & (landings <= first)]
         after = landings[(landings > last) & (landings <= last + 20)]
         start, end = min(before, default=first), max(after, default=last + 1)
