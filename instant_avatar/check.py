@@ -19,11 +19,12 @@ from instant_avatar.capture_validation import (
     check_capture,
     check_command,
 )
-from instant_avatar.cli.command_line import BAD_INPUT, DONE, parse_arguments, run_command
+from instant_avatar.cli.command_line import BAD_INPUT, DONE, run_main
 from instant_avatar.cli.console import Console
 from instant_avatar.cli.shared_options import (
     CaptureArguments,
     Flag,
+    OptionalFile,
     capture_name,
     check_disjoint_from_inputs,
     check_output_file,
@@ -70,7 +71,7 @@ class CheckArguments(CaptureArguments):
     """Write a corrected copy of the capture to this folder."""
     sheet: Annotated[Path | None, arg(metavar="PNG", help_behavior_hint="")] = None
     """Contact sheet to write (default: runs/NAME-check.png, named after the video)."""
-    json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    json: OptionalFile = None
     """Write the diagnosis to this file as JSON."""
     overwrite: Flag = False
     """Replace the files that --sheet and --json name, if they exist."""
@@ -112,8 +113,7 @@ class CheckArguments(CaptureArguments):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
-    given = parse_arguments(CheckArguments, "ia-check", argv)
-    return run_command("ia-check", lambda: check(given, Console()))
+    return run_main("ia-check", CheckArguments, check, argv)
 
 
 def check(arguments: CheckArguments, console: Console) -> int:

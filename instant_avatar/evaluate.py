@@ -7,14 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from capture.input_error import InputError
-from instant_avatar.cli.command_line import (
-    DONE,
-    INTERRUPTED,
-    NO_AVATAR,
-    CommandExit,
-    parse_arguments,
-    run_command,
-)
+from instant_avatar.cli.command_line import DONE, INTERRUPTED, NO_AVATAR, CommandExit, run_main
 from instant_avatar.cli.console import Console
 from instant_avatar.cli.shared_options import parse_frame_range
 from instant_avatar.evaluation.evaluate_arguments import EvaluateArguments
@@ -30,8 +23,7 @@ if TYPE_CHECKING:  # torch is loaded after --help has been answered
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
-    arguments = parse_arguments(EvaluateArguments, "ia-evaluate", argv)
-    return run_command("ia-evaluate", lambda: evaluate(arguments, Console()))
+    return run_main("ia-evaluate", EvaluateArguments, evaluate, argv)
 
 
 def evaluate(arguments: EvaluateArguments, console: Console) -> int:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import Positional, arg
 
 from capture.atomic_files import atomic_file
 from capture.camera import Camera
@@ -28,15 +28,16 @@ from instant_avatar.animation.driving_motion import (
     load_driving_motion,
     pose_rate,
 )
-from instant_avatar.cli.command_line import (
-    DONE,
-    NO_AVATAR,
-    CommandExit,
-    parse_arguments,
-    run_command,
-)
+from instant_avatar.cli.command_line import DONE, NO_AVATAR, CommandExit, run_main
 from instant_avatar.cli.console import Console
-from instant_avatar.cli.shared_options import check_output_file
+from instant_avatar.cli.shared_options import (
+    Flag,
+    OptionalCount,
+    OptionalFile,
+    OptionalId,
+    OptionalName,
+    check_output_file,
+)
 from instant_avatar.run.run_folder import RunFolder
 from preprocess.body.body_pose import BodyPose, Motion
 
@@ -89,25 +90,24 @@ class ExportArguments:
     or 3-D Gaussians in one pose, as .ply or .spz."""
     out: Annotated[Path, arg(metavar="FILE", help_behavior_hint="(required)")]
     """File to write, whole or not at all."""
-    poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    poses: OptionalFile = None
     """Motion for --to glb, as in ia-play (default: a turn); --to splats takes its first pose
     (default: the canonical pose)."""
-    person: Annotated[str | None, arg(metavar="ID", help_behavior_hint="")] = None
+    person: OptionalId = None
     """Person ID in the pose file (default: the longest track)."""
-    triangles: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    triangles: OptionalCount = None
     """Number of triangles of a mesh, for game engines and phones; a .glb or .vrm then has a texture
     (default: some 300,000, with vertex colors). 20,000 are enough for most."""
-    author: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    author: OptionalName = None
     """Author that --to vrm states (default: unknown); its licence allows the author's own use
     alone, commercial use only if all that the avatar was made with does."""
-    overwrite: Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")] = False
+    overwrite: Flag = False
     """Replace the file that --out names, if it exists."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
-    given = parse_arguments(ExportArguments, "ia-export", argv)
-    return run_command("ia-export", lambda: export(given, Console()))
+    return run_main("ia-export", ExportArguments, export, argv)
 
 
 def export(arguments: ExportArguments, console: Console) -> int:

@@ -13,9 +13,8 @@ from instant_avatar.cli.command_line import (
     INTERRUPTED,
     exit_on_interrupt,
     fill_optional_value,
-    parse_arguments,
     require_packages,
-    run_command,
+    run_main,
     without_garbage_collection,
 )
 from instant_avatar.cli.console import Console
@@ -39,8 +38,7 @@ if TYPE_CHECKING:  # it imports torch
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
     words = fill_optional_value(sys.argv[1:] if argv is None else argv, "--view", VIEW_PORT)
-    arguments = parse_arguments(IngestArguments, PROGRAM, words)
-    return run_command(PROGRAM, lambda: ingest(arguments, Console()))
+    return run_main(PROGRAM, IngestArguments, ingest, words)
 
 
 def ingest(

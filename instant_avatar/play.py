@@ -14,8 +14,7 @@ from instant_avatar.cli.command_line import (
     DONE,
     INTERRUPTED,
     fill_optional_value,
-    parse_arguments,
-    run_command,
+    run_main,
 )
 from instant_avatar.cli.console import Console
 
@@ -28,8 +27,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
     words = fill_optional_value(sys.argv[1:] if argv is None else argv, "--web", WEB_PORT)
     words = fill_optional_value(words, "--turntable", DEFAULT_TURN_S)
-    given = parse_arguments(PlayArguments, "ia-play", words)
-    return run_command("ia-play", lambda: play(given, Console()))
+    return run_main("ia-play", PlayArguments, play, words)
 
 
 def play(arguments: PlayArguments, console: Console) -> int:

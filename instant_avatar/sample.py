@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from capture.input_error import counted, quote_command
-from instant_avatar.cli.command_line import DONE, parse_arguments, run_command
+from instant_avatar.cli.command_line import DONE, run_main
 from instant_avatar.cli.console import Console
 from instant_avatar.cli.shared_options import Flag, check_output_folder
 from instant_avatar.studio.shoot_config import ShootConfig
@@ -48,8 +48,7 @@ class SampleArguments:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
-    config = parse_arguments(SampleArguments, "ia-sample", argv)
-    return run_command("ia-sample", lambda: _film(config, Console()))
+    return run_main("ia-sample", SampleArguments, _film, argv)
 
 
 def _film(config: SampleArguments, console: Console) -> int:

@@ -14,16 +14,16 @@ from tyro.conf import Positional, arg
 from capture.atomic_files import OutputFileList, write_text_atomically
 from capture.input_error import InputError, quote_command
 from capture.live_sources import camera_address
-from instant_avatar.cli.command_line import (
-    DONE,
-    INTERRUPTED,
-    parse_arguments,
-    run_command,
-    stop_on_interrupt,
-)
+from instant_avatar.cli.command_line import DONE, INTERRUPTED, run_main, stop_on_interrupt
 from instant_avatar.cli.console import Console
 from instant_avatar.cli.shared_options import (
     Flag,
+    OptionalCameras,
+    OptionalCount,
+    OptionalFile,
+    OptionalFolder,
+    OptionalName,
+    Switch,
     capture_name,
     check_output_file,
     check_output_folder,
@@ -65,20 +65,20 @@ class TrackArguments:
 
     video: Annotated[Positional[Path], arg(metavar="VIDEO")]
     """Video file, folder of images, or capture folder."""
-    out: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    out: OptionalFile = None
     """Poses to write, .npz; the rest is written beside it (default: runs/NAME-tracked/poses.npz,
     named after the video)."""
-    person: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    person: OptionalCount = None
     """Which person, counted from left to right from 1 in the first frame with that many persons
     (default: the largest)."""
-    tracker: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    tracker: OptionalName = None
     """Another installed tracker to use (default: blazepose, the built-in one; docs/formats.md)."""
-    masks: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    masks: OptionalFolder = None
     """Masks to use instead of tracked ones, as ia-ingest takes them."""
-    cameras: Annotated[str | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    cameras: OptionalCameras = None
     """Cameras, as ia-ingest takes them (default: a camera that stands still; its focal length is
     fitted)."""
-    body: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    body: OptionalFile = None
     """Your own SMPL body; the poses are then SMPL's (default: the embedded body)."""
     frames: str = "::"
     """Frames to use: START:STOP:STEP, counted from 0 (default: all; of a long video every nth, 600
@@ -86,7 +86,7 @@ class TrackArguments:
     rotate: Literal[0, 90, 180, 270] = 0
     """Turn each frame clockwise by this many degrees, where the video lies on its side or upside
     down; masks and cameras that are given must be those of the turned frames."""
-    film: Annotated[bool, arg(help_behavior_hint="")] = True
+    film: Switch = True
     """Draw skeleton.mp4."""
     overwrite: Flag = False
     """Replace what ia-track wrote there before. Files that it did not write are kept."""
@@ -160,8 +160,7 @@ class TrackArguments:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
-    given = parse_arguments(TrackArguments, PROGRAM, argv)
-    return run_command(PROGRAM, lambda: track(given, Console()))
+    return run_main(PROGRAM, TrackArguments, track, argv)
 
 
 def next_command(arguments: TrackArguments, frames: slice | None) -> list[str]:

@@ -11,7 +11,13 @@ from tyro.conf import Positional, arg
 
 from capture.hardware import usable_cores
 from capture.input_error import InputError
-from instant_avatar.cli.shared_options import Flag, check_output_file
+from instant_avatar.cli.shared_options import (
+    Flag,
+    OptionalCount,
+    OptionalFile,
+    OptionalId,
+    check_output_file,
+)
 from preprocess.body.kinematics import JOINT_NAMES, rotation_matrices
 
 WEB_PORT = 8010
@@ -96,11 +102,11 @@ class PlayArguments:
 
     avatar: Annotated[Positional[Path], arg(metavar="AVATAR")]
     """The .iavatar package."""
-    poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    poses: OptionalFile = None
     """Poses: an .npz with global_orient, body_pose, transl (or poses, trans), a motion of a
     skeleton (.bvh, .glb, .vrma), or a file of AMASS, AIST++ or a tracker (docs/formats.md;
     default: a turn, a wave, a few steps)."""
-    person: Annotated[str | None, arg(metavar="ID", help_behavior_hint="")] = None
+    person: OptionalId = None
     """Person ID in the pose file (default: the longest track)."""
     still: Annotated[int | None, arg(metavar="ROW", help_behavior_hint="")] = None
     """Hold this pose of the motion (0 is the first): one image, or a turntable."""
@@ -118,7 +124,7 @@ class PlayArguments:
     background: Annotated[str | None, arg(metavar="COLOR|FILE", help_behavior_hint="")] = None
     """A color (white, #203040), an image (cropped to the size), or `transparent` (default: white
     for clips, transparent for .png and frames)."""
-    camera: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    camera: OptionalFile = None
     """Cameras to render, as in ia-ingest: one, or one per pose."""
     orbit: Annotated[float, arg(metavar="DEG", help_behavior_hint="")] = 0.0
     """Azimuth of the camera around the person: 90 is at its left hand, 180 behind it."""
@@ -131,7 +137,7 @@ class PlayArguments:
     or around the motion while it plays."""
     tier: Literal["hq", "lite"] = "hq"
     """Quality tier: lite takes two thirds of the time of hq."""
-    workers: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    workers: OptionalCount = None
     """Frames rendered in parallel (default: one per core). They do not depend on it."""
     provider: Annotated[str, arg(metavar="NAME", help_behavior_hint="")] = "cpu"
     """Execution provider of onnxruntime (cpu, cuda, …), if installed."""
@@ -143,7 +149,7 @@ class PlayArguments:
     verify: Flag = False
     """Render the package's golden frames and compare them with the stored ones; write no images.
     Exit code 2 if they differ."""
-    json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    json: OptionalFile = None
     """Also write the results of --bench or --verify to this file."""
     overwrite: Flag = False
     """Replace the file that --out or --json names, if it exists. Without this flag a file is

@@ -233,6 +233,17 @@ def parse_arguments(
     return tyro.cli(arguments_type, prog=program, args=argv, description="")
 
 
+def run_main(
+    program: str,
+    arguments_type: type[Arguments],
+    work: Callable[[Arguments, Console], int],
+    argv: Sequence[str] | None,
+) -> int:
+    """Parse the arguments of a command, and run it; return its exit code."""
+    given = parse_arguments(arguments_type, program, argv)
+    return run_command(program, lambda: work(given, Console()))
+
+
 def _join_help_lines(arguments_type: Any) -> None:
     """Set the help of each field to its docstring as one paragraph; tyro would keep line breaks."""
     for record in (arguments_type, *(field.default_factory for field in fields(arguments_type))):

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import final
 
@@ -92,14 +92,14 @@ class Console:
             self._rich.print(f"[yellow]warning:[/] … and {rest} more, all in the report")
 
     @contextmanager
-    def status(self, message: str) -> Iterator[Callable[[str], None]]:
-        """Show a spinner (a line in a log) during a block; yield what shows progress next to it."""
+    def status(self, message: str) -> Iterator[None]:
+        """Show a spinner (a line in a log) during a block."""
         if not self.is_terminal:
             self.info(message)
-            yield lambda _: None
+            yield
             return
-        with self._rich.status(escape(message)) as status:
-            yield lambda note: status.update(f"{escape(message)}: {escape(note)}")
+        with self._rich.status(escape(message)):
+            yield
 
     @contextmanager
     def progress(self, label: str, total: float) -> Iterator["ProgressBar"]:

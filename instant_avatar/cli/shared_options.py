@@ -19,6 +19,16 @@ from preprocess.capture_inputs import CaptureInputs
 
 Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
 """A flag without its opposite."""
+Switch = Annotated[bool, arg(help_behavior_hint="")]
+"""A flag with its opposite."""
+OptionalFile = Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")]
+OptionalFolder = Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")]
+OptionalCameras = Annotated[str | None, arg(metavar="FILE", help_behavior_hint="")]
+OptionalId = Annotated[str | None, arg(metavar="ID", help_behavior_hint="")]
+OptionalName = Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")]
+OptionalCount = Annotated[int | None, arg(metavar="N", help_behavior_hint="")]
+OptionalPixels = Annotated[int | None, arg(metavar="PX", help_behavior_hint="")]
+"""Options whose help tells what holds without them."""
 HOST = "127.0.0.1"
 """Loopback address: only browsers of this machine reach what a command serves."""
 
@@ -29,15 +39,15 @@ class CaptureArguments:
 
     video: Annotated[Positional[Path], arg(metavar="VIDEO")]
     """Video file, folder of images, or capture folder."""
-    poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    poses: OptionalFile = None
     """SMPL poses: an .npz with global_orient, body_pose, transl (or poses, trans), or the output of
     4D-Humans, WHAM, VIBE, GVHMR, TRAM, PromptHMR, ROMP, BEV or EasyMocap (a file, or a folder of
     files); see docs/formats.md. Pickles are read without executing them. Default: tracked in the
     video."""
-    person: Annotated[str | None, arg(metavar="ID", help_behavior_hint="")] = None
+    person: OptionalId = None
     """Person ID in the pose file (default: the longest track); without poses, which person to
     track: 1 is the leftmost (default: the largest)."""
-    masks: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    masks: OptionalFolder = None
     """Masks, one per frame, 255 where the person is: a folder of images, a video, or an .npz.
     Default: tracked with the poses, or estimated from images and given poses
     (segmenter:blazepose); segmenter:NAME selects another installed segmenter."""
@@ -45,12 +55,12 @@ class CaptureArguments:
     """Masks are dark where the person is (default: detected automatically)."""
     no_mask_invert: Flag = False
     """Masks are bright where the person is (default: detected automatically)."""
-    cameras: Annotated[str | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    cameras: OptionalCameras = None
     """A cameras.npz (intrinsic, extrinsic: one, or one per frame), a COLMAP model, a
     transforms.json, or an export of Record3D or Polycam; `static`: fixed camera with unknown focal
     length; or `solve`: moving camera, solved from the images (a minute or two, with pycolmap;
     docs/cameras.md). Poses are then relative to the camera of each frame."""
-    body: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    body: OptionalFile = None
     """Your own SMPL body, .npz or .pkl (nothing in it is executed; default: the embedded body)."""
     frames: str = "::"
     """Frames to use: START:STOP:STEP, counted from 0; ::1 for all, where poses are tracked."""

@@ -15,7 +15,7 @@ half of those is the test.
 """
 
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -63,37 +63,6 @@ class DatasetSubject:
     paper: dict[str, float] = field(default_factory=dict)
 
 
-def _write_splits(
-    folder: Path,
-    splits: Mapping[str, Sequence[int]],
-    write_frames: Callable[[str, Path, Sequence[int]], Iterable[int]],
-    console: Console,
-) -> tuple[SplitFrames, SplitFrames]:
-    """Write the capture folders "train" and "test" of a subject; those that exist stay.
-
-    `splits` are frame numbers. `write_frames` writes the frames of a split into a folder, with
-    poses and cameras, and yields their numbers while it does.
-    """
-    for name, numbers in splits.items():
-        if (folder / name).is_dir():  # written whole or not at all
-            continue
-        with (
-            atomic_folder(folder / name) as part,
-            console.progress(f"writing {folder / name}", float(len(numbers))) as bar,
-        ):
-            for made in ("images", "masks"):
-                (part / made).mkdir()
-            done = 0
-            for done, number in enumerate(write_frames(name, part, numbers), start=1):
-                bar.update(float(done), f"frame {number}")
-            if done != len(numbers):
-                raise InputError(
-                    f"Only {done} of {len(numbers)} frames of {folder / name} were found; is the "
-                    "video complete?"
-                )
-    return SplitFrames(folder=folder / "train"), SplitFrames(folder=folder / "test")
-
-
 def _require_rows(count: int, numbers: Sequence[int], path: Path, what: str) -> None:
     """Check that a file has a row for each frame."""
     if count <= max(numbers):
@@ -125,20 +94,17 @@ TRAIN_POSES, TEST_POSES = Path("poses/anim_nerf_train.npz"), Path("poses/anim_ne
 
 def find_people_snapshot(folder: Path) -> list[DatasetSubject]:
     """Find the paper's subjects in a folder, which may be a subject itself."""
-    subjects = []
-    for name in SPLITS:
-        for place in (folder / name, folder):
-            if place.resolve().name == name and place.is_dir():
-                subjects.append(
-                    DatasetSubject(
-                        name=name,
-                        open_splits=partial(_open_prepared, name, place),
-                        size_px=LONGER_SIDE_PX,
-                        paper=PAPER[name],
-                    )
-                )
-                break
-    return subjects
+    return [
+        DatasetSubject(
+            name=name,
+            open_splits=partial(_open_prepared, name, place),
+            size_px=LONGER_SIDE_PX,
+            paper=PAPER[name],
+        )
+        for name in SPLITS
+        for place in (folder / name, folder)
+        if place.resolve().name == name and place.is_dir()
+    ]
 
 
 def _open_prepared(
@@ -150,11 +116,10 @@ def _open_prepared(
             f"{place} holds no images/. The data set's own files (a video, camera.pkl, HDF5) are "
             "prepared first, by InstantAvatar's preprocess_PeopleSnapshot.py (docs/evaluation.md)."
         )
+    files = (place / TRAIN_POSES, place / TEST_POSES)
     train, test = (
         SplitFrames(folder=place, poses=poses if poses.is_file() else None, frames=frames)
-        for poses, frames in zip(
-            (place / TRAIN_POSES, place / TEST_POSES), SPLITS[name], strict=True
-        )
+        for poses, frames in zip(files, SPLITS[name], strict=True)
     )
     return train, test
 
@@ -184,14 +149,23 @@ def split_by_rule(count: int) -> tuple[list[int], list[int]]:
 
 
 def _open_subject(place: Path, into: Path, console: Console) -> tuple[SplitFrames, SplitFrames]:
-    """Write both splits with cameras and poses in meters."""
+    """Write the capture folders "train" and "test", in meters; those that exist stay."""
     model = find_colmap_model(place / "sparse")
     if model is None:
         raise InputError(f"{place / 'sparse'} holds no COLMAP model (cameras and images).")
     cameras = read_colmap_model(model)
     splits = _read_splits(place, [Path(each.name or "").name for each in cameras])
-    write = partial(_write_frames, place, cameras)
-    return _write_splits(into / place.resolve().name, splits, write, console)
+    folder = into / place.resolve().name
+    for name, rows in splits.items():
+        if (folder / name).is_dir():  # written whole or not at all
+            continue
+        with (
+            atomic_folder(folder / name) as part,
+            console.progress(f"writing {folder / name}", float(len(rows))) as bar,
+        ):
+            for done, row in enumerate(_write_frames(place, cameras, part, rows), start=1):
+                bar.update(float(done), f"frame {row}")
+    return SplitFrames(folder=folder / "train"), SplitFrames(folder=folder / "test")
 
 
 def _read_splits(place: Path, names: list[str]) -> dict[str, Sequence[int]]:
@@ -213,7 +187,7 @@ def _read_splits(place: Path, names: list[str]) -> dict[str, Sequence[int]]:
 
 
 def _write_frames(
-    place: Path, cameras: list[NamedCamera], _split: str, part: Path, rows: Sequence[int]
+    place: Path, cameras: list[NamedCamera], part: Path, rows: Sequence[int]
 ) -> Iterator[int]:
     """Write frames of the camera's order; yield their rows."""
     stored = read_npz(place / POSES, POSE_KEYS)
@@ -250,6 +224,8 @@ def _copy_images(
     if folder is None:
         raise InputError(f"{place} holds no segmentations/.")
     masks = open_masks(folder, invert=MASK_FOLDERS[folder.relative_to(place)])
+    for made in ("images", "masks"):
+        (part / made).mkdir()
     for row in rows:
         name = Path(cameras[row].name or "").name
         if name not in images:

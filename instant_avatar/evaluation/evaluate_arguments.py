@@ -5,10 +5,20 @@ from pathlib import Path
 from typing import Annotated, Literal
 from zipfile import is_zipfile
 
-from tyro.conf import FlagCreatePairsOff, Positional, arg
+from tyro.conf import Positional, arg
 
 from capture.input_error import InputError
-from instant_avatar.cli.shared_options import check_output_file, parse_frame_range
+from instant_avatar.cli.shared_options import (
+    Flag,
+    OptionalCameras,
+    OptionalCount,
+    OptionalFile,
+    OptionalFolder,
+    OptionalPixels,
+    Switch,
+    check_output_file,
+    parse_frame_range,
+)
 from preprocess.capture_inputs import CaptureInputs
 
 
@@ -56,38 +66,38 @@ class EvaluateArguments:
     """LPIPS as published tables compute it: AlexNet fed [0, 1] (PeopleSnapshot), AlexNet fed
     [-1, 1] (NeuMan), VGG fed [-1, 1] (ZJU-MoCap; five seconds of CPU per image of 540 px).
     Default: all three."""
-    lpips_weights: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    lpips_weights: OptionalFolder = None
     """Folder with alexnet-owt-7be5be79.pth and vgg16-397923af.pth (default: torch's cache)."""
-    poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    poses: OptionalFile = None
     """Poses of --on, as in ia-ingest (default: those in the capture folder)."""
-    masks: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    masks: OptionalFolder = None
     """Masks of --on, as in ia-ingest (default: those in the capture folder)."""
-    cameras: Annotated[str | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    cameras: OptionalCameras = None
     """Cameras of --on, as in ia-ingest (default: those in the capture folder)."""
-    body: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    body: OptionalFile = None
     """Body file that the avatars were trained with, if not the embedded body."""
     frames: str = "::"
     """Frames of --on to use: START:STOP:STEP, counted from 0."""
     rotate: Literal[0, 90, 180, 270] = 0
     """Turn the frames of --on clockwise by this many degrees, as in ia-ingest."""
-    size: Annotated[int | None, arg(metavar="PX", help_behavior_hint="")] = None
+    size: OptionalPixels = None
     """Longer side of the images (default: as in training, else the original size)."""
-    fitted: Annotated[bool, arg(help_behavior_hint="")] = True
+    fitted: Switch = True
     """Score poses fitted to the frames as well."""
-    player: Annotated[bool, arg(help_behavior_hint="")] = True
+    player: Switch = True
     """Score each tier of the package's player as well."""
     seconds: float = 60.0
     """Training time per subject of a dataset."""
-    steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    steps: OptionalCount = None
     """Training steps per subject of a dataset, instead of --seconds."""
-    out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    out: OptionalFolder = None
     """Folder for the runs of a dataset, and for its frames under captures/ (default: runs/NAME,
     named after the dataset)."""
-    json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    json: OptionalFile = None
     """Write conditions and the scores of every frame to this file."""
-    card: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    card: OptionalFile = None
     """Write a page with conditions, scores and pictures to this file."""
-    overwrite: Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")] = False
+    overwrite: Flag = False
     """Replace the files that --json and --card name, if they exist."""
 
     def validate(self) -> None:

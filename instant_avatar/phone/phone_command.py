@@ -18,12 +18,11 @@ from instant_avatar.cli.command_line import (
     CommandExit,
     exit_on_interrupt,
     is_disk_full,
-    parse_arguments,
     require_packages,
-    run_command,
+    run_main,
 )
 from instant_avatar.cli.console import Console
-from instant_avatar.cli.shared_options import Flag, check_writable
+from instant_avatar.cli.shared_options import Flag, OptionalFile, check_writable
 from instant_avatar.run.ingest_arguments import IngestArguments
 
 if TYPE_CHECKING:
@@ -63,9 +62,9 @@ class CaptureOptions:
     """Address to serve at (default: all of this machine; 127.0.0.1 for this machine only)."""
     port: int = 8010
     """Port of the page; the one after it has the page with TLS."""
-    cert: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    cert: OptionalFile = None
     """Certificate (PEM) instead of one made on the spot."""
-    key: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    key: OptionalFile = None
     """Key of --cert (PEM)."""
     no_tls: Flag = False
     """Serve the plain page only."""
@@ -94,8 +93,7 @@ class CaptureOptions:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; return its exit code."""
-    given = parse_arguments(CaptureOptions, PROGRAM, argv)
-    return run_command(PROGRAM, lambda: capture(given, Console()))
+    return run_main(PROGRAM, CaptureOptions, capture, argv)
 
 
 def capture(options: CaptureOptions, console: Console) -> int:

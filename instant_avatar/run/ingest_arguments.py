@@ -15,6 +15,12 @@ from instant_avatar.cli.command_line import require_packages
 from instant_avatar.cli.shared_options import (
     CaptureArguments,
     Flag,
+    OptionalCount,
+    OptionalFile,
+    OptionalFolder,
+    OptionalName,
+    OptionalPixels,
+    Switch,
     capture_name,
     check_output_file,
 )
@@ -58,13 +64,13 @@ class IngestArguments(CaptureArguments):
     video: Annotated[Positional[Path], arg(metavar="VIDEO")]
     """Video file, folder of images, or capture folder; camera:0 for a camera, or the address of a
     stream, as in camera:rtsp://…"""
-    tracker: Annotated[str | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    tracker: OptionalName = None
     """Another installed tracker to use where no --poses are given (default: blazepose, the built-in
     one; docs/formats.md)."""
     height_cm: Annotated[float | None, arg(metavar="CM", help_behavior_hint="")] = None
     """Height of the person, barefoot. Sets the metric scale of the body, its distance and solved
     cameras, which images alone cannot determine."""
-    out: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    out: OptionalFolder = None
     """Folder for the run (default: runs/NAME, named after the video or its folder)."""
     resume: Flag = False
     """Continue the run in --out: with the same video after an interruption, or with another one."""
@@ -74,7 +80,7 @@ class IngestArguments(CaptureArguments):
     seconds: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None
     """Training time in seconds, excluding start-up (default: 60; with --realtime the clip's
     duration)."""
-    steps: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    steps: OptionalCount = None
     """Number of training steps instead of --seconds, so that the result does not depend on the
     speed of the machine, but for rounding. Two cores make about 50 per second. Every frame takes
     at least one step."""
@@ -90,15 +96,15 @@ class IngestArguments(CaptureArguments):
     idle_seconds: float = IDLE_TIMEOUT_S
     """End the run when no new image has come into a live folder for this many seconds; also the
     limit for the first one."""
-    size: Annotated[int | None, arg(metavar="PX", help_behavior_hint="")] = None
+    size: OptionalPixels = None
     """Longer side of training images in pixels; never upscaled (default: 540 for 60 s, proportional
     to the square root of --seconds). The head is learnt in the video's own resolution."""
     hold_out: Annotated[int, arg(metavar="N", help_behavior_hint="(default: 10)")] = HELD_OUT_STRIDE
     """Hold out every Nth frame for evaluation; 0 trains on all frames."""
-    refine_poses: Annotated[bool, arg(help_behavior_hint="")] = True
+    refine_poses: Switch = True
     """Fit poses, body and focal length to the masks, and optimize the poses during training. With
     --no-refine-poses all are taken as exact."""
-    refine_masks: Annotated[bool, arg(help_behavior_hint="")] = True
+    refine_masks: Switch = True
     """Refine given masks if the pictures have stronger edges beside their borders."""
     force: Flag = False
     """Train even if ia-check considers poses and masks unusable."""
@@ -106,11 +112,11 @@ class IngestArguments(CaptureArguments):
     """Open a live viewer at http://127.0.0.1:PORT (default 8008): orbit the avatar, see body
     coverage, pause training, save a package. Requires the extra [viewer]. Ctrl-C closes it at the
     end."""
-    threads: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    threads: OptionalCount = None
     """Threads of the trainer (default: one per core)."""
     seed: int = 0
     """Random seed."""
-    json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    json: OptionalFile = None
     """Write a copy of report.json to this file."""
 
     def validate(self) -> None:
