@@ -83,7 +83,6 @@ def batch(arguments: BatchArguments, ingest_words: Sequence[str], console: Conso
 
 
 def _sum_up(folder: BatchFolder, results: Results, console: Console) -> None:
-    """Write the contact sheet, and print what it says in short."""
     folder.write_text(PAGE_NAME, summary_page(results, Path(folder.place).name))
     console.info(headline(results))
     console.print_artifact("results", f"{folder.place}/{RESULTS_NAME}")

@@ -224,7 +224,6 @@ def _sample_masks(capture: Capture, count: int = SAMPLED_FRAMES) -> SilhouetteOb
 
 
 def _stored_geometry(capture: Capture) -> CaptureGeometry:
-    """Return poses, cameras and mask polarity as stored in the files."""
     files = mask_files(capture)
     return replace(capture.geometry(), masks_inverted=files is not None and files.inverted)
 
@@ -250,10 +249,8 @@ def preflight_check(
 ) -> None:
     """Check a few masks; diagnose the capture only if they and the poses disagree.
 
-    Live sources are not checked. `inputs` are for the suggested command.
-
-    Raises:
-        InputError: If the capture is unusable; with `force` the user is only warned.
+    Live sources are not checked. `inputs` are for the suggested command. An unusable
+    capture is refused; with `force` the user is only warned.
     """
     if passes_quick_check(capture):
         return
@@ -288,6 +285,5 @@ def _explain(check: CaptureValidation) -> str:
 
 
 def _suggest_command(check: CaptureValidation, inputs: CaptureInputs) -> str:
-    """Suggest the command that corrects the capture, or that shows it."""
     aim = "correct" if check.causes else "inspect"
     return f"To {aim} it: {check_command(inputs, fix=bool(check.causes))}"

@@ -44,9 +44,6 @@ def write_corrected_capture(check: CaptureValidation, out: Path) -> None:
     Unchanged images are copied: who edits the copy does not change the original. Images that must
     be rotated or mirrored are written as images; for a crop or an offset, masks, poses and cameras
     are changed instead.
-
-    Raises:
-        InputError: If no correctable mistake was found.
     """
     if not check.causes:
         raise InputError("No correctable mistake was found; --fix wrote nothing.")
@@ -102,7 +99,6 @@ def _write_images(source: FrameSource, video: VideoTransform, folder: Path) -> s
 
 
 def _write_masks(check: CaptureValidation, masks: StoredMasks, folder: Path) -> None:
-    """Write the mask of each video frame that has one."""
     source, corrected = check.capture.source, check.diagnosis.corrected
     video, sampled = corrected.video_transform, check.objective.masks
     by_name = source.path.is_dir() and not video.reorients

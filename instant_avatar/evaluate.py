@@ -6,17 +6,30 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from capture.atomic_files import write_text_atomically
 from capture.input_error import InputError
-from instant_avatar.cli.command_line import DONE, INTERRUPTED, NO_AVATAR, CommandExit, run_main
+from instant_avatar.cli.command_line import (
+    DONE,
+    INTERRUPTED,
+    NO_AVATAR,
+    CommandExit,
+    run_main,
+    stop_on_interrupt,
+)
 from instant_avatar.cli.console import Console
 from instant_avatar.cli.shared_options import parse_frame_range
+from instant_avatar.evaluation.datasets import (
+    DatasetSubject,
+    SplitFrames,
+    find_neuman,
+    find_people_snapshot,
+)
 from instant_avatar.evaluation.evaluate_arguments import EvaluateArguments
 from instant_avatar.ingest import ingest
 from instant_avatar.run.ingest_arguments import IngestArguments
 from instant_avatar.run.run_folder import RunFolder
 
 if TYPE_CHECKING:  # torch is loaded after --help has been answered
-    from instant_avatar.evaluation.datasets import DatasetSubject, SplitFrames
     from instant_avatar.evaluation.evaluation_session import EvaluationSession
     from instant_avatar.evaluation.score_table import AvatarEvaluation
 
@@ -32,8 +45,6 @@ def evaluate(arguments: EvaluateArguments, console: Console) -> int:
     _check_targets(arguments.targets)
     with console.status("loading torch"):
         from avatar.evaluation.perceptual import Lpips
-        from capture.atomic_files import write_text_atomically
-        from instant_avatar.cli.command_line import stop_on_interrupt
         from instant_avatar.evaluation.evaluation_session import EvaluationSession
         from instant_avatar.evaluation.score_table import (
             evaluation_conditions,
@@ -71,8 +82,6 @@ def evaluate(arguments: EvaluateArguments, console: Console) -> int:
 
 def _check_targets(targets: Sequence[Path]) -> None:
     """Refuse folders that hold nothing to score, before torch is loaded."""
-    from instant_avatar.evaluation.datasets import find_neuman, find_people_snapshot
-
     for path in targets:
         is_avatar = path.is_file() or RunFolder(path=path).has_checkpoint()
         if not (is_avatar or find_people_snapshot(path) or find_neuman(path)):
@@ -84,8 +93,6 @@ def _check_targets(targets: Sequence[Path]) -> None:
 
 
 def _evaluate_all(session: "EvaluationSession") -> "Iterator[AvatarEvaluation]":
-    from instant_avatar.evaluation.datasets import find_neuman, find_people_snapshot
-
     arguments, stop = session.arguments, session.stop
     for path in arguments.targets:
         if stop.is_set():
@@ -93,7 +100,7 @@ def _evaluate_all(session: "EvaluationSession") -> "Iterator[AvatarEvaluation]":
         run = RunFolder(path=path)
         if path.is_file():
             frames = session.frames_of_capture(RunFolder(path=path.parent))
-            yield session.evaluate_package(path, frames)
+            yield session.evaluate(str(path), frames, package=path)
         elif run.has_checkpoint():
             yield _evaluate_run(run, session)
         else:
@@ -106,7 +113,6 @@ def _evaluate_all(session: "EvaluationSession") -> "Iterator[AvatarEvaluation]":
 
 
 def _evaluate_run(run: RunFolder, session: "EvaluationSession") -> "AvatarEvaluation":
-    """Score renderer and player on the run's held-out frames, or on the capture of --on."""
     from instant_avatar.evaluation.evaluation_frames import held_out_frames, trained_longer_side_px
 
     if session.arguments.on is None:
@@ -117,7 +123,7 @@ def _evaluate_run(run: RunFolder, session: "EvaluationSession") -> "AvatarEvalua
 
 
 def _evaluate_subject(
-    subject: "DatasetSubject", above: Path, session: "EvaluationSession"
+    subject: DatasetSubject, above: Path, session: "EvaluationSession"
 ) -> "Iterator[AvatarEvaluation]":
     """Train a subject and score its test frames; nothing if training was stopped."""
     from instant_avatar.evaluation.evaluation_frames import capture_frames
@@ -140,7 +146,7 @@ def _evaluate_subject(
 
 
 def _train_subject(
-    subject: "DatasetSubject", train: "SplitFrames", run: RunFolder, session: "EvaluationSession"
+    subject: DatasetSubject, train: SplitFrames, run: RunFolder, session: "EvaluationSession"
 ) -> bool:
     """Train a subject like ia-ingest, on all of its training frames.
 

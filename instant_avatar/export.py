@@ -174,7 +174,6 @@ def _export_converted(arguments: ExportArguments, package: Path, console: Consol
 def _build_mesh(
     arguments: ExportArguments, package: AvatarPackage, motion: Motion, console: Console
 ) -> tuple[bytes, str]:
-    """Return a file of a mesh, and its size in words."""
     name = arguments.out.stem
     textured = arguments.to in ("glb", "vrm") and arguments.triangles is not None
     if textured and find_spec("xatlas") is None:

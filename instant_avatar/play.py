@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from capture.atomic_files import write_text_atomically
 from capture.input_error import InputError, counted
 from instant_avatar.animation.play_arguments import DEFAULT_TURN_S, WEB_PORT, PlayArguments
 from instant_avatar.cli.command_line import (
@@ -15,8 +16,10 @@ from instant_avatar.cli.command_line import (
     INTERRUPTED,
     fill_optional_value,
     run_main,
+    stop_on_interrupt,
 )
 from instant_avatar.cli.console import Console
+from instant_avatar.cli.shared_options import check_output_folder
 
 if TYPE_CHECKING:  # onnxruntime is loaded after --help has been answered
     from export.player import Player
@@ -43,7 +46,6 @@ def play(arguments: PlayArguments, console: Console) -> int:
 
 
 def _render_clip(arguments: PlayArguments, console: Console) -> int:
-    from export.player import Player
     from instant_avatar.animation.clip_file import (
         MAX_GIF_FPS,
         TRANSPARENT,
@@ -53,10 +55,8 @@ def _render_clip(arguments: PlayArguments, console: Console) -> int:
         plan_render,
         write_clip,
     )
-    from instant_avatar.cli.command_line import stop_on_interrupt
 
-    player = Player.load(arguments.avatar, tier=arguments.tier, provider=arguments.provider)
-    out = arguments.output_path
+    player, out = _load_player(arguments, console), arguments.output_path
     suffix = out.suffix.lower()
     check_clip_path(out, arguments.inputs, overwrite=arguments.overwrite)
     clear = (
@@ -66,7 +66,6 @@ def _render_clip(arguments: PlayArguments, console: Console) -> int:
     )
     blend = None if clear else background_compositor(arguments.background or "white")
     description = clip_format(out, transparent=blend is None).description
-    _print_package_warnings(player, console)
     shots, fps = plan_render(
         arguments, player, console, max_fps=MAX_GIF_FPS if suffix == ".gif" else np.inf
     )
@@ -102,23 +101,24 @@ def _describe_clip(shots: "list[Shot]", count: int, fps: float) -> str:
     return f"{frames} of {width}x{height} px{rate}"
 
 
-def _print_package_warnings(player: "Player", console: Console) -> None:
+def _load_player(arguments: PlayArguments, console: Console) -> "Player":
+    """Open the package, and print the weaknesses that it was written with."""
+    from export.player import Player
     from instant_avatar.animation.player_checks import package_warnings
 
+    player = Player.load(arguments.avatar, tier=arguments.tier, provider=arguments.provider)
     for note in package_warnings(player.manifest):
         console.warning(note)
+    return player
 
 
 def _run_benchmark(arguments: PlayArguments, console: Console) -> int:
-    from capture.atomic_files import write_text_atomically
-    from export.player import Player
     from instant_avatar.animation.clip_file import plan_render
     from instant_avatar.animation.player_checks import benchmark_player
 
     started = time.perf_counter()
-    player = Player.load(arguments.avatar, tier=arguments.tier, provider=arguments.provider)
+    player = _load_player(arguments, console)
     load_ms = 1000.0 * (time.perf_counter() - started)
-    _print_package_warnings(player, console)
     shots, _ = plan_render(arguments, player, console)
     result = benchmark_player(
         player, shots, load_ms=load_ms, tier=arguments.tier, workers=arguments.workers or 1
@@ -136,20 +136,16 @@ def _run_benchmark(arguments: PlayArguments, console: Console) -> int:
 
 
 def _run_web(arguments: PlayArguments, port: int, console: Console) -> int:
-    from export.player import Player
     from export.player_page import build_page, encode_motion, runtime_files
     from instant_avatar.animation.driving_motion import load_driving_motion, pose_rate
     from instant_avatar.animation.web_server import sample_motions, serve_site, write_site
-    from instant_avatar.cli.shared_options import check_output_folder
 
     if not 0 < port < 1 << 16:
         raise InputError(f"--web is {port}, but must be a port from 1 to 65535.")
     runtime_files()
     if arguments.out is not None:
         check_output_folder(arguments.out, "--out", arguments.inputs)
-    player = Player.load(arguments.avatar)
-    _print_package_warnings(player, console)
-    joints, motions = player.manifest.rest_joints, sample_motions()
+    joints, motions = _load_player(arguments, console).manifest.rest_joints, sample_motions()
     if arguments.poses is not None:
         given = load_driving_motion(arguments.poses, joints, console, person=arguments.person)
         motions = {"Given": given, **motions}
@@ -176,7 +172,6 @@ def _run_web(arguments: PlayArguments, port: int, console: Console) -> int:
 
 
 def _run_verification(arguments: PlayArguments, console: Console) -> int:
-    from capture.atomic_files import write_text_atomically
     from instant_avatar.animation.player_checks import to_json_text, verdict_lines, verify_package
 
     result = verify_package(arguments.avatar, provider=arguments.provider)

@@ -33,7 +33,7 @@ from instant_avatar.cli.shared_options import (
     parse_frame_range,
     unused_path,
 )
-from instant_avatar.run.run_folder import RunFolder, claim_folder
+from instant_avatar.run.run_folder import RunFolder, claim_folder, listing_outputs
 from preprocess.capture_inputs import CaptureInputs
 
 PROGRAM = "ia-track"
@@ -176,14 +176,8 @@ def next_command(arguments: TrackArguments, frames: slice | None) -> list[str]:
 @contextmanager
 def claim_outputs(folder: Path, console: Console) -> Iterator[None]:
     """Make and lock a folder during a block, in which the files of ia-track are listed."""
-    with claim_folder(folder, console):
-        listing = OutputFileList(folder)
-        listing.create()
-        listing.remove_temporaries()
-        try:
-            yield
-        finally:
-            listing.remove_if_empty()
+    with claim_folder(folder, console), listing_outputs(folder):
+        yield
 
 
 def track(arguments: TrackArguments, console: Console) -> int:

@@ -253,7 +253,6 @@ def load_cameras(
 
 
 def _resize_camera(camera: Camera, size: int | tuple[int, int] | None) -> Camera:
-    """Return the camera as a pinhole camera of a size."""
     pinhole = replace(camera, distortion=())
     if not isinstance(size, tuple):
         return pinhole.resize_longer_side(size or max(camera.size_px))

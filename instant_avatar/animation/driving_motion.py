@@ -220,7 +220,6 @@ class FollowingCamera:
         return Camera.at(self._look_at_point(pose) - away * axes[2], axes, focal, self.size_px)
 
     def _look_at_point(self, pose: BodyPose) -> Float[np.ndarray, "3"]:
-        """Return the world point in the center of the image."""
         manifest, joint = self.player.manifest, self.viewpoint.joint
         pelvis = manifest.rest_joints[0]
         if joint is None:

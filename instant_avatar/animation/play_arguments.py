@@ -233,14 +233,15 @@ class PlayArguments:
         return self.avatar.parent / f"{stem}.{'webm' if is_clear else 'mp4'}"
 
 
-ALL_ARGUMENTS = frozenset(field.name for field in fields(PlayArguments))
-"""Names of all arguments."""
 MODES = {
     "verify": ("renders the golden frames as stored", frozenset({"provider", "json", "overwrite"})),
     "web": (
         "shows a page with its own camera, size and choice of tiers",
         frozenset({"poses", "person", "out", "fps", "speed"}),
     ),
-    "bench": ("writes no pictures", ALL_ARGUMENTS - {"out", "background"}),
+    "bench": (
+        "writes no pictures",
+        frozenset(f.name for f in fields(PlayArguments) if f.name not in ("out", "background")),
+    ),
 }
 """For each mode other than rendering a clip: what it does, and the arguments it uses."""

@@ -72,11 +72,7 @@ class BatchFolder:
 
     @contextmanager
     def claim(self, console: Console) -> Iterator[None]:
-        """Create the folder, lock it if it is local, and read the results, during a block.
-
-        Raises:
-            InputError: If it holds files of another program.
-        """
+        """Create the folder, lock it if it is local, and read the results, during a block."""
         with ExitStack() as held:
             if self.path is not None:
                 marker = OutputFileList(self.path)
@@ -145,7 +141,6 @@ class BatchFolder:
             write_text_atomically(self.path / name, text, replace=True)
 
     def _read(self) -> None:
-        """Read the results, and which packages are there."""
         results = f"{self.place}/{RESULTS_NAME}"
         if not list_files(results):
             return
@@ -167,7 +162,6 @@ class BatchFolder:
         self.write_text(RESULTS_NAME, "".join(map(_line, self.records)))
 
     def _send(self, name: str, content: bytes) -> None:
-        """Write a file behind a URL."""
         with open_remote(f"{self.place}/{name}") as (system, path):
             system.makedirs(path.rsplit("/", 1)[0], exist_ok=True)
             system.pipe_file(path, content)

@@ -63,9 +63,6 @@ def find_captures(places: Iterable[str], common: Iterable[str] = ()) -> list[Bat
     """Find the captures in folders, files, tables and URLs, in order of their names.
 
     Options in `common` are for all captures; a capture's own take precedence.
-
-    Raises:
-        InputError: If a place holds no capture, or two captures have the same name.
     """
     paths, words = split_paths(common, Path.cwd().as_posix())
     captures: dict[str, BatchCapture] = {}
@@ -94,7 +91,6 @@ def parse_options(words: tuple[str, ...]) -> IngestArguments:
     """Parse and check options of ia-ingest, other than paths, for captures of a batch.
 
     Raises:
-        InputError: If one has a wrong value, or is set by the batch itself.
         SystemExit: If the words cannot be parsed.
     """
     parsed = parse_arguments(IngestArguments, "ia-ingest", ["CAPTURE", *words])
@@ -125,7 +121,6 @@ def split_paths(words: Iterable[str], base: str) -> Options:
 
 
 def _absolute(value: str, base: str) -> str:
-    """Return the absolute path, or the URL, of the value of a path option."""
     if is_url(value) or value.startswith("/") or KEYWORDS.fullmatch(value):
         return value
     return f"{base}/{value}" if is_url(base) else Path(base, value).absolute().as_posix()

@@ -212,7 +212,6 @@ def _time_limit(seconds: float, log: TextIO) -> Iterator[None]:
 
 
 def _collect(run: Path, *, checkpoint: bool) -> dict[str, bytes]:
-    """Read the files of a run that are brought back."""
     paths = [run / name for name in KEPT_FILES]
     paths += sorted((run / "checkpoint").rglob("*")) if checkpoint else []
     return {str(path.relative_to(run)): path.read_bytes() for path in paths if path.is_file()}
@@ -275,7 +274,6 @@ def run_attempts(
 
 
 def _connect(ray: Any, address: str) -> None:
-    """Connect to a cluster, or start one of this machine."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent anywhere
     own: dict[str, Any] = {}
     if address == RAY_LOCAL:
@@ -312,7 +310,6 @@ def _check_room(ray: Any, needs: Iterable[dict[str, int]]) -> None:
 
 
 def _attempt(ray: Any, task: Any, capture: BatchCapture) -> Attempt:
-    """Return the last attempt of a task that has ended."""
     try:
         return ray.get(task)
     except ray.exceptions.RayTaskError as error:

@@ -256,7 +256,6 @@ def _join_help_lines(arguments_type: Any) -> None:
 
 
 def _installed_version() -> str:
-    """Return the version of the installed package."""
     try:
         return version(DISTRIBUTION)
     except PackageNotFoundError:

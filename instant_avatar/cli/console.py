@@ -112,7 +112,6 @@ class Console:
 
 
 def _min_width_column(width: int) -> Column:
-    """Return a column that keeps this width in a narrow terminal."""
     return Column(min_width=width, no_wrap=True)
 
 

@@ -64,7 +64,6 @@ class DatasetSubject:
 
 
 def _require_rows(count: int, numbers: Sequence[int], path: Path, what: str) -> None:
-    """Check that a file has a row for each frame."""
     if count <= max(numbers):
         raise InputError(
             f"{path} holds {count} {what}, but the protocol needs that of frame {max(numbers)}; is "

@@ -133,7 +133,6 @@ class EvaluateArguments:
                 check_output_file(path, flag, self._inputs(), overwrite=self.overwrite)
 
     def _inputs(self) -> list[Path]:
-        """Return files that are read and must not be written to."""
         packages = [path for path in self.targets if path.is_file()]
         if self.on is not None:
             return [*packages, *self.capture_inputs(self.on).input_paths()]

@@ -47,10 +47,6 @@ class EvaluationSession:
     stop: threading.Event
     lpips: Lpips
 
-    def evaluate_package(self, package: Path, frames: EvaluationFrames) -> AvatarEvaluation:
-        """Score the player alone."""
-        return self._evaluate(str(package), frames, None, package, ("white",))
-
     def evaluate_run(
         self,
         name: str,
@@ -69,7 +65,10 @@ class EvaluationSession:
             trainer = checkpoint.load(run.checkpoint)[0]
         report = read_report(run) if run.report_json.is_file() else None
         package = run.package if run.package.is_file() else None
-        return self._evaluate(name, frames, trainer, package, backgrounds, report, paper)
+        return self.evaluate(
+            name, frames, trainer, package,
+            backgrounds=backgrounds, report=report, paper=paper,
+        )  # fmt: skip
 
     def frames_of_capture(self, run: RunFolder, size_px: int | None = None) -> EvaluationFrames:
         """Open the capture of --on for the person of a run, if the run is known."""
@@ -79,17 +78,18 @@ class EvaluationSession:
         inputs = arguments.capture_inputs(arguments.on)
         return capture_frames(inputs, person, arguments.size or size_px)
 
-    def _evaluate(
+    def evaluate(
         self,
         name: str,
         frames: EvaluationFrames,
-        trainer: Trainer | None,
-        package: Path | None,
-        backgrounds: tuple[str, ...],
+        trainer: Trainer | None = None,
+        package: Path | None = None,
+        *,
+        backgrounds: tuple[str, ...] = ("white",),
         report: dict[str, Any] | None = None,
         paper: dict[str, float] | None = None,
     ) -> AvatarEvaluation:
-        """Score all renderers on all frames, or on those before `stop` is set."""
+        """Score a trainer's renderer and a package's player, on frames before `stop` is set."""
         renderers = self._renderers(frames, trainer, package)
         scorer = FrameScorer(
             renderers,

@@ -237,7 +237,6 @@ class PhoneServer:
         return web.Response(body=path.read_bytes(), headers={"Content-Type": kind})
 
     async def _runtime(self, request: web.Request) -> web.Response:
-        """The player's WebAssembly module."""
         if request.match_info["file"] != MODULE_FILE or not self._player:
             raise InputError("There is no such file.")
         return web.Response(body=self._player[WEB_MODULE], headers=HEADERS | KEPT)
@@ -295,9 +294,8 @@ class PhoneServer:
 
     async def _end(self, request: web.Request) -> web.Response:
         film, total = self._film(request), int(request.query["size"])
-        if film.file.received < total:
-            return self._progress(film)
-        film.file.end()
+        if film.file.received >= total:
+            film.file.end()
         return self._progress(film)
 
     def _wake(self, number: str) -> None:
@@ -384,7 +382,6 @@ def _session(request: web.Request) -> str:
 
 
 def _player_files() -> dict[str, bytes]:
-    """The files of a player's page with the sample motions."""
     samples = sample_motions()
     motions = {name: encode_motion(motion, pose_rate(motion)) for name, motion in samples.items()}
     return player_files(motions, compression_level=1)

@@ -140,12 +140,6 @@ class CurvePoint:
     video: int = 1
     pixels: int | None = None
 
-    @classmethod
-    def from_checkpoint(cls, content: dict[str, Any]) -> "CurvePoint":
-        """Restore a point from a checkpoint."""
-        frames = content.get("frames", [])
-        return cls(**{**content, "frames": tuple((frame, psnr) for frame, psnr in frames)})
-
 
 @dataclass(frozen=True, kw_only=True)
 class Percentiles:

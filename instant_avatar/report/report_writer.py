@@ -161,11 +161,7 @@ class ReportWriter:
                 self._print(result)
 
     def exit_code(self) -> int:
-        """Return the exit code of a session that has ended.
-
-        Raises:
-            CommandExit: If there is no package, or its avatar has failed.
-        """
+        """Return the exit code of a session that has ended; raise that of a failed avatar."""
         assert self._result is not None
         assert self.report is not None
         is_interrupted = self._result.interrupted
@@ -207,7 +203,6 @@ class ReportWriter:
         return quote_command("ia-play", self._run.package, *options)
 
     def _next_steps(self) -> dict[str, str]:
-        """Return commands by what they do."""
         package, mesh = self._run.package, self._run.path / "avatar.glb"
         return {
             "Play it as a video": self._play_command(),
@@ -218,7 +213,6 @@ class ReportWriter:
         }
 
     def _print(self, result: TrainingResult) -> None:
-        """Print frames, scores, verdict and files."""
         report, run, console = self.report, self._run, self._console
         assert report is not None
         held_out, fitted = report.held_out, report.held_out_refined
@@ -278,7 +272,6 @@ def demo_animation(player: Player) -> bytes:
 
 
 def _fitted_pose_stats(result: TrainingResult) -> HeldOutStats | None:
-    """Scores in poses fitted to the frames, if there are any."""
     if not result.scores.fitted:
         return None
     return replace(HeldOutStats.of(result.scores.fitted, result.meter.size_px), poses="fitted")
@@ -340,17 +333,14 @@ def _build_report(
 
 
 def _frame_stats(result: TrainingResult) -> FrameStats:
-    meter = result.meter
+    meter, used = result.meter, result.frames_added
     return FrameStats(
-        read=result.frames_added
-        + meter.held_out_count
-        + meter.dropped_count
-        + meter.near_duplicates,
-        used=result.frames_added,
+        read=used + meter.held_out_count + meter.dropped_count + meter.near_duplicates,
+        used=used,
         held_out=meter.held_out_count,
         dropped=tuple(meter.dropped),
         near_duplicates=meter.near_duplicates,
-        not_replayed=result.frames_added - sum(i >= 0 for i in result.trainer.replay.frame_indices),
+        not_replayed=used - sum(i >= 0 for i in result.trainer.replay.frame_indices),
     )
 
 

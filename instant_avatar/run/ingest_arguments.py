@@ -148,7 +148,6 @@ class IngestArguments(CaptureArguments):
             require_packages("viser")
 
     def _check_live_options(self) -> None:
-        """Refuse what only a recording can have."""
         if self.realtime:
             raise InputError(
                 "--realtime simulates a live camera with a recording; this source is live. Drop it."

@@ -255,7 +255,6 @@ class LiveViewer:
         self.page.close()
 
     def _wait_while_paused(self, session: TrainingSession) -> None:
-        """Wait until the user resumes training, or presses Ctrl-C."""
         self._next_panel = 0.0
         status = f"Paused after {_progress_text(session)}"
         while self.page.paused and not session.stop.is_set():
@@ -266,7 +265,6 @@ class LiveViewer:
         self._next_panel = 0.0
 
     def _save_package(self, session: TrainingSession) -> None:
-        """Write the avatar in its current state as a package."""
         self.page.save_requested = False
         if not session.trainer.steps:
             self.page.notify("Not yet", "Training has not started.")
@@ -286,7 +284,6 @@ class LiveViewer:
         self._console.info(f"Saved from the live viewer: {self._run.package}, {size}.")
 
     def _update_page(self, session: TrainingSession, status: str, *, idle: bool) -> None:
-        """Update the parts of the page that are due."""
         now = time.perf_counter()
         if now >= self._next_panel:
             self._next_panel = now + PANEL_INTERVAL_S

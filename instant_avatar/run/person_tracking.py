@@ -112,7 +112,6 @@ def track_person(
     `for_learning` leaves out frames that an avatar does not need (see `limit_frames`).
 
     Raises:
-        InputError: If the recording cannot be read, or no person is found in it.
         KeyboardInterrupt: If it was stopped before the person was found.
     """
     inputs, source = _open_video(inputs, console, look=not resume, for_learning=for_learning)
@@ -318,7 +317,6 @@ def fit_tracked_video(
 
 
 def _without(motion: Motion, frames: Sequence[int]) -> Motion:
-    """The motion with the poses of some frames marked as not valid."""
     if motion.frames is None:
         return motion
     return replace(motion, valid=motion.valid & ~np.isin(motion.frames, list(frames)))

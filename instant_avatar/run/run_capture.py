@@ -1,9 +1,9 @@
 """The capture of a run: read, tracked or streamed, aligned, in the world of its cameras, fitted."""
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Executor
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
 
 from capture.atomic_files import atomic_file
@@ -80,12 +80,18 @@ def open_observations(
     is_new = inputs.kind is InputKind.POSED and not resumes  # what was tracked here has its grade
     if is_new and background is not None:
         background.submit(_take_first_look, imported.source, inputs, console)
-    with console.status("opening video and poses"), _hinting(imported):
+    with console.status("opening video and poses"):
         size_px = arguments.longer_side_px(imported.source)
-        if resumes:
-            capture, earlier = _align_as_trained(imported, run, size_px)
-        else:
-            capture = align_capture(imported, size_px=size_px)
+        try:
+            if resumes:
+                capture, earlier = _align_as_trained(imported, run, size_px)
+            else:
+                capture = align_capture(imported, size_px=size_px)
+        except InputError as error:
+            hint = correction_hint(imported)
+            if not hint:
+                raise
+            raise InputError(f"{error} {hint}") from error
     _describe(capture, console)
     if is_new:
         preflight_check(capture, imported.inputs, console, force=arguments.force)
@@ -107,18 +113,6 @@ def _fit_poses(capture: Capture, console: Console) -> CaptureFit | None:
 def _take_first_look(source: FrameSource, inputs: CaptureInputs, console: Console) -> None:
     with suppress(InputError, OSError, ValueError):  # damaged: reading names it
         print_first_look(look_at(source), inputs, console, tracks=False)
-
-
-@contextmanager
-def _hinting(imported: ImportedCapture) -> Iterator[None]:
-    """Let an error of alignment say what would correct it, if that is known."""
-    try:
-        yield
-    except InputError as error:
-        hint = correction_hint(imported)
-        if not hint:
-            raise
-        raise InputError(f"{error} {hint}") from error
 
 
 def open_as_trained(imported: ImportedCapture, run: RunFolder, size_px: int) -> Capture:
@@ -154,7 +148,6 @@ def _open_stream(
 
 
 def _describe(capture: Capture, console: Console) -> None:
-    """Print what was opened, and what is to be said about it."""
     console.info(
         f"{counted(len(capture.motion), 'pose')}, body {capture.shaped.body.family}, camera: "
         f"{capture.cameras.source}"
@@ -164,7 +157,6 @@ def _describe(capture: Capture, console: Console) -> None:
 
 
 def _solve_cameras(arguments: IngestArguments, capture: Capture, console: Console) -> Capture:
-    """Return the capture, with its poses in the camera of each frame, in a world of cameras."""
     with console.progress("solving cameras", 1.0) as bar:
         solved = solve_capture_cameras(
             capture,
@@ -180,7 +172,6 @@ def _solve_cameras(arguments: IngestArguments, capture: Capture, console: Consol
 def _apply_fit(
     capture: Capture, fit: CaptureFit | None, inputs: CaptureInputs, console: Console
 ) -> Capture:
-    """Make the changes of a fit, if there is one, and describe them."""
     if fit is None:
         return capture
     fitted = apply_fit(capture, fit, height_m=inputs.height_m)

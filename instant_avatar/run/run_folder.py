@@ -65,6 +65,25 @@ def _acquire(lock: BaseFileLock, folder: Path, console: Console) -> None:
         )
 
 
+@contextmanager
+def listing_outputs(folder: Path) -> Iterator[None]:
+    """Make a folder whose files are listed as ours during a block; remove it if it stayed empty."""
+    folder.mkdir(parents=True, exist_ok=True)
+    OutputFileList(folder).create()
+    OutputFileList(folder).remove_temporaries()
+    try:
+        yield
+    finally:
+        remove_if_empty(folder)
+
+
+def remove_if_empty(folder: Path) -> None:
+    """Remove a folder of ours that nothing was written to."""
+    OutputFileList(folder).remove_if_empty()
+    with suppress(OSError):  # not empty, or missing
+        folder.rmdir()
+
+
 STATE_FILE = "state.pt"
 """Trainer and avatar, in checkpoint/."""
 CHECKPOINT_FILES = (STATE_FILE, "person.npz", "fit.npz", "frames.tensors", "earlier.tensors")
@@ -127,12 +146,7 @@ class RunFolder:
         return (self.checkpoint / STATE_FILE).is_file()
 
     def check_usable(self, inputs: Iterable[Path], *, resume: bool, overwrite: bool) -> None:
-        """Check that a run can be written here; nothing is created yet.
-
-        Raises:
-            InputError: If the path is a file, overlaps an input, holds files of others but no run,
-                or others where a run writes, or cannot be written to.
-        """
+        """Refuse a folder to which no run can be written; nothing is created yet."""
         if resume and overwrite:
             raise InputError("--resume and --overwrite are mutually exclusive.")
         if self.path.exists() and not self.path.is_dir():
@@ -157,11 +171,7 @@ class RunFolder:
 
     @contextmanager
     def claim(self, console: Console, *, resume: bool, overwrite: bool) -> Iterator[None]:
-        """Create, lock and mark the folder during a block; remove it if it stayed empty.
-
-        Raises:
-            InputError: If a run exists and neither flag is given.
-        """
+        """Create, lock and mark the folder during a block; remove it if it stayed empty."""
         with claim_folder(self.path, console):
             if any(path.exists() for path in self.files) and not (resume or overwrite):
                 raise InputError(
@@ -213,9 +223,7 @@ class RunFolder:
     def remove_empty_folders(self) -> None:
         """Remove folders that nothing was written to."""
         for folder in (self.checkpoint, self.path):
-            OutputFileList(folder).remove_if_empty()
-            with suppress(OSError):  # not empty, or missing
-                folder.rmdir()
+            remove_if_empty(folder)
 
     def _foreign_file(self) -> Path | None:
         """Return a foreign file that forbids a run here; None if there is none."""

@@ -1,7 +1,6 @@
 """Poses and masks that are tracked in the video of a run, and kept in its folder tracking/."""
 
 import json
-import threading
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any
@@ -13,13 +12,12 @@ from instant_avatar.cli.console import Console
 from instant_avatar.run.ingest_arguments import IngestArguments
 from instant_avatar.run.person_tracking import (
     FitFunction,
-    PersonTracking,
     fit_in_process,
     print_doubts,
     track_person,
     tracked_inputs,
 )
-from instant_avatar.run.run_folder import RunFolder
+from instant_avatar.run.run_folder import RunFolder, listing_outputs
 from instant_avatar.tracked_video import write_tracked_video
 from preprocess.capture_inputs import CaptureInputs, find_own_poses
 from preprocess.capture_session import Provenance
@@ -40,10 +38,7 @@ def import_tracked(
 
     Poses are written to the run's folder tracking/, as ia-track writes them. After Ctrl-C that
     folder holds the frames before it, and a resumed run goes on with the next.
-
-    Raises:
-        InputError: If the poses are not good enough; they and the tracked video are kept.
-        CommandExit: After Ctrl-C.
+    Poses that are not good enough are refused, but kept with the tracked video.
     """
     stored = _read_stored(arguments, run) if arguments.resume else None
     if stored is not None and stored["complete"]:
@@ -53,8 +48,12 @@ def import_tracked(
     beside = find_own_poses(inputs.video.parent)
     if beside is not None:
         console.warning(f"{beside} lies beside the video; to use it, pass --poses.")
-    with stop_on_interrupt(console, "keeping the frames that were tracked") as stop:
-        tracking = _track(inputs, run, console, stop, fit, resume=stored is not None)
+    keeping = "keeping the frames that were tracked"
+    with stop_on_interrupt(console, keeping) as stop, listing_outputs(run.tracking):
+        tracking = track_person(
+            inputs, run.tracked_poses, console,
+            stop=stop, resume=stored is not None, for_learning=True, fit=fit,
+        )  # fmt: skip
     imported, grade = tracking.imported, tracking.grade
     chosen = imported.inputs.frames
     stored = {
@@ -105,29 +104,6 @@ def _stored_inputs(stored: dict[str, Any], inputs: CaptureInputs, run: RunFolder
 def _with_grade(imported: ImportedCapture, stored: dict[str, Any]) -> ImportedCapture:
     tracking = Provenance("tracking", "tracking/", uncertainty=1.0, figures=stored["grade"])
     return replace(imported, provenance=(tracking,))
-
-
-def _track(
-    inputs: CaptureInputs,
-    run: RunFolder,
-    console: Console,
-    stop: threading.Event,
-    fit: FitFunction,
-    *,
-    resume: bool,
-) -> PersonTracking:
-    """Track the person into the run's folder; leave no empty folder if that fails."""
-    run.tracking.mkdir(parents=True, exist_ok=True)
-    OutputFileList(run.tracking).create()
-    OutputFileList(run.tracking).remove_temporaries()
-    try:
-        return track_person(
-            inputs, run.tracked_poses, console, stop=stop, resume=resume, for_learning=True, fit=fit
-        )
-    finally:
-        OutputFileList(run.tracking).remove_if_empty()
-        with suppress(OSError):  # not empty
-            run.tracking.rmdir()
 
 
 def remove_tracking(run: RunFolder) -> None:

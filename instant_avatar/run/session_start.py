@@ -166,7 +166,6 @@ def _show_events(session: TrainingSession, readers: Sequence[EventReader]) -> No
 def _open_viewer(
     arguments: IngestArguments, capture: Capture, run: RunFolder, console: Console
 ) -> "LiveViewer | None":
-    """Open the live viewer if --view asks for it."""
     if arguments.view is None:
         return None
     from instant_avatar.run.live_viewer import LiveViewer
@@ -219,7 +218,6 @@ def _new_run(arguments: IngestArguments, capture: Capture, rig: Rig | None) -> P
 def _load_trainer(
     arguments: IngestArguments, capture: Capture, run: RunFolder, console: Console
 ) -> PreparedTrainer:
-    """Load the checkpoint: the same video continues, another one is added."""
     trainer, notes = checkpoint.load(run.checkpoint)
     _check_same_body(trainer, capture, run)
     earlier = EarlierVideos(run, notes)

@@ -93,9 +93,7 @@ class TrainingSession:
         self.trainer, self._source, self._run = trainer, observations, run
         self._capture, self._frames = observations.capture, observations.frames
         self.stop, self._notes, self._restore_count = stop, notes, restore_count
-        self.curve: list[CurvePoint] = [
-            CurvePoint.from_checkpoint(kept) for kept in notes.get("curve", [])
-        ]
+        self.curve = [CurvePoint(**kept) for kept in notes.get("curve", [])]
         self.held_out: list[HeldOutFrame] = []
         self.newest_observation: Observation | None = None
         self._checkpoints = CheckpointWriter(run, observations.capture)
@@ -118,9 +116,6 @@ class TrainingSession:
         The package comes first, as it was baked; a fine-tuned one replaces it, and scores of the
         held-out frames follow. Setting `stop` ends training, and what follows the first package.
         `report_progress` receives the progress of stages that yield nothing meanwhile.
-
-        Raises:
-            CommandExit: If the avatar was not trained.
         """
         self._report_progress = lambda stage, share: report_progress(
             Progressed(stage=stage, share=share)
@@ -138,12 +133,15 @@ class TrainingSession:
 
     def save_package(self) -> ExportReport:
         """Write the avatar in its current state, between two steps; raise like `export_avatar`."""
-        (exported,) = write_packages(
+        (exported,) = self._package_stages(fine_tune=False)
+        return exported
+
+    def _package_stages(self, **options: Any) -> Iterator[ExportReport]:
+        return write_packages(
             self.trainer, self._run.package, validation_views(self.held_out, self._capture),
             curve_point=self.curve[-1] if self.curve else None,
-            made_with=self._notes.get("made_with", ()), fine_tune=False,
+            made_with=self._notes.get("made_with", ()), **options,
         )  # fmt: skip
-        return exported
 
     @property
     def result(self) -> TrainingResult:
@@ -206,12 +204,7 @@ class TrainingSession:
         self._begin_checkpoint(trains_on=False)  # baking changes nothing of it
         self._report_progress("writing the package", 0.0)
         try:
-            for exported in write_packages(
-                self.trainer, self._run.package, validation_views(self.held_out, self._capture),
-                curve_point=self.curve[-1] if self.curve else None,
-                made_with=self._notes.get("made_with", ()), baked_first=True,
-                progress=check_stop,
-            ):  # fmt: skip
+            for exported in self._package_stages(baked_first=True, progress=check_stop):
                 self._checkpoints.settle()
                 self._checkpoints.wait()
                 is_final = self.result.exported is not None
@@ -353,7 +346,7 @@ class TrainingSession:
 
     def _add_curve_point(
         self, scores: tuple[HeldOutScore, ...], wall_s: float, cpu_s: float
-    ) -> CurvePoint:
+    ) -> None:
         point = CurvePoint(
             wall_seconds=wall_s,
             cpu_seconds=cpu_s,
@@ -366,7 +359,6 @@ class TrainingSession:
             pixels=PIXELS_PER_FRAME,
         )
         self.curve.append(point)
-        return point
 
     def _begin_checkpoint(self, *, trains_on: bool) -> None:
         curve = [vars(point) for point in self.curve]

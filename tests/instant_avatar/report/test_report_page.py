@@ -120,13 +120,6 @@ def test_what_there_is_not_and_what_is_no_number_is_null():
     assert (content["curve"][0]["psnr"], content["curve"][0]["psnr_mask"]) == (None, None)
 
 
-def test_a_point_of_the_curve_survives_a_checkpoint():
-    kept = replace(point(2.0, 24.0), frames=((9, 30.0), (19, 20.0)))
-    assert CurvePoint.from_checkpoint(json.loads(json.dumps(vars(kept)))) == kept
-    older = {key: value for key, value in vars(kept).items() if key not in ("frames", "verdict")}
-    assert CurvePoint.from_checkpoint(older).frames == ()
-
-
 class Tags(HTMLParser):
     """Checks that tags close in order, and collects addresses."""
 
