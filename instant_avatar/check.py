@@ -102,9 +102,8 @@ class CheckArguments(CaptureArguments):
     def may_replace_sheet(self) -> bool:
         """True if the sheet may replace a file: with --overwrite, or an earlier default one."""
         path = self.sheet_path()
-        return self.overwrite or (
-            self.sheet is None and OutputFileList(path.parent).owns(path.name)
-        )
+        ours = self.sheet is None and OutputFileList(path.parent).owns(path.name)
+        return self.overwrite or ours
 
     def sheet_path(self) -> Path:
         """Return the path of the contact sheet."""
@@ -176,16 +175,11 @@ def check_to_json(check_result: CaptureValidation) -> dict[str, Any]:
 
     def tried(key: str, rows: slice, *, of_video: bool) -> list[dict[str, Any]]:
         def entry(guess: CorrectionCandidate) -> dict[str, Any]:
-            score = mean_score(guess.frame_scores[rows]) if len(guess.frame_scores[rows]) else None
-            correction = guess.correction
-            return {
-                "cause": correction.cause,
-                key: _json_number(score),
-                "words": correction.description,
-            }
+            scores, correction = guess.frame_scores[rows], guess.correction
+            score = _json_number(mean_score(scores) if len(scores) else None)
+            return {"cause": correction.cause, key: score, "words": correction.description}
 
-        chosen = (c for c in diagnosis.candidates if c.correction.is_of_video == of_video)
-        return [entry(candidate) for candidate in chosen]
+        return [entry(c) for c in diagnosis.candidates if c.correction.is_of_video == of_video]
 
     return refused_to_json(check_result.refusal) | {
         "verdict": check_result.verdict,

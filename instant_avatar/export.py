@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from tyro.conf import Positional, arg
@@ -213,9 +213,7 @@ def _encode_static(mesh: SkinnedMesh, kind: str) -> bytes:
     """Encode the canonical pose; colors are sRGB, as programs take a PLY's to be."""
     import trimesh  # slow to import
 
-    options: dict[str, Any] = {"ply": {"vertex_normal": True}, "obj": {"include_normals": True}}[
-        kind
-    ]
+    with_normals = {"ply": "vertex_normal", "obj": "include_normals"}[kind]
     solid = trimesh.Trimesh(
         vertices=mesh.positions,
         faces=mesh.faces,
@@ -223,7 +221,7 @@ def _encode_static(mesh: SkinnedMesh, kind: str) -> bytes:
         vertex_colors=mesh.colors,
         process=False,
     )
-    content = solid.export(file_type=kind, **options)
+    content = solid.export(file_type=kind, **{with_normals: True})
     return content if isinstance(content, bytes) else str(content).encode()
 
 

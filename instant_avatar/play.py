@@ -40,9 +40,8 @@ def play(arguments: PlayArguments, console: Console) -> int:
         return _run_verification(arguments, console)
     if arguments.web is not None:
         return _run_web(arguments, arguments.web, console)
-    return (
-        _run_benchmark(arguments, console) if arguments.bench else _render_clip(arguments, console)
-    )
+    run = _run_benchmark if arguments.bench else _render_clip
+    return run(arguments, console)
 
 
 def _render_clip(arguments: PlayArguments, console: Console) -> int:
@@ -59,12 +58,9 @@ def _render_clip(arguments: PlayArguments, console: Console) -> int:
     player, out = _load_player(arguments, console), arguments.output_path
     suffix = out.suffix.lower()
     check_clip_path(out, arguments.inputs, overwrite=arguments.overwrite)
-    clear = (
-        suffix in ("", ".png")
-        if arguments.background is None
-        else arguments.background == TRANSPARENT
-    )
-    blend = None if clear else background_compositor(arguments.background or "white")
+    usual = TRANSPARENT if suffix in ("", ".png") else "white"
+    background = usual if arguments.background is None else arguments.background
+    blend = None if background == TRANSPARENT else background_compositor(background or "white")
     description = clip_format(out, transparent=blend is None).description
     shots, fps = plan_render(
         arguments, player, console, max_fps=MAX_GIF_FPS if suffix == ".gif" else np.inf
@@ -153,11 +149,8 @@ def _run_web(arguments: PlayArguments, port: int, console: Console) -> int:
         motion_name: encode_motion(motion, arguments.fps or arguments.speed * pose_rate(motion))
         for motion_name, motion in motions.items()
     }
-    name = (
-        arguments.avatar.resolve().parent.name
-        if arguments.avatar.stem == "avatar"
-        else arguments.avatar.stem
-    )
+    path = arguments.avatar.resolve()
+    name = path.parent.name if arguments.avatar.stem == "avatar" else arguments.avatar.stem
     with console.status("packing the page"):
         level = 1 if arguments.out is None else 6
         files = build_page(arguments.avatar, encoded, name=name, compression_level=level)

@@ -176,16 +176,10 @@ def describe_failure(error: BaseException) -> tuple[int, str] | None:
         failure = _system_failure(error)
     elif isinstance(error, RuntimeError | MemoryError):
         message = str(error).strip() or "out of memory"
-        is_busy = any(
-            phrase in message.lower()
-            for phrase in ("out of memory", "busy or unavailable", "not enough memory")
-        )
-        if is_busy or isinstance(error, MemoryError):
-            reason = message.splitlines()[0]
-            failure = (
-                RESOURCE_UNAVAILABLE,
-                f"the device is out of memory or busy ({reason}). Try a smaller --size.",
-            )
+        phrases = ("out of memory", "busy or unavailable", "not enough memory")
+        if isinstance(error, MemoryError) or any(each in message.lower() for each in phrases):
+            advice = f"({message.splitlines()[0]}). Try a smaller --size."
+            failure = RESOURCE_UNAVAILABLE, f"the device is out of memory or busy {advice}"
     if failure is None:
         return None
     return failure[0], " ".join([failure[1], *getattr(error, "__notes__", [])])

@@ -36,11 +36,8 @@ class EvaluationFrames:
     @property
     def count(self) -> int | None:
         """Number of frames; None if unknown."""
-        return (
-            self.capture.source.frame_count
-            if self.frame_indices is None
-            else len(self.frame_indices)
-        )
+        chosen = self.frame_indices
+        return self.capture.source.frame_count if chosen is None else len(chosen)
 
     def __iter__(self) -> Iterator[Observation]:
         """Yield the frames that show the person; reading ends after the last one needed."""

@@ -132,12 +132,9 @@ def capture(options: CaptureOptions, console: Console) -> int:
     try:
         server.start(options.host or "0.0.0.0", sites)
     except OSError as error:
+        cause = f"The page cannot be served at {address}: {error.strerror}. Check --host, --port."
         if error.errno == errno.EADDRINUSE:
             cause = f"Port {options.port} or the next is in use. Pass another --port."
-        else:
-            cause = (
-                f"The page cannot be served at {address}: {error.strerror}. Check --host, --port."
-            )
         raise InputError(cause) from None
     if server.missing_player:
         console.warning(f"The page will film, but not play. {server.missing_player}")

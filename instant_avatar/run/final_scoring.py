@@ -257,10 +257,8 @@ def _score_in_fitted_poses(
             scores.append(after if after.psnr >= one.given.psnr else one.given)
         return scores
 
-    stage, first_frames = (
-        "fitting poses to the held-out frames",
-        range(0, len(scored), FRAMES_PER_FIT),
-    )
+    stage = "fitting poses to the held-out frames"
+    first_frames = range(0, len(scored), FRAMES_PER_FIT)
     report_progress(stage, 0.0)
     with closing(map_ahead(fit, first_frames, workers=numba.get_num_threads())) as fits:
         for done, scores in enumerate(fits, start=1):

@@ -351,14 +351,10 @@ def _quality_text(session: TrainingSession) -> str:
 def render_preview(
     avatar: Avatar, pose: BodyPose, camera: Camera, *, cells: CorrespondenceGrid
 ) -> RgbImage:
-    """Render the avatar in its current state over the page's background.
-
-    The camera also defines the image size; `cells` is the correspondence grid of the pose.
-    """
+    """Render the avatar as it is over the page's background; `cells` are those of the pose."""
     rgba = render(avatar, pose, camera, cells=cells)
-    mixed = rgba[..., :3] * 255.0 + (1.0 - rgba[..., 3:]) * np.array(
-        BACKGROUND_RGB, dtype=np.float32
-    )
+    behind = np.array(BACKGROUND_RGB, dtype=np.float32)
+    mixed = rgba[..., :3] * 255.0 + (1.0 - rgba[..., 3:]) * behind
     return np.clip(mixed + 0.5, 0.0, 255.0).astype(np.uint8)
 
 
