@@ -6,7 +6,7 @@ positive number does to the right arm what it does to the left.
 The figures of the dances, and twelve poses that no film holds.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -61,6 +61,7 @@ class Gesture:
     """Position of the whole body; angles in degrees, lengths in metres.
 
     Attributes:
+        right, right_leg: Like the left ones if None.
         bow, lean, turn: The back: to the front, to the left side, twisted to the left.
         nod, tilt, look: The head: down, to its left, turned left.
         yaw: The whole body turned left.
@@ -68,10 +69,10 @@ class Gesture:
         hop: Height above the floor.
     """
 
-    left: Arm = field(default_factory=Arm)
-    right: Arm = field(default_factory=Arm)
-    left_leg: Leg = field(default_factory=Leg)
-    right_leg: Leg = field(default_factory=Leg)
+    left: Arm = Arm()
+    right: Arm | None = None
+    left_leg: Leg = Leg()
+    right_leg: Leg | None = None
     bow: Degrees = 0.0
     lean: Degrees = 0.0
     turn: Degrees = 0.0
@@ -86,9 +87,9 @@ class Gesture:
         """The same with left and right exchanged."""
         return replace(
             self,
-            left=self.right,
+            left=self.right or self.left,
             right=self.left,
-            left_leg=self.right_leg,
+            left_leg=self.right_leg or self.left_leg,
             right_leg=self.left_leg,
             lean=-self.lean,
             turn=-self.turn,
@@ -102,8 +103,8 @@ class Gesture:
         """Local rotations of joints 1 … 23."""
         vectors = np.zeros((23, 3))
         for side, sign in ((0, 1.0), (1, -1.0)):
-            _put_arm(vectors, (self.left, self.right)[side], side, sign)
-            _put_leg(vectors, (self.left_leg, self.right_leg)[side], side, sign)
+            _put_arm(vectors, (self.left, self.right or self.left)[side], side, sign)
+            _put_leg(vectors, (self.left_leg, self.right_leg or self.left_leg)[side], side, sign)
         for joint in SPINE:
             vectors[joint] = _vector("yxz", self.turn / 3, self.bow / 3, -self.lean / 3)
         for joint in (NECK, HEAD):
@@ -150,7 +151,6 @@ WAVE = Gesture(
     left=Arm(lift=14, forward=12, twist=62, elbow=66),
     right=Arm(lift=-30, forward=10, elbow=20),
     left_leg=SMALL_STEP,
-    right_leg=SMALL_STEP,
     lean=-8,
     tilt=-8,
     shift=(-0.06, 0.0),
@@ -165,9 +165,7 @@ CROSS = Gesture(
 )
 OPEN = Gesture(
     left=Arm(lift=8, forward=8, elbow=8),
-    right=Arm(lift=8, forward=8, elbow=8),
     left_leg=Leg(out=16, forward=18, knee=34),
-    right_leg=Leg(out=16, forward=18, knee=34),
     nod=-8,
 )
 POINT = Gesture(
@@ -192,7 +190,6 @@ ROBOT = Gesture(
     left=Arm(lift=-4, forward=10, twist=85, elbow=88),
     right=Arm(lift=-4, forward=10, twist=-75, elbow=88),
     left_leg=SMALL_STEP,
-    right_leg=SMALL_STEP,
     look=-18,
 )
 SHUFFLE = Gesture(
@@ -213,21 +210,15 @@ FILMED_DANCE = (
 )  # fmt: skip
 
 NOVEL_POSES = (
-    Gesture(
-        left=Arm(lift=38, elbow=10), right=Arm(lift=38, elbow=10), nod=-10, left_leg=SMALL_STEP
-    ),
+    Gesture(left=Arm(lift=38, elbow=10), nod=-10, left_leg=SMALL_STEP, right_leg=Leg()),
     Gesture(
         left=Arm(lift=-74, forward=6, elbow=4),
-        right=Arm(lift=-74, forward=6, elbow=4),
         left_leg=Leg(out=5),
-        right_leg=Leg(out=5),
         look=25,
     ),
     Gesture(
         left=Arm(lift=-4, forward=70, elbow=10),
-        right=Arm(lift=-4, forward=70, elbow=10),
         left_leg=Leg(out=10, forward=50, knee=75, turn=12),
-        right_leg=Leg(out=10, forward=50, knee=75, turn=12),
         bow=22,
     ),
     Gesture(
@@ -239,9 +230,7 @@ NOVEL_POSES = (
     ),
     Gesture(
         left=Arm(lift=-48, forward=20, twist=-45, elbow=95),
-        right=Arm(lift=-48, forward=20, twist=-45, elbow=95),
         left_leg=Leg(out=14, knee=4),
-        right_leg=Leg(out=14, knee=4),
         yaw=30,
         lean=6,
     ),
@@ -255,7 +244,6 @@ NOVEL_POSES = (
     ),
     Gesture(
         left=Arm(lift=0, elbow=4),
-        right=Arm(lift=0, elbow=4),
         left_leg=RAISED_LEG,
         right_leg=Leg(out=3, forward=3, knee=6),
         look=-20,
@@ -281,9 +269,7 @@ NOVEL_POSES = (
     ),
     Gesture(
         left=Arm(lift=30, forward=6, twist=88, elbow=95),
-        right=Arm(lift=30, forward=6, twist=88, elbow=95),
         left_leg=Leg(out=15, forward=26, knee=44),
-        right_leg=Leg(out=15, forward=26, knee=44),
         yaw=180,
     ),
     Gesture(

@@ -54,7 +54,6 @@ def _turning_gesture(
         left=Arm(lift=lift + 9.0 * wave[0], forward=8.0 * wave[1], elbow=16.0 + 9.0 * wave[2]),
         right=Arm(lift=lift + 9.0 * wave[5], forward=8.0 * wave[6], elbow=16.0 - 9.0 * wave[2]),
         left_leg=bend,
-        right_leg=bend,
         lean=2.5 * wave[3],
         turn=4.0 * wave[7],
         nod=3.0 * wave[2],
