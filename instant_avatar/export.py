@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from tyro.conf import Positional, arg
@@ -214,6 +214,7 @@ def _encode_static(mesh: SkinnedMesh, kind: str) -> bytes:
     import trimesh  # slow to import
 
     with_normals = {"ply": "vertex_normal", "obj": "include_normals"}[kind]
+    options: dict[str, Any] = {with_normals: True}
     solid = trimesh.Trimesh(
         vertices=mesh.positions,
         faces=mesh.faces,
@@ -221,7 +222,7 @@ def _encode_static(mesh: SkinnedMesh, kind: str) -> bytes:
         vertex_colors=mesh.colors,
         process=False,
     )
-    content = solid.export(file_type=kind, **{with_normals: True})
+    content = solid.export(file_type=kind, **options)
     return content if isinstance(content, bytes) else str(content).encode()
 
 
