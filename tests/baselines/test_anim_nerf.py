@@ -81,7 +81,17 @@ def test_fog_has_the_opacity_of_its_closed_form(fine_samples):
     np.testing.assert_array_equal(rgba[2], np.zeros(4))
 
 
+@pytest.fixture
+def one_thread():
+    """torch on one thread: several add gradients in the order in which they end."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
 @pytest.mark.slow
+@pytest.mark.usefixtures("one_thread")
 def test_training_moves_field_and_poses_and_repeats_exactly(person, rig, clip):
     frames = [prepare_frame(seen, rig) for seen in clip.observations[:3]]
 
