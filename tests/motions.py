@@ -4,7 +4,11 @@ from typing import Any
 
 import numpy as np
 
+from capture.camera import Camera
 from preprocess.body.body_pose import Motion
+from preprocess.body.parametric_body import ShapedBody
+from preprocess.body.proportion_space import ProportionSpace
+from preprocess.fitting.keypoint_rows import KEYPOINT_JOINTS, KeypointModel
 from preprocess.tracking.keypoints import KeypointTrack
 
 
@@ -30,3 +34,24 @@ def make_track(frames: np.ndarray, size_px: tuple[int, int], **others: Any) -> K
     usual = {"image_px": np.zeros((count, 33, 2)), "world_m": np.zeros((count, 33, 3))}
     usual |= {"visibility": np.ones((count, 33)), "presence": np.ones(count)}
     return KeypointTrack(frames=frames, size_px=size_px, **(usual | others))
+
+
+def posed_joints(motion: Motion, shaped: ShapedBody) -> np.ndarray:
+    """Posed joints of every row of a motion, metres."""
+    return np.stack([shaped.with_pose(motion[row]).joints() for row in range(len(motion))])
+
+
+def perfect_track(motion: Motion, shaped: ShapedBody, camera: Camera) -> KeypointTrack:
+    """The key points that a perfect tracker would find of a motion, at 30 frames a second."""
+    points, offsets_m = [], KeypointModel(ProportionSpace.around(shaped)).offsets_m
+    rest = shaped.joints[KEYPOINT_JOINTS] + offsets_m
+    for row in range(len(motion)):
+        carried = shaped.with_pose(motion[row]).world_from_rest()[KEYPOINT_JOINTS]
+        points.append(np.einsum("pab,pb->pa", carried[:, :3, :3], rest) + carried[:, :3, 3])
+    world = np.stack(points)
+    pixels = camera.project(world.reshape(-1, 3)).reshape(-1, 33, 2)
+    seen = world @ camera.camera_from_world[:3, :3].T
+    seen -= seen[:, [23, 24]].mean(axis=1, keepdims=True)
+    numbers = np.arange(len(motion))
+    parts = {"image_px": pixels, "world_m": seen, "times_s": numbers / 30.0}
+    return make_track(numbers, camera.size_px, **parts)

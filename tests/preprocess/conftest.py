@@ -18,10 +18,9 @@ from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import PARENTS
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.proportion_space import ProportionSpace
-from preprocess.fitting.keypoint_rows import KEYPOINT_JOINTS, KeypointModel
 from preprocess.tracking.keypoints import KeypointTrack
 from tests.cached_networks import networks_run_once as networks_run_once
-from tests.motions import make_motion, make_track
+from tests.motions import make_motion, perfect_track, posed_joints
 
 
 @pytest.fixture
@@ -74,12 +73,7 @@ def truth(rng) -> Motion:
 @pytest.fixture
 def joints_of(shaped) -> Callable[..., np.ndarray]:
     """Posed joints of every row of a motion, metres."""
-
-    def joints_of(motion: Motion, body: ShapedBody = shaped) -> np.ndarray:
-        rows = range(len(motion))
-        return np.stack([body.with_pose(motion[row]).joints() for row in rows])
-
-    return joints_of
+    return lambda motion: posed_joints(motion, shaped)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -174,18 +168,4 @@ def turning_person() -> Callable[[int], Motion]:
 @pytest.fixture(scope="session")
 def track_motion(shaped, keypoint_camera) -> Callable[[Motion], KeypointTrack]:
     """Makes the key points that a perfect tracker would find of a motion."""
-
-    def track_motion(motion: Motion) -> KeypointTrack:
-        points, offsets_m = [], KeypointModel(ProportionSpace.around(shaped)).offsets_m
-        rest = shaped.joints[KEYPOINT_JOINTS] + offsets_m
-        for row in range(len(motion)):
-            carried = shaped.with_pose(motion[row]).world_from_rest()[KEYPOINT_JOINTS]
-            points.append(np.einsum("pab,pb->pa", carried[:, :3, :3], rest) + carried[:, :3, 3])
-        world = np.stack(points)
-        pixels = keypoint_camera.project(world.reshape(-1, 3)).reshape(-1, 33, 2)
-        world -= world[:, [23, 24]].mean(axis=1, keepdims=True)
-        numbers = np.arange(len(motion))
-        parts = {"image_px": pixels, "world_m": world, "times_s": numbers / 30.0}
-        return make_track(numbers, keypoint_camera.size_px, **parts)
-
-    return track_motion
+    return lambda motion: perfect_track(motion, shaped, keypoint_camera)

@@ -1,15 +1,21 @@
-"""Tests for corrections that are fitted to key points, with key points made from known cameras."""
+"""Corrections that are fitted to key points made from known cameras; masks that are sampled."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from capture.camera import Camera
+from capture.source import FrameSelection, FrameSource
 from preprocess.alignment.capture_geometry import CaptureGeometry, VideoTransform
 from preprocess.alignment.corrections import fit_to_keypoints
 from preprocess.alignment.keypoint_objective import KeypointObjective, TrackedImage
-from preprocess.body.parametric_body import load_body_model
-from tests.motions import make_motion
+from preprocess.alignment.silhouette_objective import sample_masks
+from preprocess.body.body_surface import SkinPoints
+from preprocess.cameras.camera_file import CameraTrack
+from preprocess.masks.mask_sources import MaskSource
+from tests.motions import make_motion, make_track
 
 SIZE, FRAMES = (120, 160), 6
 
@@ -33,14 +39,13 @@ def true() -> CaptureGeometry:
 
 
 @pytest.fixture(scope="module")
-def objective(true) -> KeypointObjective:
+def objective(true, shaped) -> KeypointObjective:
     """What a tracker without errors would find."""
     blank = TrackedImage(
         index=0, thumbnail=np.zeros((1, 1, 3), np.uint8), alpha=None, size_px=SIZE,
         image_px=np.zeros((33, 2)), confidence=np.ones(33),
     )  # fmt: skip
     images = tuple(replace(blank, index=row) for row in range(FRAMES))
-    shaped = load_body_model().with_shape()
     pixels = KeypointObjective(images=images, shaped=shaped).bodies(true).pixels
     found = [replace(each, image_px=px) for each, px in zip(images, pixels, strict=True)]
     return KeypointObjective(images=tuple(found), shaped=shaped)
@@ -103,3 +108,21 @@ def test_a_principal_point_is_found(true, objective):
     wrong = replace(true, intrinsics=shifted)
     point = [c for c in fit_to_keypoints(wrong, objective) if c.cause == "focal"][-1]
     np.testing.assert_allclose(point.apply(wrong).intrinsics, true.intrinsics, atol=1e-6)
+
+
+class MasksOfFive(MaskSource):
+    """Masks of a file that breaks off after five frames."""
+
+    def read(self, index, size_px):
+        return np.full(size_px[::-1], float(index < 5), np.float32)
+
+
+def test_sampled_masks_are_of_frames_with_key_points(shaped):
+    source = FrameSource(Path("film.mp4"), FrameSelection())
+    source.size_px, source.frame_count = SIZE, 600  # as its header claims
+    camera = Camera.at(np.zeros(3), np.eye(3), 60.0, SIZE)
+    sampled = sample_masks(
+        source, MasksOfFive(), CameraTrack(cameras=(camera,), source=""), SkinPoints.of(shaped),
+        count=60, track=make_track(np.arange(5), SIZE),
+    )  # fmt: skip
+    assert [each.index for each in sampled.samples] == [0, 1, 2, 3, 4]

@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 from capture.camera import Camera
 from preprocess.body.body_pose import Motion
 from preprocess.body.body_surface import SkinPoints, splat_silhouette
-from preprocess.body.parametric_body import load_body_model
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.fitting.clip_fitting import ClipFitter, ClipFrame, FitParameters
 from preprocess.fitting.clip_poses import ClipPoses
 from preprocess.fitting.outlines import OUTLINE_SKIN_POINTS, OutlineDistances
+from tests.motions import make_motion, posed_joints
 
 VIEW = np.diag([1.0, -1.0, -1.0, 1.0])
 VIEW[2, 3] = 2.6
@@ -30,10 +30,7 @@ def turning_motion() -> Motion:
     joints[:, [15, 16], 2] = -0.8, 0.8
     roots = np.zeros((FRAMES, 3))
     roots[:, 1] = 2.0 * np.pi * np.arange(FRAMES) / FRAMES
-    return Motion(
-        root_rotations=roots, root_translations=np.zeros((FRAMES, 3)), joint_rotations=joints,
-        valid=np.ones(FRAMES, dtype=bool), betas=np.zeros(10), body_model="body24",
-    )  # fmt: skip
+    return make_motion(roots, joints=joints)
 
 
 def err_like_a_tracker(motion: Motion) -> Motion:
@@ -50,8 +47,8 @@ def err_like_a_tracker(motion: Motion) -> Motion:
 
 
 @pytest.fixture(scope="module")
-def space() -> ProportionSpace:
-    return ProportionSpace.around(load_body_model().with_shape())
+def space(shaped) -> ProportionSpace:
+    return ProportionSpace.around(shaped)
 
 
 def outlines(space: ProportionSpace, coefficients, motion: Motion) -> list[ClipFrame]:
@@ -71,22 +68,19 @@ def fitter_of(motion: Motion, space: ProportionSpace, frames: list[ClipFrame]) -
 def joint_error_cm(fitter: ClipFitter, person, truth: Motion) -> float:
     """Mean distance of joints from the truth, relative to the pelvis."""
     shaped = fitter.model.space.shape(fitter.coefficients)
-    found = []
-    for row in range(len(truth)):
-        ours = shaped.with_pose(fitter.poses[row]).joints()
-        theirs = person.with_pose(truth[row]).joints()
-        found.append(np.linalg.norm((ours - ours[0]) - (theirs - theirs[0]), axis=1))
-    return 100.0 * float(np.mean(found))
+    ours, theirs = posed_joints(fitter.poses.replace_in(truth), shaped), posed_joints(truth, person)
+    apart = (ours - ours[:, :1]) - (theirs - theirs[:, :1])
+    return 100.0 * float(np.linalg.norm(apart, axis=2).mean())
 
 
 def turn_error_deg(fitter: ClipFitter, truth: Motion) -> float:
     """Mean angle between the joints' rotations and the truth's: of hips and shoulders."""
 
-    def turns(poses) -> Rotation:
-        rows = [poses[row].joint_rotations[[0, 1, 15, 16]] for row in range(len(truth))]
-        return Rotation.from_rotvec(np.concatenate(rows))
-
-    return float(np.degrees((turns(fitter.poses) * turns(truth).inv()).magnitude().mean()))
+    ours, theirs = (
+        Rotation.from_rotvec(motion.joint_rotations[:, [0, 1, 15, 16]].reshape(-1, 3))
+        for motion in (fitter.poses.replace_in(truth), truth)
+    )
+    return float(np.degrees((ours * theirs.inv()).magnitude().mean()))
 
 
 def test_poses_and_proportions_come_back(space):
@@ -121,8 +115,8 @@ def test_exact_poses_hardly_move(space):
     assert np.degrees(np.linalg.norm(fitter.corrections[:, :3], axis=1).mean()) < 0.5
 
 
-def test_frames_that_are_alike_count_as_two_at_most():
-    truth, rest = turning_motion(), load_body_model().with_shape().joints
+def test_frames_that_are_alike_count_as_two_at_most(shaped):
+    truth, rest = turning_motion(), shaped.joints
 
     def count(rows: list[int]) -> float:
         views = np.broadcast_to(VIEW[:3, :3], (len(rows), 3, 3))

@@ -5,7 +5,7 @@ import pytest
 
 from preprocess.body.kinematics import PARENTS as TREE
 from preprocess.body.kinematics import rotation_matrices
-from preprocess.body.parametric_body import load_body_model, smpl_rest_joints
+from preprocess.body.parametric_body import smpl_rest_joints
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.fitting.clip_poses import ClipPoses
 from preprocess.fitting.joint_fitting import LANDMARKS, POINT_NAMES, fit_joints, rows_with_limbs
@@ -52,8 +52,8 @@ def times():
     return np.arange(FRAMES) / 30.0
 
 
-def test_a_persons_joints_come_back(poses):
-    space = ProportionSpace.around(load_body_model().with_shape())
+def test_a_persons_joints_come_back(poses, shaped):
+    space = ProportionSpace.around(shaped)
     person = space.shape(np.random.default_rng(1).normal(size=space.count))
     found = fit_joints(places_of(poses, person.joints), times())
     assert found.distances_m.mean() < 0.005
@@ -64,8 +64,8 @@ def test_a_persons_joints_come_back(poses):
     assert turned[:22].mean() < 12.0
 
 
-def test_knuckles_and_eyes_tell_how_hands_and_head_are_turned(poses):
-    rest = load_body_model().with_shape().joints
+def test_knuckles_and_eyes_tell_how_hands_and_head_are_turned(poses, shaped):
+    rest = shaped.joints
     true = poses.joints(rest, PARENTS).turns
     errors = []
     for landmarks in (True, False):

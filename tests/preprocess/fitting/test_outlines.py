@@ -9,11 +9,15 @@ from capture.camera import Camera
 from preprocess.body.body_pose import BodyPose
 from preprocess.body.body_surface import SkinPoints, splat_silhouette
 from preprocess.body.kinematics import joint_transforms, rotation_matrices
-from preprocess.body.parametric_body import load_body_model
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.fitting.clip_poses import ClipPoses
 from preprocess.fitting.keypoint_rows import ClipCameras, ClipKeypoints, KeypointModel
-from preprocess.fitting.outlines import OUTLINE_SKIN_POINTS, OutlineDistances, OutlineModel
+from preprocess.fitting.outlines import (
+    OUTLINE_SKIN_POINTS,
+    OutlineDistances,
+    OutlineModel,
+    _Matches,
+)
 
 VIEW = np.diag([1.0, -1.0, -1.0, 1.0])
 VIEW[2, 3] = 2.6
@@ -35,8 +39,8 @@ def a_pose() -> BodyPose:
 
 
 @pytest.fixture(scope="module")
-def model() -> OutlineModel:
-    return OutlineModel(ProportionSpace.around(load_body_model().with_shape()))
+def model(shaped) -> OutlineModel:
+    return OutlineModel(ProportionSpace.around(shaped))
 
 
 def mask_of(model: OutlineModel, pose: BodyPose) -> OutlineDistances:
@@ -97,8 +101,6 @@ def test_the_jacobian_of_a_pose_is_that_of_projected_skin(model, parameter):
 
 
 def linearise_at(model, pose, chosen, normals):
-    from preprocess.fitting.outlines import _Matches
-
     transforms = world_from_rest(model, pose)
     blended = np.einsum("rj,jab->rab", model._weights[chosen], transforms[:, :3])
     points = np.einsum("rab,rb->ra", blended[:, :, :3], model._rest[chosen]) + blended[:, :, 3]

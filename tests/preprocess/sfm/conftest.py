@@ -1,12 +1,16 @@
 """A room to solve cameras in: a textured box, a turning camera, and where it really stood."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 from capture.camera import Camera
+from capture.source import FrameSource
+from capture.source_opening import open_source
 from preprocess.sfm.camera_solution import SparseModel
 from tests.avatar_fixtures import pixel_centers
 
@@ -79,6 +83,17 @@ class Room:
             if len(maps):
                 rgb[here] = _sampled(texture, maps)
         return rgb.reshape(height, width, 3)
+
+    def film(self, folder: Path, cameras: Iterable[Camera]) -> FrameSource:
+        return filmed(folder, map(self.seen, cameras))
+
+
+def filmed(folder: Path, pictures: Iterable[np.ndarray]) -> FrameSource:
+    """A folder of 8-bit RGB pictures."""
+    folder.mkdir(exist_ok=True)
+    for index, rgb in enumerate(pictures):
+        cv2.imwrite(str(folder / f"{index:03d}.png"), rgb[..., ::-1])
+    return open_source(folder)
 
 
 def _sampled(texture: np.ndarray, places: np.ndarray) -> np.ndarray:

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from capture.source_opening import open_source
 from preprocess.sfm.colmap_mapping import SfmKeyframe
 from preprocess.sfm.point_tracking import (
     detect_corners,
@@ -88,45 +87,43 @@ def test_a_camera_that_walks_or_trembles_is_no_tripod(room):
 
 @pytest.fixture(scope="module")
 def film(room, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("film")
     cameras = walked(15, degrees=14, size_px=(320, 240), focal_px=260.0)
-    for index, camera in enumerate(cameras):
-        cv2.imwrite(str(folder / f"{index:04d}.png"), room.seen(camera)[..., ::-1])
-    return cameras, open_source(folder)
+    return cameras, room.film(tmp_path_factory.mktemp("film"), cameras)
 
 
-def keyed(film, cameras, room_points, rows):
+ROWS = [0, 6, 12]
+
+
+def keyed(film, cameras, room_points):
     """Some frames are known exactly, with the corners of their pictures as points."""
     keys, seen = [], []
     for frame in film.frames():
-        if frame.index in rows:
+        if frame.index in ROWS:
             grey = cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2GRAY)
             keys.append(
                 SfmKeyframe(index=frame.index, gray=grey, person_mask=np.zeros(grey.shape, bool))
             )
             seen.append(cameras[frame.index])
     model = exact_model(seen, room_points)
-    return keys, replace(model, frames=np.array(rows))
+    return keys, replace(model, frames=np.array(ROWS))
 
 
 def test_frames_between_key_frames_are_placed_to_millimetres(film, room_points):
     cameras, source = film
-    rows = [0, 6, 12]
-    keys, model = keyed(source, cameras, room_points, rows)
+    keys, model = keyed(source, cameras, room_points)
     found = resect_intermediate_frames(source, model, keys, lambda share: None)
-    assert sorted(found.cameras) == [i for i in range(15) if i not in rows]  # those at the end, too
+    assert sorted(found.cameras) == [i for i in range(15) if i not in ROWS]  # those at the end, too
     off = np.array([apart(found.cameras[i], cameras[i].camera_from_world) for i in found.cameras])
     assert np.median(off[:, 0]) < 4.0
     assert off[:, 0].max() < 20.0
     assert np.median(off[:, 1]) < 0.1
-    assert sorted(found.keyframe_errors_px) == rows[1:]
+    assert sorted(found.keyframe_errors_px) == ROWS[1:]
     assert max(found.keyframe_errors_px.values()) < 0.6
 
 
 def test_a_key_frame_in_the_wrong_place_is_betrayed_by_what_is_followed(film, room_points):
     cameras, source = film
-    rows = [0, 6, 12]
-    keys, model = keyed(source, cameras, room_points, rows)
+    keys, model = keyed(source, cameras, room_points)
     views = model.camera_from_world.copy()
     views[2, :3, 3] += [0.12, 0.0, 0.0]
     found = resect_intermediate_frames(

@@ -7,8 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from preprocess.body.body_pose import Motion
-from preprocess.tracking.keypoints import KeypointTrack
+from preprocess.tracking.keypoints import MIRRORED_POINTS, KeypointTrack
 from preprocess.tracking.pose_lift import find_swaps, lift_keypoints, repair_swaps
+from tests.motions import make_track, posed_joints
 
 LEFT, RIGHT = [1, 2, 3, *range(7, 33, 2)], [4, 5, 6, *range(8, 33, 2)]
 
@@ -25,24 +26,15 @@ def turning_track(count: int, degrees_per_frame: float, frame_step: int = 1) -> 
     turn[:, 0, 0] = turn[:, 2, 2] = np.cos(angle)
     turn[:, 0, 2], turn[:, 2, 0] = np.sin(angle), -np.sin(angle)
     world = rest @ turn.swapaxes(1, 2)
-    return KeypointTrack(
-        frames=frame_step * np.arange(count), image_px=200.0 + 100.0 * world[..., :2],
-        world_m=world, visibility=np.ones((count, 33)), presence=np.ones(count),
-        size_px=(400, 400),
-    )  # fmt: skip
+    image_px = 200.0 + 100.0 * world[..., :2]
+    return make_track(frame_step * np.arange(count), (400, 400), image_px=image_px, world_m=world)
 
 
 def swap(track: KeypointTrack, rows: slice | list[int]) -> KeypointTrack:
     image, world = track.image_px.copy(), track.world_m.copy()
     for array in (image, world):
-        array[rows] = array[rows][:, _mirrored()]
+        array[rows] = array[rows][:, MIRRORED_POINTS]
     return replace(track, image_px=image, world_m=world)
-
-
-def _mirrored() -> np.ndarray:
-    order = np.arange(33)
-    order[LEFT], order[RIGHT] = RIGHT, LEFT
-    return order
 
 
 @pytest.mark.parametrize(
@@ -71,7 +63,7 @@ def test_key_points_between_two_guesses_hide_no_exchange():
     """On the way from one guess to another, both sides lie in the middle."""
     whole = turning_track(80, 4.0)
     swapped = swap(whole, slice(30, 60))
-    middle = 0.5 * (whole.world_m[60] + whole.world_m[60][_mirrored()])
+    middle = 0.5 * (whole.world_m[60] + whole.world_m[60][MIRRORED_POINTS])
     swapped.world_m[60] = middle + 0.2 * (swapped.world_m[59] - middle)
     assert np.flatnonzero(find_swaps(swapped)).tolist() == list(range(30, 61))
 
@@ -109,7 +101,7 @@ def walker(turning_person) -> Motion:
 
 
 def relative_joints(shaped, motion):
-    joints = np.stack([shaped.with_pose(motion[row]).joints() for row in range(len(motion))])
+    joints = posed_joints(motion, shaped)
     return joints - joints[:, :1]
 
 

@@ -9,13 +9,14 @@ import pytest
 from capture.input_error import InputError
 from capture.source_opening import open_source
 from preprocess.tracking import video_tracking
-from preprocess.tracking.keypoints import CroppedMask, KeypointTrack, PersonKeypoints
+from preprocess.tracking.keypoints import CroppedMask, PersonKeypoints
 from preprocess.tracking.video_tracking import (
     ProblemFinder,
     TrackingProblem,
     VideoTracking,
     touched_borders,
 )
+from tests.motions import make_track
 
 COUNT = 12
 
@@ -174,11 +175,9 @@ def walking_track(hips_x, crowded):
     image += np.random.default_rng(0).normal(0.0, 1.0, image.shape)
     problems = np.zeros(len(hips_x), np.int64)
     problems[crowded] = video_tracking.PROBLEM_BITS[TrackingProblem.CROWDED]
-    return KeypointTrack(
-        frames=np.arange(len(hips_x)), image_px=image, world_m=np.zeros((len(hips_x), 33, 3)),
-        visibility=np.ones((len(hips_x), 33)), presence=np.ones(len(hips_x)), size_px=(640, 400),
-        times_s=np.arange(len(hips_x)) / 30.0, problems=problems,
-    )  # fmt: skip
+    rows = np.arange(len(hips_x))
+    parts = {"image_px": image, "times_s": rows / 30.0, "problems": problems}
+    return make_track(rows, (640, 400), **parts)
 
 
 def frames_with_another(track):

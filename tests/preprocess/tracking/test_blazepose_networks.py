@@ -1,9 +1,19 @@
-"""Tests of `preprocess/tracking/blazepose_networks.py`: the square, and masks in such a square."""
+"""Tests of `preprocess/tracking/blazepose_networks.py`: the square of a person, and detections."""
+
+import hashlib
 
 import numpy as np
 import pytest
 
-from preprocess.tracking.blazepose_networks import PersonSquare
+from dev.make_blazepose import NETWORKS, WEIGHTS, verified
+from preprocess.tracking.blazepose_networks import (
+    PersonDetection,
+    PersonSquare,
+    anchors,
+    is_same_person,
+    parts_of_frame,
+    refine,
+)
 from preprocess.tracking.keypoints import CroppedMask
 
 SIZE = 64
@@ -71,3 +81,50 @@ def test_a_mask_of_the_crop_lies_over_what_was_cropped():
     assert halved.shape == (100, 120)
     np.testing.assert_allclose(centroid(halved), np.array(spot) / 2, atol=0.02)
     assert mask.resample(frame_px, frame_px)[0, 0] == 0
+
+
+def test_anchors_are_the_middles_of_their_cells():
+    places = anchors(224)
+    assert places.shape == (2254, 2)
+    np.testing.assert_allclose(places[:3] * 224, [[4, 4], [4, 4], [12, 4]])
+    np.testing.assert_allclose(places[1568] * 224, [8, 8])
+    np.testing.assert_allclose(places[-1] * 224, [208, 208])
+
+
+def test_a_flat_heat_map_leaves_a_point_where_it_is_and_a_peak_draws_it():
+    heatmaps = np.full((2, 64, 64), -9.0, np.float32)
+    heatmaps[1, 30:33, 20:23] = 9.0
+    points = np.array([[81.0, 122.0], [81.0, 122.0]])
+    refined = refine(points, heatmaps, 256)
+    np.testing.assert_array_equal(refined[0], points[0])
+    np.testing.assert_allclose(refined[1], [84, 124], atol=0.1)
+    np.testing.assert_array_equal(refine(points - 300, heatmaps, 256), points - 300)
+
+
+def test_the_parts_of_a_wide_frame_cover_it():
+    wide = parts_of_frame(np.zeros((100, 260, 3), np.uint8))
+    assert [part.x for part in wide] == [50.0, 130.0, 210.0]
+    assert {(part.y, part.side) for part in wide} == {(50.0, 100.0)}
+    tall = parts_of_frame(np.zeros((260, 100, 3), np.uint8))
+    assert [part.y for part in tall] == [50.0, 130.0, 210.0]
+
+
+def test_detections_of_one_head_are_one_person():
+    def detection(x, head_x):
+        box = np.array([head_x - 20.0, 0, head_x + 20, 40])
+        return PersonDetection(square=PersonSquare(x=x, y=100.0, side=200.0), box=box, score=1.0)
+
+    assert is_same_person(detection(100.0, 100.0), detection(110.0, 160.0))
+    assert is_same_person(detection(100.0, 100.0), detection(160.0, 105.0))
+    assert not is_same_person(detection(100.0, 100.0), detection(160.0, 160.0))
+
+
+@pytest.mark.parametrize("name", ["blazepose_detector", "blazepose_landmarks_full"])
+def test_the_networks_here_are_the_ones_that_the_script_makes(name):
+    data = (WEIGHTS / f"{name}.onnx").read_bytes()
+    assert hashlib.sha256(data).hexdigest() == NETWORKS[name].sha256
+
+
+def test_other_data_are_refused():
+    with pytest.raises(SystemExit, match="model: SHA-256 is"):
+        verified(b"other", "0" * 64, "model")
