@@ -48,7 +48,10 @@ def one_actor_and_rig_per_body():
         return rigs[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Actor, "of", functools.cache(Actor.of))
+        make_actor = functools.cache(Actor.of)
+        patch.setattr(
+            Actor, "of", lambda subject=1, seed=0, sized=None: make_actor(subject, seed, sized)
+        )
         patch.setattr(staging, "unfilmed_dance", functools.cache(staging.unfilmed_dance))
         patch.setattr(Rig, "from_shaped_body", rig_of)
         yield

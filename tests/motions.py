@@ -6,9 +6,12 @@ import numpy as np
 
 from capture.camera import Camera
 from preprocess.body.body_pose import Motion
+from preprocess.body.kinematics import PARENTS
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.proportion_space import ProportionSpace
-from preprocess.fitting.keypoint_rows import KEYPOINT_JOINTS, KeypointModel
+from preprocess.fitting.clip_poses import ClipPoses
+from preprocess.fitting.joint_fitting import LANDMARKS
+from preprocess.fitting.keypoint_rows import KEYPOINT_JOINTS, KEYPOINT_OFFSETS_M, KeypointModel
 from preprocess.tracking.keypoints import KeypointTrack
 
 
@@ -55,3 +58,17 @@ def perfect_track(motion: Motion, shaped: ShapedBody, camera: Camera) -> Keypoin
     numbers = np.arange(len(motion))
     parts = {"image_px": pixels, "world_m": seen, "times_s": numbers / 30.0}
     return make_track(numbers, camera.size_px, **parts)
+
+
+def posed_points(poses: ClipPoses, rest_joints: np.ndarray) -> np.ndarray:
+    """Places of `POINT_NAMES` in each pose, metres: joints, then landmarks."""
+    joints, numbers = poses.joints(rest_joints, np.array(PARENTS)), list(LANDMARKS.values())
+    on = np.array(KEYPOINT_JOINTS)[numbers]
+    offsets = (joints.turns[:, on] @ KEYPOINT_OFFSETS_M[numbers][:, :, None])[..., 0]
+    return np.concatenate([joints.places, joints.places[:, on] + offsets], axis=1)
+
+
+def angles_deg(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Angles between rotation matrices, degrees."""
+    cosine = (np.trace(a.swapaxes(-1, -2) @ b, axis1=-2, axis2=-1) - 1.0) / 2.0
+    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))

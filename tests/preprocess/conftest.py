@@ -18,6 +18,7 @@ from preprocess.body.body_pose import Motion
 from preprocess.body.kinematics import PARENTS
 from preprocess.body.parametric_body import ShapedBody
 from preprocess.body.proportion_space import ProportionSpace
+from preprocess.fitting.clip_fitting import ClipFitter
 from preprocess.tracking.keypoints import KeypointTrack
 from tests.cached_networks import networks_run_once as networks_run_once
 from tests.motions import make_motion, perfect_track, posed_joints
@@ -90,6 +91,14 @@ def one_proportion_space_per_body():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ProportionSpace, "around", space_around)
         yield
+
+
+@pytest.fixture
+def one_iteration(monkeypatch) -> None:
+    """Fits iterate once over key points, and once with outlines."""
+    stages = ClipFitter.iterate_stages
+    once = lambda fitter, fitted, *counts, **named: stages(fitter, fitted, 1, 1)  # noqa: E731
+    monkeypatch.setattr(ClipFitter, "iterate_stages", once)
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ import pytest
 from capture.input_error import InputError
 from capture.live_sources import silence_opencv
 from capture.source_opening import open_source
+from capture.video_writer import FFV1, write_video
 from preprocess.body.body_pose import Motion
 from preprocess.cameras.camera_file import CameraTrack, assume_static_camera
 from preprocess.frame_association import associate_by_name
@@ -256,11 +257,8 @@ def test_a_truncated_video_is_used_as_far_as_it_goes(tmp_path):
 @pytest.fixture(scope="module")
 def film(tmp_path_factory) -> Path:
     """Five frames."""
-    path = tmp_path_factory.mktemp("film") / "film.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (32, 24))
-    for _ in range(5):
-        writer.write(np.zeros((24, 32, 3), np.uint8))
-    writer.release()
+    path = tmp_path_factory.mktemp("film") / "film.mp4"
+    write_video(path, [np.zeros((24, 32, 3), np.uint8)] * 5, 30.0, FFV1)
     return path
 
 

@@ -30,10 +30,7 @@ def test_the_projects_own_tracker_and_segmenter_need_no_entry_point(shaped):
     tracker = make_tracker()
     assert isinstance(tracker, BlazePoseTracker)
     assert isinstance(tracker, PersonTracker)
-
-
-def test_persons_are_counted_from_one():
-    with pytest.raises(InputError, match="--person 0"):
+    with pytest.raises(InputError, match="--person 0"):  # they are counted from one
         make_tracker(person=0)
 
 

@@ -18,9 +18,8 @@ from preprocess.body.parametric_body import load_body_model
 from preprocess.cameras.camera_file import CameraTrack, assume_camera, write_cameras
 from preprocess.capture_inputs import CaptureInputs, CapturePaths
 from preprocess.capture_session import Capture
-from preprocess.fitting.clip_fitting import ClipFitter
 from preprocess.fitting.tracked_frames import CHUNK_FRAMES
-from preprocess.observation import DroppedFrame, Observation
+from preprocess.observation import DroppedFrame
 from preprocess.open_capture import open_tracked_stream
 from preprocess.tracked_stream import (
     LiveTracking,
@@ -32,6 +31,7 @@ from preprocess.tracked_stream import (
 from preprocess.tracking.keypoints import CroppedMask, PersonKeypoints
 from preprocess.tracking.video_tracking import NOT_FOUND
 
+pytestmark = pytest.mark.usefixtures("one_iteration")  # key points and masks here are exact
 COUNT = 24
 SIZE = (180, 320)
 
@@ -53,9 +53,8 @@ class Pictures(FrameSource):
 
 
 @pytest.fixture(scope="module")
-def standing():
+def standing(shaped):
     """Key points of the embedded body, who stands before the camera, from its own joints."""
-    shaped = load_body_model(None).with_shape()
     joints = shaped.joints * (1.0, -1.0, -1.0)  # facing the camera, whose y points down
     points = np.tile(joints[15], (33, 1))
     points[[11, 12, 13, 14, 15, 16]] = joints[16:22]
@@ -70,14 +69,6 @@ def standing():
         image_px=pixels, world_m=points - joints[[1, 2]].mean(axis=0), visibility=np.ones(33),
         presence=1.0, mask=CroppedMask(values=silhouette, image_from_crop=np.eye(3)[:2]),
     )  # fmt: skip
-
-
-@pytest.fixture(autouse=True)
-def few_iterations(monkeypatch):
-    """Key points and masks here are exact."""
-    stages = ClipFitter.iterate_stages
-    once = lambda fitter, fitted, *counts, **named: stages(fitter, fitted, 1, 1)  # noqa: E731
-    monkeypatch.setattr(ClipFitter, "iterate_stages", once)
 
 
 class Tracker:
@@ -103,40 +94,35 @@ def started(tracker, source=None, *advice):
     return stream, tracking, start
 
 
-def observations(stream, tracking, start, masks=None):
+def observations(stream, tracking, start):
     capture = Capture(
         paths=CapturePaths(video=stream.path, poses=stream.path, masks=None, cameras=None),
-        source=stream, motion=start[0], masks=masks or TrackedMasks(tracking, plain),
+        source=stream, motion=start[0], masks=TrackedMasks(tracking, plain),
         cameras=start[2], shaped=start[1], size_px=max(SIZE), provenance=(),
     )  # fmt: skip
     return TrackedObservations(capture, tracking)
 
 
-def observe_all(stream, tracking, start, masks=None):
-    source = observations(stream, tracking, start, masks)
+def observe_all(stream, tracking, start):
+    source = observations(stream, tracking, start)
     return [source.join(frame) for frame in stream.frames()]
 
 
-def test_every_frame_waits_for_later_ones_and_has_a_pose_and_a_mask(standing):
-    tracker, seen = Tracker(standing), []
+def test_every_frame_waits_for_later_ones_and_lost_ones_are_dropped_and_reported(standing):
+    tracker, seen = Tracker(standing, absent={10, 11}), {}
     stream, tracking, start = started(tracker)
     source = observations(stream, tracking, start)
     for number, frame in enumerate(stream.frames()):
         assert tracker.calls >= min(COUNT, number + 1 + CHUNK_FRAMES)
-        seen.append(source.join(frame))
-    assert [item.frame.index for item in seen] == list(range(COUNT))
-    places = np.array([item.pose.root_translation for item in seen])
+        seen[frame.index] = source.join(frame)
+    assert list(seen) == list(range(COUNT))
+    for lost in (10, 11):
+        assert seen.pop(lost) == DroppedFrame(index=lost, reason=NOT_FOUND)
+    places = np.array([item.pose.root_translation for item in seen.values()])
     assert np.abs(np.diff(places, axis=0)).max() < 0.02
-    assert all(item.alpha.max() > 0.9 for item in seen)
-    assert list(tracking.notes()) == []
-
-
-def test_frames_without_the_person_are_dropped_and_reported(standing):
-    stream, tracking, start = started(Tracker(standing, absent={10, 11}))
-    seen = observe_all(stream, tracking, start)
-    assert seen[10] == DroppedFrame(index=10, reason=NOT_FOUND)
-    assert isinstance(seen[12], Observation)
-    assert "not found in 2 of 24 frames, between 0.3 and 0.4 s" in " ".join(tracking.notes())
+    assert all(item.alpha.max() > 0.9 for item in seen.values())
+    (note,) = tracking.notes()
+    assert "not found in 2 of 24 frames, between 0.3 and 0.4 s" in note
 
 
 class Filmed(Pictures):
@@ -234,23 +220,21 @@ def test_a_stream_without_a_person_is_bad_input(standing):
         started(Tracker(standing, absent=set(range(COUNT))))
 
 
-def test_a_finished_avatars_person_keeps_the_body(standing):
+def test_a_finished_avatars_person_keeps_the_body(standing, shaped):
     stream = TrackedStream(Pictures())
     tracking = LiveTracking(stream, Tracker(standing))
-    shaped = load_body_model(None).with_shape()
     person = replace(shaped, joints=1.1 * shaped.joints, vertices=1.1 * shaped.vertices)
     camera = assume_camera(Path("film.mp4"), "static", stream)
     _, kept, _ = tracking.start(person, camera, fixed_body=True)
     assert np.allclose(kept.joints, person.joints)
 
 
-def test_a_stated_focal_length_changes_less_than_an_assumed_one(standing):
+def test_a_stated_focal_length_changes_less_than_an_assumed_one(standing, shaped):
     changes = []
     for stated in (False, True):
         stream = TrackedStream(Pictures())
         tracking = LiveTracking(stream, Tracker(standing))
         guess = assume_camera(Path("film.mp4"), "static", stream).scale_focal(1.3)
-        shaped = load_body_model(None).with_shape()
         _, _, cameras = tracking.start(shaped, guess, stated_focal=stated)
         changes.append(abs(np.log(cameras[0].focal_px[0] / guess.focal_px[0])))
     assert changes[1] < 0.5 * changes[0]

@@ -2,6 +2,7 @@
 
 import json
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,8 +15,9 @@ from capture.camera import Camera
 from capture.input_error import InputError
 from capture.source import FrameSource
 from capture.source_opening import open_source
+from capture.video_writer import FFV1, write_video
 from preprocess.cameras.camera_file import read_cameras
-from preprocess.cameras.camera_formats import read_named_cameras
+from preprocess.cameras.camera_formats import NamedCamera, read_named_cameras
 
 SIZE = (640, 480)
 COUNT = 5
@@ -47,8 +49,14 @@ def opengl_pose(camera: Camera) -> np.ndarray:
     return np.column_stack([pose[:, 0], -pose[:, 1], -pose[:, 2], pose[:, 3]])
 
 
+def assert_seen_as_opengl(found: list[NamedCamera], cameras: list[Camera], points) -> None:
+    """Pixels are those of OpenGL's own arithmetic, without ours: x right, y up, z backwards."""
+    for each, camera in zip(found, cameras, strict=True):
+        wanted = seen(opengl_pose(camera), camera, points)
+        np.testing.assert_allclose(each.camera.project(points), wanted, atol=1e-6)
+
+
 def seen(pose: np.ndarray, camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Pixels by OpenGL's own arithmetic, without our cameras: x right, y up, looking along -z."""
     local = (points - pose[:3, 3]) @ pose[:3, :3]
     (fx, fy), (cx, cy) = camera.focal_px, camera.center_px
     return np.stack(
@@ -76,6 +84,11 @@ def colmap(tmp_path, cameras):
     return write
 
 
+def seen_by_colmap(model, number, points) -> np.ndarray:
+    local = model.image(number).cam_from_world() * points
+    return np.array([model.camera(1).img_from_cam(point) for point in local])
+
+
 @pytest.mark.parametrize("version", ["4.x", "3.x"])
 @pytest.mark.parametrize("kind", ["binary", "text"])
 def test_a_colmap_model_sees_what_colmap_sees(colmap, points, kind, version, tmp_path):
@@ -87,9 +100,9 @@ def test_a_colmap_model_sees_what_colmap_sees(colmap, points, kind, version, tmp
     found = read_named_cameras(tmp_path)
     assert [each.name for each in found] == [f"frames/frame_{n:05d}" for n in range(1, COUNT + 1)]
     for number, each in enumerate(found, 1):
-        local = model.image(number).cam_from_world() * points
-        pixels = np.array([model.camera(1).img_from_cam(point) for point in local])
-        np.testing.assert_allclose(each.camera.project(points), pixels, atol=1e-6)
+        np.testing.assert_allclose(
+            each.camera.project(points), seen_by_colmap(model, number, points), atol=1e-6
+        )
 
 
 @pytest.mark.parametrize(
@@ -106,9 +119,7 @@ def test_every_lens_that_opencv_has_is_colmaps(colmap, points, kind, params):
     folder, model = colmap(kind, params)
     model.write_binary(folder)
     camera = read_named_cameras(folder)[0].camera
-    local = model.image(1).cam_from_world() * points
-    pixels = np.array([model.camera(1).img_from_cam(point) for point in local])
-    np.testing.assert_allclose(camera.project(points), pixels, atol=1e-6)
+    np.testing.assert_allclose(camera.project(points), seen_by_colmap(model, 1, points), atol=1e-6)
 
 
 def test_a_fisheye_is_refused_with_what_to_do(colmap):
@@ -118,25 +129,34 @@ def test_a_fisheye_is_refused_with_what_to_do(colmap):
         read_named_cameras(folder)
 
 
+LENS = {"w": 640, "h": 480, "fl_x": 500.0, "cx": 318.5, "cy": 243.0}
+
+
+def transforms(path: Path, cameras: list[Camera], names: list[str], lens=LENS) -> Path:
+    """A transforms.json."""
+    frames = [
+        {"file_path": name, "transform_matrix": opengl_pose(camera).tolist()}
+        for name, camera in zip(names, cameras, strict=True)
+    ]
+    path.write_text(json.dumps({**lens, "frames": frames}))
+    return path
+
+
 def test_transforms_json_is_seen_as_opengl_sees_it(cameras, points, tmp_path):
     turned = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0.5], [0, 0, 0, 1]])
-    content = {
-        "w": 640, "h": 480, "fl_x": 500.0, "fl_y": 505.0, "cx": 318.5, "cy": 243.0,
-        "camera_model": "OPENCV", "k1": 0.0, "applied_transform": turned[:3].tolist(),
-        "frames": [
-            {"file_path": f"images/frame_{n:05d}.png",
-             "transform_matrix": (turned @ opengl_pose(camera)).tolist()}
-            for n, camera in reversed(list(enumerate(cameras, 1)))
-        ],
-    }  # fmt: skip
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    there = [
+        replace(camera, camera_from_world=camera.camera_from_world @ np.linalg.inv(turned))
+        for camera in cameras
+    ]
+    lens = LENS | {"fl_y": 505.0, "camera_model": "OPENCV", "k1": 0.0}
+    lens["applied_transform"] = turned[:3].tolist()
+    names = [f"images/frame_{n:05d}" for n in range(1, COUNT + 1)]
+    files = [f"{name}.png" for name in reversed(names)]
+    transforms(tmp_path / "transforms.json", there[::-1], files, lens)
     for path in (tmp_path, tmp_path / "transforms.json"):
         found = read_named_cameras(path)
-        names = [f"images/frame_{n:05d}" for n in range(1, COUNT + 1)]
         assert [each.name for each in found] == names
-        for each, camera in zip(found, cameras, strict=True):
-            wanted = seen(opengl_pose(camera), camera, points)
-            np.testing.assert_allclose(each.camera.project(points), wanted, atol=1e-6)
+        assert_seen_as_opengl(found, cameras, points)
 
 
 def test_a_frame_may_have_a_lens_of_its_own(cameras, tmp_path):
@@ -158,9 +178,21 @@ def test_record3d_is_seen_as_arkit_sees_it(cameras, points, tmp_path):
     with zipfile.ZipFile(tmp_path / "walk.r3d", "w") as archive:
         archive.writestr("metadata", json.dumps(content))
     for path in (tmp_path, tmp_path / "metadata", tmp_path / "walk.r3d"):
-        for each, camera in zip(read_named_cameras(path), cameras, strict=True):
-            wanted = seen(opengl_pose(camera), camera, points)
-            np.testing.assert_allclose(each.camera.project(points), wanted, atol=1e-6)
+        assert_seen_as_opengl(read_named_cameras(path), cameras, points)
+
+
+def test_record3d_has_a_focal_length_for_each_frame(tmp_path):
+    content = {
+        "poses": [[0, 0, 0, 1, 0, 0, 0]] * 3, "K": [50, 0, 0, 0, 50, 0, 40, 30, 1], "w": 80,
+        "h": 60, "perFrameIntrinsicCoeffs": [[50 + n, 50 + n, 40, 31] for n in range(3)],
+    }  # fmt: skip
+    path = tmp_path / "metadata"
+    path.write_text(json.dumps(content))
+    assert [each.camera.focal_px[0] for each in read_named_cameras(path)] == [50.0, 51.0, 52.0]
+    assert read_named_cameras(path)[0].camera.center_px == (40.0, 31.0)
+    for broken in ([[1, 2]] * 3, "x", [[0, 0, 0, 0]] * 3, None):
+        path.write_text(json.dumps({**content, "perFrameIntrinsicCoeffs": broken}))
+        assert {each.camera.focal_px for each in read_named_cameras(path)} == {(50.0, 50.0)}
 
 
 def test_polycam_is_seen_as_arkit_sees_it(cameras, points, tmp_path):
@@ -174,20 +206,7 @@ def test_polycam_is_seen_as_arkit_sees_it(cameras, points, tmp_path):
         (folder / f"{98000 + number}.json").write_text(json.dumps(numbers))
     found = read_named_cameras(tmp_path)
     assert [each.name for each in found] == [str(98000 + n) for n in range(COUNT)]
-    for each, camera in zip(found, cameras, strict=True):
-        wanted = seen(opengl_pose(camera), camera, points)
-        np.testing.assert_allclose(each.camera.project(points), wanted, atol=1e-6)
-
-
-def transforms(path: Path, cameras: list[Camera], names: list[str]) -> Path:
-    """A transforms.json."""
-    frames = [
-        {"file_path": f"images/{name}.png", "transform_matrix": opengl_pose(camera).tolist()}
-        for name, camera in zip(names, cameras, strict=True)
-    ]
-    content = {"w": 640, "h": 480, "fl_x": 500.0, "cx": 318.5, "cy": 243.0, "frames": frames}
-    path.write_text(json.dumps(content))
-    return path
+    assert_seen_as_opengl(found, cameras, points)
 
 
 @pytest.fixture
@@ -205,18 +224,15 @@ def video(tmp_path):
     """A video with this number of frames."""
 
     def make(frames: int) -> FrameSource:
-        path = tmp_path / f"{frames}.avi"
-        writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (32, 24))
-        for _ in range(frames):
-            writer.write(np.zeros((24, 32, 3), np.uint8))
-        writer.release()
+        path = tmp_path / f"{frames}.mp4"
+        write_video(path, [np.zeros((24, 32, 3), np.uint8)] * frames, 30.0, FFV1)
         return open_source(path)
 
     return make
 
 
 def test_cameras_find_their_pictures_by_name(cameras, folder, tmp_path):
-    names = ["shot_3", "shot_4", "shot_6", "shot_7", "shot_8"]
+    names = [f"images/shot_{n}.png" for n in (3, 4, 6, 7, 8)]
     path = transforms(tmp_path / "transforms.json", cameras, names)
     track = read_cameras(path, SIZE, folder)
     assert len(track.cameras) == 7
@@ -229,7 +245,7 @@ def test_cameras_find_their_pictures_by_name(cameras, folder, tmp_path):
 
 def test_a_camera_between_two_stands_and_turns_half_way(cameras, folder, tmp_path):
     two = [cameras[0], cameras[2]]
-    path = transforms(tmp_path / "transforms.json", two, ["shot_3", "shot_5"])
+    path = transforms(tmp_path / "transforms.json", two, ["shot_3.png", "shot_5.png"])
     between = read_cameras(path, SIZE, folder)[1]
     middle = 0.5 * (two[0].center_world + two[1].center_world)
     np.testing.assert_allclose(between.center_world, middle)
@@ -240,7 +256,7 @@ def test_a_camera_between_two_stands_and_turns_half_way(cameras, folder, tmp_pat
 
 
 def test_numbers_in_names_count_a_videos_frames(cameras, video, tmp_path):
-    names = [f"frame_{n:05d}" for n in (1, 3, 4, 8, 9)]
+    names = [f"frame_{n:05d}.png" for n in (1, 3, 4, 8, 9)]
     path = transforms(tmp_path / "transforms.json", cameras, names)
     track = read_cameras(path, SIZE, video(10))
     for frame, camera in zip((0, 2, 3, 7, 8), cameras, strict=True):
@@ -250,11 +266,50 @@ def test_numbers_in_names_count_a_videos_frames(cameras, video, tmp_path):
 def test_consecutive_numbers_of_a_few_frames_say_nothing_about_a_longer_video(
     cameras, video, tmp_path
 ):
-    names = [f"frame_{n:05d}" for n in range(1, 6)]
+    names = [f"frame_{n:05d}.png" for n in range(1, 6)]
     path = transforms(tmp_path / "transforms.json", cameras, names)
     with pytest.raises(InputError, match=r"5 cameras.*40 frames"):
         read_cameras(path, SIZE, video(40))
     assert len(read_cameras(path, SIZE, video(5)).cameras) == 5
+
+
+def test_an_angle_of_view_alone_is_enough_where_the_pictures_are_known(cameras, tmp_path):
+    angle = {"camera_angle_x": 2 * np.arctan(0.5)}
+    transforms(tmp_path / "transforms_train.json", cameras[:1], ["./train/r_0"], angle)
+    for path in (tmp_path, tmp_path / "transforms_train.json"):
+        camera = read_cameras(path, (80, 60))[0]
+        assert camera.focal_px == pytest.approx((80.0, 80.0))
+        assert (camera.center_px, camera.size_px) == ((40.0, 30.0), (80, 60))
+    with pytest.raises(InputError, match=r"transforms_train\.json"):
+        read_named_cameras(tmp_path)
+
+
+@pytest.mark.parametrize(("size", "focal"), [((80, 60), 90.0), ((40, 30), 45.0)])
+def test_a_principal_point_in_the_middle_tells_the_size_that_is_not_stated(
+    cameras, tmp_path, size, focal
+):
+    lens = {"fl_x": 90.0, "cx": 40.0, "cy": 30.0}
+    path = transforms(tmp_path / "transforms.json", cameras[:1], ["0.png"], lens)
+    camera = read_cameras(path, size)[0]
+    assert camera.focal_px == (focal, focal)
+    assert camera.center_px == (size[0] / 2, size[1] / 2)
+
+
+@pytest.mark.parametrize("said", [{"is_fisheye": True}, {"camera_model": "OPENCV_FISHEYE"}])
+def test_a_fisheye_is_never_read_as_another_lens(cameras, tmp_path, said):
+    lens = LENS | {"k1": 0.1}
+    path = transforms(tmp_path / "transforms.json", cameras[:1], ["0.png"], lens | said)
+    with pytest.raises(InputError, match=r"(?i)fisheye.*Undistort"):
+        read_named_cameras(path)
+    path = transforms(path, cameras[:1], ["0.png"], lens | {"is_fisheye": False})
+    assert read_named_cameras(path)[0].camera.distortion[0] == 0.1
+
+
+def test_images_of_one_name_in_several_folders_are_refused(cameras, folder, tmp_path):
+    names = [f"images\\{side}\\shot_{n}.png" for side in ("left", "right") for n in (3, 4)]
+    path = transforms(tmp_path / "transforms.json", cameras[:4], names)
+    with pytest.raises(InputError, match="pictures of one name"):
+        read_cameras(path, SIZE, folder)
 
 
 @pytest.mark.parametrize(

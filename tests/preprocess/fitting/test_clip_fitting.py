@@ -20,7 +20,7 @@ VIEW[2, 3] = 2.6
 CAMERA = Camera(
     focal_px=(200.0, 200.0), center_px=(48.0, 80.0), size_px=(96, 160), camera_from_world=VIEW
 )
-FRAMES = 12
+FRAMES = 10
 
 
 def turning_motion() -> Motion:
@@ -132,7 +132,7 @@ def test_frames_that_are_alike_count_as_two_at_most(shaped):
 def test_a_still_person_is_believed_no_more_the_longer_the_film(space):
     coefficients, found = np.zeros(space.count), []
     coefficients[17] = 3.0  # outlines of forearms 15 % too long
-    for count in (4, 12):
+    for count in (3, 9):
         still = replace(turning_motion(), root_rotations=np.zeros((FRAMES, 3)))
         fitter = fitter_of(still, space, outlines(space, coefficients, still)[:count])
         for _ in range(6):

@@ -8,8 +8,8 @@ from preprocess.body.kinematics import rotation_matrices
 from preprocess.body.parametric_body import smpl_rest_joints
 from preprocess.body.proportion_space import ProportionSpace
 from preprocess.fitting.clip_poses import ClipPoses
-from preprocess.fitting.joint_fitting import LANDMARKS, POINT_NAMES, fit_joints, rows_with_limbs
-from preprocess.fitting.keypoint_rows import KEYPOINT_JOINTS, KEYPOINT_OFFSETS_M
+from preprocess.fitting.joint_fitting import POINT_NAMES, fit_joints, rows_with_limbs
+from tests.motions import angles_deg, posed_points
 
 FRAMES = 8
 PARENTS = np.array(TREE)
@@ -32,22 +32,6 @@ def poses() -> ClipPoses:
     )
 
 
-def places_of(poses: ClipPoses, rest, landmarks=True):
-    joints = poses.joints(rest, PARENTS)
-    places = np.full((len(joints.places), len(POINT_NAMES), 3), np.nan)
-    places[:, :24] = joints.places
-    for name, number in LANDMARKS.items() if landmarks else ():
-        joint = KEYPOINT_JOINTS[number]
-        offset = joints.turns[:, joint] @ KEYPOINT_OFFSETS_M[number]
-        places[:, POINT_NAMES.index(name)] = joints.places[:, joint] + offset
-    return places
-
-
-def angles_deg(a, b):
-    cosine = (np.trace(a.swapaxes(-1, -2) @ b, axis1=-2, axis2=-1) - 1.0) / 2.0
-    return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-
-
 def times():
     return np.arange(FRAMES) / 30.0
 
@@ -55,7 +39,7 @@ def times():
 def test_a_persons_joints_come_back(poses, shaped):
     space = ProportionSpace.around(shaped)
     person = space.shape(np.random.default_rng(1).normal(size=space.count))
-    found = fit_joints(places_of(poses, person.joints), times())
+    found = fit_joints(posed_points(poses, person.joints), times())
     assert found.distances_m.mean() < 0.005
     mine = found.poses.joints(space.shape(found.coefficients).joints, PARENTS)
     true = poses.joints(person.joints, PARENTS)
@@ -68,8 +52,10 @@ def test_knuckles_and_eyes_tell_how_hands_and_head_are_turned(poses, shaped):
     rest = shaped.joints
     true = poses.joints(rest, PARENTS).turns
     errors = []
-    for landmarks in (True, False):
-        found = fit_joints(places_of(poses, rest, landmarks), times())
+    for known in (len(POINT_NAMES), 24):
+        places = posed_points(poses, rest)
+        places[:, known:] = np.nan
+        found = fit_joints(places, times())
         turns = found.poses.joints(rest, PARENTS).turns
         errors.append(angles_deg(turns, true).mean(axis=0)[[15, 20, 21]].mean())
     assert errors[0] < 0.6 * errors[1]
@@ -78,7 +64,9 @@ def test_knuckles_and_eyes_tell_how_hands_and_head_are_turned(poses, shaped):
 def test_known_rotations_are_kept(poses):
     rest = smpl_rest_joints()
     true = poses.joints(rest, PARENTS).turns
-    found = fit_joints(places_of(poses, rest, landmarks=False), times(), true)
+    places = posed_points(poses, rest)
+    places[:, 24:] = np.nan
+    found = fit_joints(places, times(), true)
     turns = found.poses.joints(rest, PARENTS).turns
     limbs = [4, 5, 18, 19, 20, 21]
     assert np.median(angles_deg(turns, true)[:, limbs]) < 12.0
@@ -86,7 +74,7 @@ def test_known_rotations_are_kept(poses):
 
 
 def test_rows_without_limbs_are_left_out(poses):
-    places = places_of(poses, smpl_rest_joints())
+    places = posed_points(poses, smpl_rest_joints())
     places[[0, 3], 18] = np.nan
     np.testing.assert_array_equal(rows_with_limbs(places), [1, 2, 4, 5, 6, 7])
     with pytest.raises(ValueError, match="no frame has all"):

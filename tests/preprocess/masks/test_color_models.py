@@ -29,7 +29,6 @@ def test_background_is_known_once_seen_twice() -> None:
 
 
 def test_what_was_never_free_stays_unknown() -> None:
-    """Behind the person nothing is learnt."""
     plate, free = _plate(0), FREE.copy()
     free[10:20] = False
     for _ in range(3):
@@ -39,7 +38,6 @@ def test_what_was_never_free_stays_unknown() -> None:
 
 
 def test_colors_follow_the_exposure() -> None:
-    """A frame in other light is compared with the background in that light."""
     plate, gain = _plate(3), np.array([0.85, 0.95, 1.1], np.float32)[:, None, None]
     plate.align(gain * _wall(), FREE)
     found = plate.within(ALL)

@@ -1,11 +1,11 @@
-"""Refined masks: finer than the network's, better still before a static background."""
+"""Refined masks: finer than the network's; their borders, and the person's color there."""
 
 import cv2
 import numpy as np
 import pytest
 
 from preprocess.masks.mask_refinement import GivenMaskRefiner, MaskRefiner
-from preprocess.masks.matting import border_distance_px, refine_border
+from preprocess.masks.matting import border_distance_px, person_colors, refine_border
 from preprocess.tracking.keypoints import CroppedMask
 
 SIZE_PX = 160, 240
@@ -23,6 +23,10 @@ def _background(seed: int) -> np.ndarray:
     coarse[alike] = COLOR + generator.normal(0.0, 25.0, (int(alike.sum()), 3))
     fine = generator.normal(0.0, 6.0, (SIZE_PX[1], SIZE_PX[0], 3)).astype(np.float32)
     return cv2.resize(coarse, SIZE_PX, interpolation=cv2.INTER_CUBIC) + fine
+
+
+def _wall(*color: float) -> np.ndarray:
+    return np.full((SIZE_PX[1], SIZE_PX[0], 3), color, np.float32)
 
 
 def _person(shift_px: int) -> np.ndarray:
@@ -71,7 +75,6 @@ def _refine_clip(backgrounds: list[np.ndarray]) -> tuple[float, float]:
 
 
 def test_single_frame_gains_from_the_colors_nearby() -> None:
-    """One frame is enough to be finer than the network."""
     rgb, mask, truth = _frame(0, _background(1))
     alpha = MaskRefiner(SIZE_PX)(rgb, mask)
     assert alpha.dtype == np.float32
@@ -96,7 +99,7 @@ def test_what_a_static_camera_has_seen_decides_and_others_do_no_harm() -> None:
 
 def test_shadow_of_the_person_stays_background() -> None:
     """Background that was seen before and is darker now is shaded, not person."""
-    background = np.full((SIZE_PX[1], SIZE_PX[0], 3), (110.0, 140.0, 170.0), np.float32)
+    background = _wall(110.0, 140.0, 170.0)
     refiner = MaskRefiner(SIZE_PX)
     for shift_px in (-20, 20, -15, 15, -10, 10):
         refiner(*_frame(shift_px, background)[:2])
@@ -109,7 +112,6 @@ def test_shadow_of_the_person_stays_background() -> None:
 
 @pytest.mark.parametrize("size_px", [(80, 120), (160, 240), (240, 360)])
 def test_any_size(size_px: tuple[int, int]) -> None:
-    """The mask comes in the size that is wanted, and covers the same part of the picture."""
     rgb, mask, truth = _frame(0, _background(1))
     alpha = MaskRefiner(SIZE_PX)(rgb, mask, size_px)
     assert alpha.shape == size_px[::-1]
@@ -129,7 +131,6 @@ def test_large_frames_are_decided_at_a_smaller_size() -> None:
 
 
 def test_frame_without_a_person_gives_an_empty_mask() -> None:
-    """Where the network sees no person there is no mask, and the background is learnt."""
     rgb, mask, _ = _frame(0, _background(1))
     empty = CroppedMask(values=np.zeros_like(mask.values), image_from_crop=mask.image_from_crop)
     assert not MaskRefiner(SIZE_PX)(rgb, empty).any()
@@ -137,7 +138,7 @@ def test_frame_without_a_person_gives_an_empty_mask() -> None:
 
 def test_things_of_the_persons_color_that_are_apart_stay_background() -> None:
     """A spot of the color of the trunk beside it, where the network saw no person, is cleared."""
-    rgb, mask, truth = _frame(0, np.full((SIZE_PX[1], SIZE_PX[0], 3), 120.0))
+    rgb, mask, truth = _frame(0, _wall(120.0))
     spot = np.s_[118:128, 45:51]
     rgb[spot] = rgb[105:115, 77:83]
     alpha = MaskRefiner(SIZE_PX)(rgb, mask)
@@ -148,7 +149,7 @@ def test_things_of_the_persons_color_that_are_apart_stay_background() -> None:
 
 def test_stripes_of_the_walls_color_stay_person() -> None:
     """A shirt of red and white stripes before a wall that is nearly white."""
-    wall = np.full((SIZE_PX[1], SIZE_PX[0], 3), 205.0, np.float32)
+    wall = _wall(205.0)
     stripes = np.where(np.arange(SIZE_PX[1])[:, None, None] // 8 % 2, COLOR, [222.0, 220.0, 216.0])
     refiner, found = MaskRefiner(SIZE_PX), []
     for number in range(12):
@@ -160,9 +161,8 @@ def test_stripes_of_the_walls_color_stay_person() -> None:
 
 
 def test_border_before_a_known_background_is_exact_to_a_part_of_a_pixel() -> None:
-    """Pixels of the border show how far they are person."""
     refiner, off = MaskRefiner(SIZE_PX), []
-    wall = np.full((SIZE_PX[1], SIZE_PX[0], 3), 205.0, np.float32)
+    wall = _wall(205.0)
     for number in range(12):
         rgb, mask, truth = _frame((number % 8 - 4) * 5, wall)
         off.append(
@@ -172,7 +172,6 @@ def test_border_before_a_known_background_is_exact_to_a_part_of_a_pixel() -> Non
 
 
 def test_textured_background_that_the_network_takes_for_person_is_cleared() -> None:
-    """What the plate knows and the frame shows is not person, whatever the network says."""
     refiner, background = MaskRefiner(SIZE_PX), _background(1)
     for number in range(6):
         refiner(*_frame((number - 3) * 5, background)[:2])
@@ -200,7 +199,6 @@ def _given_masks(refiner: GivenMaskRefiner, *, wrong: bool) -> list[tuple[np.nda
 
 
 def test_given_masks_are_refined_where_they_miss_the_edges() -> None:
-    """Wandering borders come nearer to the truth, and a note tells."""
     refiner = GivenMaskRefiner()
     clip = _given_masks(refiner, wrong=True)[6:]
     before = float(np.mean([_iou(given, truth) for given, _, truth in clip]))
@@ -212,7 +210,6 @@ def test_given_masks_are_refined_where_they_miss_the_edges() -> None:
 
 
 def test_exact_masks_stay_as_they_are() -> None:
-    """No pixel of them changes."""
     refiner = GivenMaskRefiner()
     clip = _given_masks(refiner, wrong=False)
     assert all(found is given for given, found, _ in clip)
@@ -221,12 +218,13 @@ def test_exact_masks_stay_as_they_are() -> None:
 
 
 def test_a_frame_without_the_person_is_no_evidence() -> None:
-    """Its empty mask comes back, and decides nothing."""
     refiner, empty = GivenMaskRefiner(), np.zeros(SIZE_PX[::-1], np.float32)
     assert refiner(np.zeros((*SIZE_PX[::-1], 3), np.uint8), empty, SIZE_PX) is empty
     assert not refiner.is_needed
     assert not refiner.keeps_given_masks
 
+
+# --- borders --------------------------------------------------------------------------------------
 
 WALL, SUIT = np.float32([205, 60, 190]), np.float32([30, 160, 40])
 
@@ -238,6 +236,11 @@ def disc(radius: float, size: int = 64, fine: int = 8) -> np.ndarray:
     return cv2.resize(inside, (size, size), interpolation=cv2.INTER_AREA)
 
 
+def mix(person: np.ndarray, background: np.ndarray, alpha: np.ndarray) -> np.ndarray:
+    mixed = alpha[..., None] * person + (1.0 - alpha[..., None]) * background
+    return np.rint(mixed).astype(np.uint8)
+
+
 def constant(color: np.ndarray, spread: float, size: int = 64) -> tuple[np.ndarray, np.ndarray]:
     return (
         np.broadcast_to(color, (size, size, 3)).astype(np.float32),
@@ -245,16 +248,11 @@ def constant(color: np.ndarray, spread: float, size: int = 64) -> tuple[np.ndarr
     )
 
 
-def pictured(alpha: np.ndarray, wall: np.ndarray) -> np.ndarray:
-    mixed = alpha[..., None] * SUIT + (1.0 - alpha[..., None]) * wall
-    return (mixed + 0.5).astype(np.uint8)
-
-
 def test_a_border_half_a_pixel_off_comes_back(rng):
     """In either direction, before a wall of any known colors."""
     true = disc(20.2)
     wall = rng.integers(120, 250, (64, 64, 3)).astype(np.float32)
-    picture = pictured(true, wall)
+    picture = mix(SUIT, wall, true)
     for radius in (19.7, 20.7):
         given = disc(radius)
         found = refine_border(picture, given, (wall, constant(WALL, 5.0)[1]), constant(SUIT, 8.0))
@@ -266,12 +264,12 @@ def test_a_border_half_a_pixel_off_comes_back(rng):
 def test_a_soft_border_stays_soft():
     """Of an enlarged or moving picture: what lies beside a sharp mask is a mixture, too."""
     true, given = cv2.GaussianBlur(disc(20.2), (0, 0), 1.5), disc(20.7)
-    found = refine_border(pictured(true, WALL), given, constant(WALL, 5.0), constant(SUIT, 8.0))
+    found = refine_border(mix(SUIT, WALL, true), given, constant(WALL, 5.0), constant(SUIT, 8.0))
     assert np.abs(found - true).sum() < 0.33 * np.abs(given - true).sum()
 
 
 def test_nothing_changes_where_either_color_is_unknown():
-    picture, given = pictured(disc(20.2), WALL), disc(19.7)
+    picture, given = mix(SUIT, WALL, disc(20.2)), disc(19.7)
     known, unknown = constant(WALL, 5.0), constant(SUIT, np.inf)
     np.testing.assert_array_equal(refine_border(picture, given, known, unknown), given)
     np.testing.assert_array_equal(refine_border(picture, given, unknown, known), given)
@@ -280,7 +278,7 @@ def test_nothing_changes_where_either_color_is_unknown():
 def test_the_mask_stays_where_person_and_wall_look_alike():
     """No displacement is likelier than another, so the area stays."""
     given = disc(20.2)
-    found = refine_border(pictured(given, SUIT), given, constant(SUIT, 5.0), constant(SUIT, 5.0))
+    found = refine_border(mix(SUIT, SUIT, given), given, constant(SUIT, 5.0), constant(SUIT, 5.0))
     assert abs(found.sum() - given.sum()) < 0.02 * given.sum()
     assert np.abs(found - given).max() < 0.5
 
@@ -289,7 +287,8 @@ def test_an_unexpected_foreground_color_is_still_person():
     """The expected color lies beyond the person's, so by both colors alone half is wall."""
     true, given = disc(20.2), disc(19.7)
     expected = WALL + 2.0 * (SUIT - WALL)
-    found = refine_border(pictured(true, WALL), given, constant(WALL, 5.0), constant(expected, 8.0))
+    picture, person = mix(SUIT, WALL, true), constant(expected, 8.0)
+    found = refine_border(picture, given, constant(WALL, 5.0), person)
     assert found[true == 1.0].mean() > 0.96
 
 
@@ -300,3 +299,44 @@ def test_border_distance_has_sub_pixel_accuracy():
     off = np.abs(border_distance_px(disc(20.2)) - true)[near]
     assert off.mean() < 0.25
     assert off.max() < 0.8
+
+
+@pytest.fixture
+def alpha() -> np.ndarray:
+    """A disc's mask with a border of two pixels."""
+    rows, columns = np.mgrid[:41, :37]
+    away = np.hypot(rows - 20.0, columns - 17.0)
+    return np.clip((13.0 - away) / 2.0, 0.0, 1.0).astype(np.float32)
+
+
+def test_a_border_pixel_has_the_persons_color_without_the_background(alpha):
+    person, background = np.array([180.0, 30.0, 40.0]), np.array([240.0, 250.0, 235.0])
+    rgb = mix(person, background, alpha)
+    border = (alpha > 0.1) & (alpha < 1.0)
+    stain = np.abs(rgb[border] - person).max(axis=1).mean()
+    left = np.abs(person_colors(rgb, alpha)[border] - person).max(axis=1).mean()
+    assert stain > 60.0
+    assert left < 0.4 * stain
+
+
+def test_stripes_and_a_background_of_two_colors_are_kept_apart(alpha):
+    columns = np.arange(alpha.shape[1])
+    stripes = np.where((columns // 5 % 2)[None, :, None] > 0, [30.0, 60.0, 200.0], 220.0)
+    person = np.broadcast_to(stripes, (*alpha.shape, 3))
+    background = np.where(np.arange(len(alpha))[:, None, None] < 20, [0.0, 160.0, 0.0], 90.0)
+    rgb = mix(person, np.broadcast_to(background, person.shape), alpha)
+    weight = alpha[..., None]
+    stain = np.square(weight * (rgb - person)).mean()
+    assert np.square(weight * (person_colors(rgb, alpha) - person)).mean() < 0.4 * stain
+
+
+def test_a_hard_mask_leaves_the_image_as_it_is(alpha, rng):
+    rgb = rng.integers(0, 256, (*alpha.shape, 3), dtype=np.uint8)
+    np.testing.assert_array_equal(person_colors(rgb, (alpha > 0.5).astype(np.float32)), rgb)
+
+
+def test_an_empty_mask_and_one_of_the_whole_image_are_no_error(rng):
+    rgb = rng.integers(0, 256, (6, 9, 3), dtype=np.uint8)
+    for value in (0.0, 0.5, 1.0):
+        found = person_colors(rgb, np.full((6, 9), value, np.float32))
+        assert np.isfinite(found).all()

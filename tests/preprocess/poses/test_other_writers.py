@@ -13,11 +13,7 @@ from capture.input_error import InputError
 from preprocess.poses.motion_builder import SMPLX_PELVIS, fill_gaps
 from preprocess.poses.pose_format_registry import read_poses
 from tests.preprocess.poses.test_trackers import World, assert_at_the_truth, npz
-
-
-@pytest.fixture
-def world(tmp_path, truth, shaped, joblib_bytes) -> World:
-    return World(tmp_path, truth, shaped.joints, joblib_bytes)
+from tests.preprocess.poses.test_trackers import world as world
 
 
 def slahmr(w: World) -> Path:

@@ -8,7 +8,7 @@ import pytest
 from capture.input_error import InputError
 from preprocess.poses.pose_file import write_motion
 from preprocess.poses.pose_format_registry import read_poses
-from preprocess.tracking.keypoints import KeypointTrack
+from tests.motions import make_track
 
 
 @pytest.fixture
@@ -50,10 +50,10 @@ def test_what_is_written_is_read(tmp_path, motion):
 @pytest.fixture
 def keypoints(rng):
     """Key points in four of seven frames."""
-    return KeypointTrack(
-        frames=np.array([0, 1, 4, 6]), image_px=rng.uniform(0.0, 500.0, (4, 33, 2)),
+    return make_track(
+        np.array([0, 1, 4, 6]), (270, 480), image_px=rng.uniform(0.0, 500.0, (4, 33, 2)),
         world_m=rng.normal(size=(4, 33, 3)), visibility=rng.uniform(size=(4, 33)),
-        presence=rng.uniform(size=4), size_px=(270, 480), times_s=np.array([0.0, 0.5, 2.0, 3.0]),
+        presence=rng.uniform(size=4), times_s=np.array([0.0, 0.5, 2.0, 3.0]),
     )  # fmt: skip
 
 

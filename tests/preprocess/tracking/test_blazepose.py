@@ -61,7 +61,7 @@ def shots() -> list[Shot]:
     """One in stripes and one in a plain shirt, of 270x480 px."""
     found = []
     for subject in (1, 2):
-        actor = Actor.of(subject)
+        actor = Actor.of(subject, 0)
         pose = staging.turning_motion(actor, frames=8, fps=30.0, turns=1.0, seed=0)[0]
         camera = staging.portrait_camera(actor, 270)
         rgb, alpha = actor.render_rgb_alpha(pose, camera, supersampling=2)

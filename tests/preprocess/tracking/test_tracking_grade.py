@@ -29,10 +29,10 @@ def a_motion(turns: float = 1.0, noise_rad: float = 0.0) -> Motion:
     return make_motion(roots.as_rotvec(), places, noise_rad * joints, frames=np.arange(FRAMES))
 
 
-def some_keypoints() -> KeypointTrack:
+def some_keypoints(**others) -> KeypointTrack:
     image = np.full((FRAMES, 33, 2), 300.0)
     image[:, 0, 1], image[:, 27:33, 1] = 100.0, 500.0
-    return make_track(np.arange(FRAMES), (600, 600), image_px=image)
+    return make_track(np.arange(FRAMES), (600, 600), **{"image_px": image, **others})
 
 
 def grade(shaped, keypoints=None, motion=None, iou=0.85, times=TIMES) -> TrackingGrade:
@@ -113,17 +113,17 @@ def test_the_cause_of_most_doubtful_frames_leads_the_verdict(shaped):
     problems = np.zeros(FRAMES, dtype=np.int64)
     problems[10:50] = PROBLEM_BITS[TrackingProblem.BOTTOM]
     problems[5:12] |= PROBLEM_BITS[TrackingProblem.LEFT]
-    verdict = grade(shaped, keypoints=replace(some_keypoints(), problems=problems)).describe()
+    verdict = grade(shaped, keypoints=some_keypoints(problems=problems)).describe()
     cause = "the person is cut by the picture's lower border in 40 of 60 frames"
     assert verdict.startswith(f"Good enough for an avatar: no, because {cause}")
 
 
 def test_a_cut_film_is_named_where_it_is_cut(shaped):
-    keypoints = some_keypoints()
-    image = keypoints.image_px + np.linspace(0.0, 30.0, FRAMES)[:, None, None] * [1.0, 0.0]
-    assert grade(shaped, keypoints=replace(keypoints, image_px=image)).stretches == ()
+    image = some_keypoints().image_px
+    image += np.linspace(0.0, 30.0, FRAMES)[:, None, None] * [1.0, 0.0]
+    assert grade(shaped, keypoints=some_keypoints(image_px=image)).stretches == ()
     image[31:, :, 0] += 90.0
-    (cut,) = grade(shaped, keypoints=replace(keypoints, image_px=image)).stretches
+    (cut,) = grade(shaped, keypoints=some_keypoints(image_px=image)).stretches
     assert (cut.start_s, cut.end_s) == (1.0, round(31 / FPS, 2))
 
 
@@ -131,18 +131,17 @@ def test_a_refusal_for_several_reasons_counts_them_all(shaped):
     problems = np.zeros(FRAMES, dtype=np.int64)
     problems[:20] = PROBLEM_BITS[TrackingProblem.CROWDED]
     problems[20:35] = PROBLEM_BITS[TrackingProblem.TOP]
-    (objection,) = grade(shaped, keypoints=replace(some_keypoints(), problems=problems)).objections
+    (objection,) = grade(shaped, keypoints=some_keypoints(problems=problems)).objections
     assert objection.endswith("mixed up in 20 of 60 frames, and 15 more are doubtful")
 
 
 def test_frames_with_another_person_near_are_left_out_unless_they_are_most(shaped):
     problems = np.zeros(FRAMES, dtype=np.int64)
     problems[10:20] = PROBLEM_BITS[TrackingProblem.CROWDED]
-    keypoints = replace(some_keypoints(), problems=problems)
-    found = grade(shaped, keypoints=keypoints)
+    found = grade(shaped, keypoints=some_keypoints(problems=problems))
     assert found.left_out == tuple(range(10, 20))
-    most = replace(keypoints, problems=np.full(FRAMES, PROBLEM_BITS[TrackingProblem.CROWDED]))
-    assert grade(shaped, keypoints=most).left_out == ()
+    problems[:] = PROBLEM_BITS[TrackingProblem.CROWDED]
+    assert grade(shaped, keypoints=some_keypoints(problems=problems)).left_out == ()
 
 
 def keypoints_in(rows) -> KeypointTrack:
