@@ -32,39 +32,30 @@ def found_in(video: Path, *named: Path, cameras: str | None = None) -> CapturePa
     return inputs.find_paths()
 
 
-def test_a_folder_holds_everything(make):
-    root = make("video.mp4", "poses.npz", "masks", "cameras.npz")
-    found = found_in(root)
-    assert found.video == root
-    assert found.poses == root / "poses.npz"
-    assert found.masks == root / "masks"
-    assert found.cameras == root / "cameras.npz"
-
-
-def test_beside_a_video_comes_before_beside_its_poses(make):
-    root = make("a/v.mp4", "a/masks", "b/poses.npz", "b/masks", "b/cameras.npz")
-    found = found_in(root / "a/v.mp4", root / "b/poses.npz")
-    assert found.masks == root / "a/masks"
-    assert found.cameras == root / "b/cameras.npz"
-
-
-def test_beside_a_folder_named_images_counts_too(make):
-    root = make("images", "poses.npz", "masks.npz")
-    assert found_in(root / "images", root / "poses.npz").masks == root / "masks.npz"
-
-
-def test_a_folder_does_not_take_its_neighbours_things(make):
-    root = make("one/video.mp4", "one/poses.npz", "masks", "cameras.npz")
-    found = found_in(root / "one")
-    assert found.masks is None
-    assert found.cameras is None
-
-
-def test_what_is_named_wins(make):
-    root = make("v.mp4", "p.npz", "masks", "other", "cameras.npz", "c.npz")
-    found = found_in(root / "v.mp4", root / "p.npz", root / "other", root / "c.npz")
-    assert (found.masks, found.cameras) == (root / "other", root / "c.npz")
-    assert found_in(root / "v.mp4", root / "p.npz", cameras="static").cameras is None
+@pytest.mark.parametrize(
+    ("there", "named", "found"),
+    [
+        # a folder holds everything, and does not take its neighbours' things
+        (["video.mp4", "poses.npz", "masks", "cameras.npz"], ["."],
+         ["poses.npz", "masks", "cameras.npz"]),
+        (["one/v.mp4", "one/poses.npz", "masks", "cameras.npz"], ["one"],
+         ["one/poses.npz", None, None]),
+        # beside a video comes before beside its poses; beside a folder named images counts, too
+        (["a/v.mp4", "a/masks", "b/poses.npz", "b/masks", "b/cameras.npz"],
+         ["a/v.mp4", "b/poses.npz"], ["b/poses.npz", "a/masks", "b/cameras.npz"]),
+        (["images", "poses.npz", "masks.npz"], ["images", "poses.npz"],
+         ["poses.npz", "masks.npz", None]),
+        # what is named wins
+        (["v.mp4", "p.npz", "masks", "other", "cameras.npz", "c.npz"],
+         ["v.mp4", "p.npz", "other", "c.npz"], ["p.npz", "other", "c.npz"]),
+    ],
+)  # fmt: skip
+def test_masks_and_cameras_are_found_in_this_order(make, there, named, found):
+    root = make(*there)
+    paths = found_in(*(root / name for name in named))
+    expected = [name and root / name for name in found]
+    assert [paths.poses, paths.masks, paths.cameras] == expected
+    assert paths.video == root / named[0]
 
 
 @pytest.mark.parametrize("missing", ["video", "poses", "masks", "cameras"])
@@ -76,9 +67,10 @@ def test_what_is_named_must_be_there(make, missing):
         found_in(*named)
 
 
-def test_cameras_that_are_to_be_solved_are_looked_for_nowhere(make):
+@pytest.mark.parametrize("cameras", ["solve", "static"])
+def test_cameras_that_are_to_be_solved_or_assumed_are_looked_for_nowhere(make, cameras):
     root = make("video.mp4", "poses.npz", "cameras.npz")
-    assert found_in(root, cameras="solve").cameras is None
+    assert found_in(root, cameras=cameras).cameras is None
 
 
 def test_poses_beside_a_video_are_not_taken_but_spoken_of(make):

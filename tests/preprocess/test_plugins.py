@@ -4,7 +4,7 @@ import pytest
 
 from capture.input_error import InputError
 from preprocess import plugins
-from preprocess.plugins import PersonTracker, make_segmenter, make_tracker, segmenter_name
+from preprocess.plugins import PersonTracker, make_segmenter, make_tracker
 from preprocess.tracking.blazepose import BlazePoseSegmenter, BlazePoseTracker
 
 
@@ -32,12 +32,6 @@ def test_the_projects_own_tracker_and_segmenter_need_no_entry_point(shaped):
     assert isinstance(tracker, PersonTracker)
     with pytest.raises(InputError, match="--person 0"):  # they are counted from one
         make_tracker(person=0)
-
-
-def test_a_segmenter_is_named_by_its_prefix():
-    assert segmenter_name("segmenter:blazepose") == "blazepose"
-    assert segmenter_name("masks/") is None
-    assert segmenter_name(None) is None
 
 
 def test_another_packages_segmenter_is_made_for_the_body(monkeypatch, shaped):

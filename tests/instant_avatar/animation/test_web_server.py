@@ -417,3 +417,19 @@ def test_a_page_replaces_a_page(call_play, package, tmp_path):
     assert (out / "runtime" / "LICENSE").is_file()
     assert (out / "runtime" / "ort.js").is_file()
     assert not list(out.rglob("*.mjs"))  # which many hosts do not serve as a script
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--web", "0"], "but must be a port"),
+        (["--web", "--bench"], "--bench"),
+        (["--web", "--tier", "lite"], "--tier"),
+        (["--web", "--size", "200"], "--size"),
+        (["--web", "--camera", "cameras.npz"], "--camera"),
+    ],
+)
+def test_what_the_page_cannot_do_is_refused(call_play, package, words, said):
+    outcome = call_play(package, *words)
+    assert outcome.code == 2
+    assert said in outcome.complaint("ia-play")

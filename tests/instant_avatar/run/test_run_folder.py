@@ -121,9 +121,9 @@ def test_a_run_does_not_replace_what_ia_track_wrote(tmp_path):
         check(RunFolder(path=tmp_path), "overwrite")
 
 
-def test_resuming_needs_a_run_and_no_other_flag(film, tmp_path, call):
-    refusal = call(ingest, film, "--out", tmp_path / "typo", "--resume").refusal()
-    assert "No run to --resume in" in refusal
+def test_resuming_needs_a_run_and_no_other_flag(film, tmp_path, capsys):
+    assert ingest.main([str(film), "--out", str(tmp_path / "typo"), "--resume"]) == 2
+    assert "No run to --resume in" in capsys.readouterr().err
     assert os.listdir(tmp_path) == []
     run = RunFolder(path=tmp_path / "killed")
     with run.claim(Console(), resume=False, overwrite=False):
@@ -135,11 +135,10 @@ def test_resuming_needs_a_run_and_no_other_flag(film, tmp_path, call):
 # --- its lock ---------------------------------------------------------------------------------
 
 
-def test_a_second_run_into_a_folder_is_refused_while_the_first_goes_on(film, tmp_path, call):
+def test_a_second_run_into_a_folder_is_refused_while_the_first_goes_on(film, tmp_path, capsys):
     with claim_folder(tmp_path, Console()):
-        ended = call(ingest, film, "--out", tmp_path, "--overwrite")
-    assert ended.code == 3
-    assert "--out" in ended.complaint()
+        assert ingest.main([str(film), "--out", str(tmp_path), "--overwrite"]) == 3
+    assert "--out" in capsys.readouterr().err
     with claim_folder(tmp_path, Console()):
         pass
     assert os.listdir(tmp_path) == []

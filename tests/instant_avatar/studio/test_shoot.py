@@ -1,6 +1,5 @@
 """Filming the actor: a capture folder with ground truth, and the light on the actor."""
 
-import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +12,6 @@ from capture.atomic_files import LIST_NAME as LIST
 from capture.camera import Camera
 from capture.input_error import InputError
 from capture.source_opening import open_source
-from instant_avatar import sample
 from instant_avatar.studio import staging
 from instant_avatar.studio.actor import Actor
 from instant_avatar.studio.lighting import NO_FACE, rasterize
@@ -179,28 +177,6 @@ def test_the_same_seed_films_the_same_and_another_seed_does_not(capture, tmp_pat
     )
     assert first == again
     assert first != other
-
-
-def test_ia_sample_says_what_comes_next_and_replaces_its_own_folder_on_request(call, tmp_path):
-    out = tmp_path / "my [c]" / ("long" * 30)
-    words = (sample, out, "--frames", 2, "--size", 32, "--background", "plain")
-    ended = call(*words)
-    assert ended.code == 0, ended.err
-    assert (out / "video.mp4").exists()
-    assert shlex.split(ended.err.splitlines()[-1]) == [
-        "ia-ingest", str(out / "video.mp4"), "--poses", str(out / "poses.npz")
-    ]  # fmt: skip
-    assert "--overwrite" in call(*words).refusal()
-    assert call(*words, "--overwrite").code == 0
-
-
-@pytest.mark.parametrize(
-    ("option", "value"),
-    [("--frames", "0"), ("--size", "3"), ("--fps", "nan"), ("--mask-noise-px", "-1")],
-)
-def test_numbers_out_of_range_are_named(call, tmp_path, option, value):
-    assert option in call(sample, tmp_path / "c", option, value).refusal()
-    assert list(tmp_path.iterdir()) == []
 
 
 SIZE = 40

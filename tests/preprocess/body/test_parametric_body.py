@@ -55,9 +55,7 @@ def test_the_embedded_body_is_closed_and_turned_outwards(body):
     assert 0.04 < volume < 0.12  # a person's 40 to 120 litres
 
 
-def test_weights_sum_to_one_and_each_joint_holds_something(body):
-    np.testing.assert_allclose(body.weights.sum(axis=1), 1.0, atol=1e-12)
-    assert body.weights.min() >= 0.0
+def test_each_joint_holds_something(body):
     assert (body.weights.max(axis=0) > 0.4).all()
 
 

@@ -330,6 +330,7 @@ def test_a_fit_without_masks_takes_the_key_points_alone(lifted, truth):
     assert error_mm(apply_fit(lifted, alone), truth) < 0.95 * error_mm(lifted, truth)
 
 
+@pytest.mark.slow
 def test_key_points_that_are_off_in_all_frames_give_way_to_outlines(lifted, truth, monkeypatch):
     track = lifted.motion.keypoints
     aside_px = 0.04 * truth.source.size_px[1] / 2.0  # about 4 cm
@@ -357,6 +358,7 @@ def test_key_points_alone_count_fully_so_that_a_fast_walk_is_followed(lifted):
     np.testing.assert_allclose(*found)
 
 
+@pytest.mark.slow
 def test_poses_follow_outlines_closer_than_proportions_do(lifted, monkeypatch):
     monkeypatch.setattr(capture_fitting, "POSE_ITERATIONS", 2)  # errors are those before the last
     fit = fit_capture(lifted)

@@ -74,15 +74,6 @@ def _refine_clip(backgrounds: list[np.ndarray]) -> tuple[float, float]:
     return float(np.mean(soft[half:])), float(np.mean(refined[half:]))
 
 
-def test_single_frame_gains_from_the_colors_nearby() -> None:
-    rgb, mask, truth = _frame(0, _background(1))
-    alpha = MaskRefiner(SIZE_PX)(rgb, mask)
-    assert alpha.dtype == np.float32
-    assert alpha.min() >= 0.0
-    assert alpha.max() <= 1.0
-    assert _iou(alpha, truth) > _iou(mask.resample(SIZE_PX, SIZE_PX), truth) + 0.01
-
-
 def test_what_a_static_camera_has_seen_decides_and_others_do_no_harm() -> None:
     """A background that is another in each frame, shakes, or is exposed otherwise by channel."""
     wall, shakes = _background(1), np.random.default_rng(0).integers(-6, 7, (16, 2))
@@ -115,6 +106,7 @@ def test_any_size(size_px: tuple[int, int]) -> None:
     rgb, mask, truth = _frame(0, _background(1))
     alpha = MaskRefiner(SIZE_PX)(rgb, mask, size_px)
     assert alpha.shape == size_px[::-1]
+    assert 0.0 <= alpha.min() < alpha.max() <= 1.0
     assert alpha.mean() == pytest.approx(truth.mean(), rel=0.03)
 
 

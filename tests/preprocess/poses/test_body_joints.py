@@ -270,7 +270,7 @@ def bending() -> ClipPoses:
 
 
 @pytest.mark.usefixtures("own_joints")
-@pytest.mark.parametrize("body", ["SOMA", "SMPL-H", NAMED])
+@pytest.mark.parametrize("body", ["SOMA", "SMPL-H", pytest.param(NAMED, marks=pytest.mark.slow)])
 def test_our_joints_are_found_from_where_another_body_has_them(tmp_path, bending, shaped, body):
     ours, offsets = bending.joints(shaped.joints, PARENTS), np.zeros((24, 3))
     for joint, name in enumerate(JOINT_NAMES):

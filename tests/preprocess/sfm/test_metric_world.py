@@ -117,6 +117,7 @@ def test_the_floor_is_found_among_walls(cameras, room_points, rng):
     assert floor.heights_above(np.array([[0.0, 1.5, 0.0]])) == pytest.approx([1.5], abs=0.01)
 
 
+@pytest.mark.slow
 def test_a_table_is_no_floor(cameras, room_points, rng):
     table = rng.uniform([-2.5, 0.75, -2.5], [2.5, 0.75, 0.5], (700, 3))  # larger than the floor
     floor = fit_floor_plane(exact_model(cameras, np.concatenate([room_points, table])), UP)

@@ -172,7 +172,7 @@ def test_the_person_in_front_is_followed(striped, plain):
     assert abs(hips(found) - middle(330)) < 15
 
 
-@pytest.mark.parametrize("is_in_front", [False, True])
+@pytest.mark.parametrize("is_in_front", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_person_who_walks_past_is_not_followed(striped, plain, is_in_front):
     tracker = BlazePoseTracker(person=1)
     found_frames, crowded = [], []
@@ -224,7 +224,7 @@ def test_a_sleeve_that_the_detector_takes_for_a_person_is_not_another_one(plain,
     assert not any(each is None or each.crowded for each in found)
 
 
-@pytest.mark.parametrize("person", [1, 2])
+@pytest.mark.parametrize("person", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_each_of_two_persons_in_a_wide_picture_can_be_followed(striped, plain, person):
     """In this room the detector sees only the one on the right, of the whole picture."""
     center_px = 350.0, striped.camera.center_px[1]
