@@ -114,7 +114,7 @@ def test_a_camera_that_turns_on_the_spot_is_solved_as_one(
     room, here, tmp_path, monkeypatch, shake_m, most_deg
 ):
     monkeypatch.setattr(colmap_mapping, "extract_features", None)  # no need of it
-    cameras = turning(here, np.linspace(-24.0, 24.0, 10), shake_m)
+    cameras = turning(here, np.linspace(-24.0, 24.0, 14), shake_m)
     source = room.film(tmp_path / "film", cameras)
     solved = solve(source, max_keyframes=KEYS)
     assert solved.model.only_turns
