@@ -35,6 +35,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.skip(reason="calls what Windows has not"))
 
 
+def pytest_runtest_setup() -> None:
+    """Check the first calls of each function in this test."""
+    shape_checks.calls.clear()
+
+
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(0)

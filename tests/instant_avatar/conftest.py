@@ -1,10 +1,12 @@
 """A short film of the actor and a short run on it, shared by all tests of the commands."""
 
 import functools
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from export.player import Player
 from instant_avatar import ingest, play
 from instant_avatar.report import report_writer
 from instant_avatar.run import final_scoring, snapshot_writer, training_session
+from instant_avatar.studio import staging
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.open_capture import open_capture
@@ -38,12 +41,17 @@ class Outcome:
     out: str
     err: str
 
-    def complaint(self, program: str = "ia-ingest") -> str:
+    def complaint(self) -> str:
         """Its one message, as one line of words."""
-        said = [line for line in self.err.splitlines() if line.startswith(f"{program}:")]
+        said = [line for line in self.err.splitlines() if re.match(r"ia-\w+:", line)]
         assert len(said) == 1, self.err
         assert "Traceback" not in self.err
         return said[0]
+
+    def refusal(self) -> str:
+        """Its one message, of bad input."""
+        assert self.code == 2, self.err
+        return self.complaint()
 
 
 Command = Callable[..., Outcome]
@@ -73,7 +81,7 @@ def pytest_runtest_setup():
     BRIEF.setattr(fine_tuning, "VALIDATION_PX", 64)
     BRIEF.setattr(splats, "MAX_CROSSED_M2", 0.4)
     BRIEF.setattr(splats, "PIXEL_M", 0.02)
-    BRIEF.setattr(mesh_texture, "PIXEL_M", 0.01)
+    BRIEF.setattr(mesh_texture, "PIXEL_M", 0.02)
     BRIEF.setattr(mesh_texture, "TEXEL_M", 0.005)
     BRIEF.setattr(held_out_pose_fitting, "CORRECTIONS_PER_FRAME", 3)
     BRIEF.setattr(held_out_pose_fitting, "RAYS_PER_CORRECTION", 1024)
@@ -109,6 +117,17 @@ def packages_load_once():
         yield
 
 
+def film_without_novel_views(folder: Path, config: ShootConfig) -> None:
+    """Film a capture folder; one picture stands for those of poses that the video does not show."""
+    with pytest.MonkeyPatch.context() as patch:
+        novel_poses = staging.novel_poses
+        one = np.arange(1)
+        patch.setattr(
+            staging, "novel_poses", lambda actor: novel_poses(actor).select_rows(one, one)
+        )
+        film_capture(folder, config)
+
+
 @pytest.fixture(scope="session")
 def film(tmp_path_factory) -> Path:
     """A capture folder: 24 frames of 64 px."""
@@ -123,6 +142,7 @@ def run(film, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "run"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(train, "warm_up", lambda trainer: 0.0)
+        patch.setattr(bake_tables, "FINE_TUNING_PICTURES", 0)  # tests of export/ show it
         assert ingest.main([str(film), "--out", str(out), "--steps", str(ENOUGH_STEPS)]) == 0
     return out
 
@@ -165,12 +185,14 @@ def on_one_core(monkeypatch) -> None:
 
 
 @pytest.fixture
-def call_ingest(capsys, on_one_core) -> Command:
-    """Runs ia-ingest, for a few steps unless the test says otherwise."""
+def call(capsys) -> Command:
+    """Runs a command, of which the module is given, with arguments of any type."""
 
-    def call(*arguments: object, steps: int = FEW_STEPS) -> Outcome:
-        words = [str(argument) for argument in arguments]
-        code = ingest.main([*words, "--steps", str(steps)])
+    def call(command: ModuleType, *arguments: object) -> Outcome:
+        try:
+            code = command.main([str(argument) for argument in arguments])
+        except SystemExit as end:  # of words that cannot be parsed
+            code = end.code
         captured = capsys.readouterr()
         return Outcome(code=code, out=captured.out, err=captured.err)
 
@@ -178,22 +200,23 @@ def call_ingest(capsys, on_one_core) -> Command:
 
 
 @pytest.fixture
-def call_play(capsys) -> Command:
+def call_ingest(call, on_one_core) -> Command:
+    """Runs ia-ingest, for a few steps unless the test says otherwise."""
+    return lambda *arguments, steps=FEW_STEPS: call(ingest, *arguments, "--steps", steps)
+
+
+@pytest.fixture
+def call_play(call) -> Command:
     """Runs ia-play."""
-
-    def call(*arguments: object) -> Outcome:
-        code = play.main([str(argument) for argument in arguments])
-        captured = capsys.readouterr()
-        return Outcome(code=code, out=captured.out, err=captured.err)
-
-    return call
+    return functools.partial(call, play)
 
 
 @pytest.fixture
 def without_baking(monkeypatch) -> None:
     """Leaves out the seconds that baking takes, where a test is not about the package.
 
-    Nor is it about how good the avatar is, for which half a second may not be enough.
+    Nor is it about how good the avatar is, for which half a second may not be enough: views that
+    were not filmed are not drawn.
     """
 
     def export_nothing(avatar, path, **options):
@@ -205,6 +228,8 @@ def without_baking(monkeypatch) -> None:
 
     monkeypatch.setattr(snapshot_writer, "export_avatar", export_nothing)
     monkeypatch.setattr(training_session, "update_metrics", lambda path, metrics: 8)
+    opaque = [np.ones((1, 1, 4), np.float32)]
+    monkeypatch.setattr(final_scoring, "render_unfilmed_views", lambda avatar, reduction: opaque)
     monkeypatch.setattr(report_writer, "diagnose_failure", lambda report: None)
     monkeypatch.setattr(report_writer, "demo_animation", lambda player: b"")
     monkeypatch.setattr(report_writer.Player, "load", lambda path: None)

@@ -13,12 +13,13 @@ from benchmarks import capture_corruptions
 from instant_avatar import check
 from instant_avatar.capture_validation import passes_quick_check
 from instant_avatar.corrected_capture import renumber_motion
-from instant_avatar.studio.shoot import ShootConfig, film_capture
+from instant_avatar.studio.shoot import ShootConfig
 from preprocess.alignment.capture_geometry import CaptureGeometry
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.open_capture import open_capture
 from preprocess.poses.pose_file import write_motion
 from preprocess.poses.pose_format_registry import read_poses
+from tests.instant_avatar.conftest import film_without_novel_views
 from tests.motions import make_motion
 
 SPOILS = {
@@ -40,7 +41,7 @@ def dancing(tmp_path_factory) -> Path:
     """A capture folder: 40 frames of 96 px."""
     folder = tmp_path_factory.mktemp("dancing") / "capture"
     config = ShootConfig(frames=40, size=96, motion="dance", background="plain", turns=1.0)
-    film_capture(folder, config)
+    film_without_novel_views(folder, config)
     return folder
 
 
@@ -58,19 +59,16 @@ def spoilt(dancing, tmp_path):
 
 
 @pytest.fixture
-def call_check(capsys, tmp_path):
+def call_check(call, tmp_path):
     """Runs ia-check; returns its exit code, what it said, and its JSON."""
 
-    def call(*arguments):
-        wanted = tmp_path / "found.json"
-        words = [str(a) for a in arguments]
-        code = check.main(
-            [*words, "--json", str(wanted), "--sheet", str(tmp_path / "sheet.png"), "--overwrite"]
-        )
+    def call_check(*arguments):
+        wanted, sheet = tmp_path / "found.json", tmp_path / "sheet.png"
+        ended = call(check, *arguments, "--json", wanted, "--sheet", sheet, "--overwrite")
         found = json.loads(wanted.read_text()) if wanted.exists() else {}
-        return code, " ".join(capsys.readouterr().err.split()), found
+        return ended.code, " ".join(ended.err.split()), found
 
-    return call
+    return call_check
 
 
 def test_a_good_capture_is_called_good_and_there_is_nothing_to_mend(dancing, call_check, tmp_path):
@@ -254,9 +252,8 @@ def test_a_glance_is_enough_for_a_good_capture_and_notices_a_late_one(dancing, s
 
 def test_ingest_stops_before_an_unusable_capture_and_says_why(spoilt, call_ingest, tmp_path):
     folder = spoilt(capture_corruptions.scale_focal(0.4))
-    outcome = call_ingest(folder, "--frames", ":12", "--out", tmp_path / "run")
-    assert outcome.code == 2
-    assert "--force" in outcome.complaint()
+    refusal = call_ingest(folder, "--frames", ":12", "--out", tmp_path / "run").refusal()
+    assert "--force" in refusal
     assert not (tmp_path / "run").exists()
 
 

@@ -62,21 +62,21 @@ def test_a_draft_draws_nearly_what_the_finished_package_draws(run, tmp_path):
 
 
 @pytest.fixture
-def call_export(capsys):
-    """Runs ia-export."""
+def call_export(call):
+    """Runs ia-export, and asserts that it is done."""
 
-    def call(*arguments):
-        code = export.main([str(argument) for argument in arguments])
-        return code, capsys.readouterr()
+    def call_export(*arguments):
+        ended = call(export, *arguments)
+        assert ended.code == 0, ended.err
+        return ended.err
 
-    return call
+    return call_export
 
 
 @pytest.mark.slow
 def test_a_runs_checkpoint_becomes_a_package_that_plays(run, call_export, tmp_path):
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
-    code, said = call_export(run, "--out", tmp_path / "now.iavatar")
-    assert code == 0, said.err
+    call_export(run, "--out", tmp_path / "now.iavatar")
     frames = compare_golden_frames(read_package(tmp_path / "now.iavatar"))
     assert all(frame.matches for frame in frames)
     golden = Player.load(tmp_path / "now.iavatar").manifest.golden[0]
@@ -101,14 +101,13 @@ def person_in(path):
 
 @pytest.mark.slow
 def test_a_run_becomes_a_mesh_that_dances(run, novel, call_export, tmp_path):
-    code, said = call_export(run, "--to", "glb", "--poses", novel, "--out", tmp_path / "a.GLB")
-    assert code == 0, said.err
+    call_export(run, "--to", "glb", "--poses", novel, "--out", tmp_path / "a.GLB")
     assert person_in(tmp_path / "a.GLB")
     assert [file.name for file in tmp_path.iterdir()] == ["a.GLB"]
 
 
 def test_a_mesh_dances_what_any_file_of_poses_says_also_without_xatlas(
-    package, novel, call_export, tmp_path, monkeypatch
+    package, novel, call, call_export, tmp_path, monkeypatch
 ):
     """AMASS's keys, which ia-play reads, say the same as our own."""
     monkeypatch.setattr("instant_avatar.export.find_spec", lambda name: None)
@@ -124,23 +123,18 @@ def test_a_mesh_dances_what_any_file_of_poses_says_also_without_xatlas(
     )
     out = tmp_path / "a.glb"
     words = package, "--to", "glb", "--triangles", 2000, "--poses", tmp_path / "amass.npz"
-    code, said = call_export(*words, "--out", out)
-    assert code == 0, said.err
-    assert "colors of vertices" in said.err
+    assert "colors of vertices" in call_export(*words, "--out", out)
     assert person_in(out)
     assert b"COLOR_0" in out.read_bytes()
     assert len(read_poses(out)) == len(ours)
-    code, said = call_export(*words, "--out", out, "--overwrite", "--person", "7")
-    assert code == 2
-    assert "7" in said.err
+    assert "7" in call(export, *words, "--out", out, "--overwrite", "--person", "7").refusal()
 
 
 def test_a_mesh_of_few_triangles_has_a_texture(package, call_export, tmp_path):
     pytest.importorskip("xatlas")
     out = tmp_path / "few.gltf"
-    code, said = call_export(package, "--to", "glb", "--triangles", 2000, "--out", out)
-    assert code == 0, said.err
-    assert "2,000 triangles" in said.err
+    said = call_export(package, "--to", "glb", "--triangles", 2000, "--out", out)
+    assert "2,000 triangles" in said
     mesh = person_in(out)
     assert len(mesh.faces) == 2000
     assert mesh.visual.kind == "texture"
@@ -165,8 +159,7 @@ def test_validators_and_three_vrm_have_nothing_to_say(run, film, call_export, tm
         "few.gltf": ("--to", "glb", *few),
     }
     for name, words in wanted.items():
-        code, said = call_export(run / "avatar.iavatar", *words, "--out", tmp_path / name)
-        assert code == 0, said.err
+        call_export(run / "avatar.iavatar", *words, "--out", tmp_path / name)
     command = [NODE, "--input-type=module", "--eval", VALIDATE]
     command += [str(tmp_path / name) for name in wanted]
     done = subprocess.run(command, cwd=PACKAGES, capture_output=True, text=True, timeout=300)
@@ -180,8 +173,7 @@ def test_validators_and_three_vrm_have_nothing_to_say(run, film, call_export, tm
 @pytest.mark.parametrize("name", ["A.PLY", pytest.param("a.OBJ", marks=pytest.mark.slow)])
 def test_a_package_becomes_a_still_mesh_in_color(run, call_export, tmp_path, name):
     out = tmp_path / name
-    code, said = call_export(run / "avatar.iavatar", "--to", name[2:].lower(), "--out", out)
-    assert code == 0, said.err
+    call_export(run / "avatar.iavatar", "--to", name[2:].lower(), "--out", out)
     mesh = trimesh.load(out)
     assert len(mesh.faces) > 10_000
     assert mesh.visual.kind == "vertex"
@@ -191,9 +183,7 @@ def test_a_package_becomes_a_still_mesh_in_color(run, call_export, tmp_path, nam
 
 def test_splats_stand_in_the_pose_of_a_file(package, player, novel, call_export, tmp_path):
     out = tmp_path / "a.ply"
-    code, said = call_export(package, "--to", "splats", "--poses", novel, "--out", out)
-    assert code == 0, said.err
-    assert "Gaussians" in said.err
+    assert "Gaussians" in call_export(package, "--to", "splats", "--poses", novel, "--out", out)
     head, rows = out.read_bytes().split(b"end_header\n", 1)
     columns = np.frombuffer(rows, "<f4").reshape(-1, head.count(b"property float"))
     gaussians = KDTree(columns[:, :3] * [1.0, -1.0, -1.0])
@@ -223,10 +213,8 @@ def test_splats_stand_in_the_pose_of_a_file(package, player, novel, call_export,
     ],
 )
 def test_what_cannot_be_exported_is_refused_and_writes_nothing(
-    run, package, call_export, tmp_path, monkeypatch, line, told
+    run, package, call, tmp_path, monkeypatch, line, told
 ):
     monkeypatch.chdir(tmp_path)
-    code, said = call_export(*line.format(run=run, package=package).split())
-    assert code == 2
-    assert told in said.err
+    assert told in call(export, *line.format(run=run, package=package).split()).refusal()
     assert list(tmp_path.iterdir()) == []

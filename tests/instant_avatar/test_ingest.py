@@ -155,42 +155,31 @@ def test_the_page_needs_nothing_else(run):
     assert "<svg" in page
 
 
-def test_an_older_run_is_not_lost_by_accident_but_replaced_with_overwrite(
+def test_a_run_goes_on_where_it_stopped_and_is_not_lost_by_accident(
     capture, call_ingest, without_baking, tmp_path, changed
 ):
     """Lost poses are left out and listed."""
-    run = RunFolder(path=tmp_path / "run")
-    run.start_run(resume=False)
-    write_text_atomically(run.report_json, "{}")
-    outcome = call_ingest(capture, *FEW, "--out", run.path)
-    assert outcome.code == 2
-    assert "--overwrite" in outcome.complaint()
-    assert run.report_json.read_text() == "{}"
+    run, copy = RunFolder(path=tmp_path / "run"), tmp_path / "copy.json"
+    run.start_run(resume=False)  # as of a run that was killed at its start
     with np.load(capture / "poses.npz") as archive:
         places = archive["transl"].copy()
     places[[3, 7]] = np.nan
     changed(capture / "poses.npz", transl=places)
-    copy = tmp_path / "copy.json"
-    outcome = call_ingest(capture, *FEW, "--out", run.path, "--overwrite", "--json", copy)
-    assert outcome.code == 0
+    words = (capture, *FEW[:2], "--out", run.path)
+    assert "No checkpoint" in call_ingest(*words, "--resume", "--json", copy).err
+    assert {path.name for path in tmp_path.iterdir()} == {"capture", "run", "copy.json"}
     assert copy.read_text() == run.report_json.read_text()
-    report = json.loads(copy.read_text())
-    assert report["format"] == 1
-    assert report["frames"]["dropped"] == [
+    first = json.loads(copy.read_text())
+    assert first["format"] == 1
+    assert first["frames"]["dropped"] == [
         {"index": 3, "reason": "pose invalid"},
         {"index": 7, "reason": "pose invalid"},
     ]
-    assert report["frames"]["read"] == 8
-    assert {path.name for path in tmp_path.iterdir()} == {"capture", "run", "copy.json"}
-
-
-def test_a_run_goes_on_where_it_stopped(capture, call_ingest, without_baking, tmp_path):
-    out = tmp_path / "run"
-    RunFolder(path=out).start_run(resume=False)  # as of a run that was killed at its start
-    assert "No checkpoint" in call_ingest(capture, *FEW[:2], "--out", out, "--resume").err
-    first = json.loads((out / "report.json").read_text())
-    outcome = call_ingest(capture, *FEW[:2], "--out", out, "--resume", steps=15)
-    second = json.loads((out / "report.json").read_text())
+    assert first["frames"]["read"] == 8
+    assert "--overwrite" in call_ingest(*words).refusal()
+    assert copy.read_text() == run.report_json.read_text()
+    outcome = call_ingest(*words, "--resume", steps=15)
+    second = json.loads(run.report_json.read_text())
     assert outcome.code == 0
     assert (first["training"]["steps"], second["training"]["steps"]) == (10, 15)
     assert second["training"]["wall_seconds"] > first["training"]["wall_seconds"]
@@ -233,19 +222,23 @@ def test_a_full_disk_keeps_the_checkpoint_before(
     [(True, "can be played", {"avatar.iavatar", LIST}), (False, "Nothing was written", set())],
 )
 def test_a_disk_that_is_full_from_the_start_leaves_the_package_if_that_fits(
-    capture, call_ingest, without_baking, tmp_path, monkeypatch, fits, word, left
+    film, call_ingest, without_baking, tmp_path, monkeypatch, fits, word, left
 ):
+    """Of the older run, which is overwritten, nothing is left."""
+    run = RunFolder(path=tmp_path / "run")
+    run.start_run(resume=False)
+    write_text_atomically(run.report_json, "{}")
+
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(torch, "save", full)
     if not fits:
         monkeypatch.setattr(snapshot_writer, "export_avatar", full)
-    outcome = call_ingest(capture, *FEW, "--out", tmp_path / "run")
+    outcome = call_ingest(film, *FEW, "--out", run.path, "--overwrite")
     assert outcome.code == 3
     assert word in outcome.complaint()
-    assert {file.name for file in (tmp_path / "run").rglob("*")} == left
-    assert (tmp_path / "run").exists() == fits
+    assert {file.name for file in run.path.rglob("*")} == left
 
 
 @pytest.mark.slow

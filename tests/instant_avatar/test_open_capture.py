@@ -23,13 +23,13 @@ from preprocess.poses.motion_builder import MotionByPerson, build_motion, place_
 from preprocess.poses.pose_format_registry import TRACKERS, read_poses
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def own(film) -> Capture:
     """The film with its own poses, in the world."""
     return open_capture(CaptureInputs(video=film))
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def in_camera(own) -> tuple[np.ndarray, np.ndarray]:
     """Rotation matrices and places of the film's poses in its camera."""
     camera, pelvis = own.cameras[0].camera_from_world, own.shaped.body.joints[0]

@@ -90,13 +90,6 @@ def test_only_this_machine_is_answered():
 
 
 @in_browser
-def test_the_browser_draws_the_golden_frames_again(page):
-    found = page.run("player.verify()", seconds=240.0)
-    assert len(found) > 0
-    assert all(frame["alike"] for frame in found), found
-
-
-@in_browser
 @pytest.mark.parametrize("subdivision", [1, 2])
 def test_the_browser_decodes_the_tables_that_python_decodes(page, package, subdivision):
     found = page.run(
@@ -167,10 +160,16 @@ def test_the_browser_draws_what_the_player_draws(page, package, novel):
 
 @in_browser
 def test_the_page_plays_pauses_turns_and_zooms(page):
-    page.run("document.getElementById('picture').focus()")
     until(lambda: moves(page), 30.0)
     paused(page)
     front = drawn(page)
+    page.run("document.activeElement.blur()")
+    for _ in range(3):
+        page.press("ArrowLeft")  # also where nothing was clicked
+    until(lambda: (drawn(page) != front).mean() > 0.01, 30.0)
+    page.press("Home")
+    until(lambda: np.array_equal(drawn(page), front), 30.0)
+    page.run("document.getElementById('picture').focus()")
     rows, columns = np.flatnonzero(front.any(axis=1)), np.flatnonzero(front.any(axis=0))
     assert len(rows) > 0.6 * front.shape[0]  # a person upright in the middle
     assert abs(columns.mean() - SIZE[0] / 2.0) < 0.1 * SIZE[0]
@@ -222,18 +221,6 @@ def test_the_page_is_dark_for_those_who_like_it_and_fits_a_phone(page):
     finally:
         page.emulate(scheme="light", size=SIZE)
     until(lambda: page.picture()[70, 10].min() > 200, 30.0)
-
-
-@in_browser
-def test_keys_turn_it_before_anything_was_clicked(page):
-    paused(page)
-    page.run("document.activeElement.blur()")
-    before = drawn(page)
-    for _ in range(3):
-        page.press("ArrowLeft")
-    until(lambda: (drawn(page) != before).mean() > 0.01, 30.0)
-    page.press("Home")
-    until(lambda: np.array_equal(drawn(page), before), 30.0)
 
 
 @in_browser
@@ -313,6 +300,7 @@ def test_an_isolated_page_draws_with_more_threads_where_they_pay(
         until(lambda: browser.run("player.engine.graphs.threads") == threads, 120.0)
         until(lambda: browser.worker_threads() == 1 + threads, 60.0)
         found = browser.run("player.verify()", seconds=240.0)
+        assert found, "no golden frames"
         assert all(frame["alike"] for frame in found), found
 
 
@@ -417,19 +405,3 @@ def test_a_page_replaces_a_page(call_play, package, tmp_path):
     assert (out / "runtime" / "LICENSE").is_file()
     assert (out / "runtime" / "ort.js").is_file()
     assert not list(out.rglob("*.mjs"))  # which many hosts do not serve as a script
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--web", "0"], "but must be a port"),
-        (["--web", "--bench"], "--bench"),
-        (["--web", "--tier", "lite"], "--tier"),
-        (["--web", "--size", "200"], "--size"),
-        (["--web", "--camera", "cameras.npz"], "--camera"),
-    ],
-)
-def test_what_the_page_cannot_do_is_refused(call_play, package, words, said):
-    outcome = call_play(package, *words)
-    assert outcome.code == 2
-    assert said in outcome.complaint("ia-play")

@@ -61,33 +61,29 @@ def records(out: Path) -> list[dict]:
     ],
 )
 def test_what_cannot_be_done_is_refused_before_anything_starts(
-    tmp_path, monkeypatch, capsys, words, message
+    tmp_path, monkeypatch, call, words, message
 ):
     (tmp_path / "films").mkdir()
     (tmp_path / "films" / "a.mp4").write_text("no video")
     (tmp_path / "empty").mkdir()
     monkeypatch.chdir(tmp_path)
-    assert batch.main(words) == 2
-    err = capsys.readouterr().err
-    assert message in err
-    assert "Traceback" not in err
+    assert message in call(batch, *words).refusal()
     assert not (tmp_path / "o").exists()
 
 
-def test_without_ray_it_says_what_to_install(monkeypatch, capsys):
+def test_without_ray_it_says_what_to_install(monkeypatch, call):
     monkeypatch.setattr(command_line, "find_spec", lambda module: None if module == "ray" else True)
-    assert batch.main(["films", "--out", "o"]) == 2
-    assert "[learn,cluster]" in capsys.readouterr().err
+    assert "[learn,cluster]" in call(batch, "films", "--out", "o").refusal()
 
 
-def test_where_ray_does_not_start_one_line_says_so(tmp_path, copies, monkeypatch, capsys):
+def test_where_ray_does_not_start_one_line_says_so(tmp_path, copies, monkeypatch, call):
     def init(**_):
         raise Exception("The current node timed out during startup.")
 
     copies(tmp_path / "films", ["a"])
     monkeypatch.setitem(sys.modules, "ray", SimpleNamespace(init=init, __spec__=True))
-    assert batch.main([str(tmp_path / "films"), "--out", str(tmp_path / "out")]) == 2
-    assert "Ray did not start on this machine (The current" in capsys.readouterr().err
+    refusal = call(batch, tmp_path / "films", "--out", tmp_path / "out").refusal()
+    assert "Ray did not start on this machine (The current" in refusal
 
 
 def test_a_broken_capture_costs_a_line_and_what_ended_is_not_learnt_again(
@@ -125,7 +121,7 @@ def test_ctrl_c_keeps_what_is_done(tmp_path, copies, scripted, monkeypatch):
     assert scripted == ["b"]
 
 
-def call(*words: object, **environment: str) -> subprocess.CompletedProcess:
+def run_batch(*words: object, **environment: str) -> subprocess.CompletedProcess:
     """Run ia-batch in a process of its own."""
     command = [sys.executable, "-m", "instant_avatar.batch", *map(str, words)]
     environment = {**os.environ, "RAY_worker_niceness": "0", **environment}
@@ -142,7 +138,9 @@ def test_ray_learns_captures_though_one_is_broken_and_a_process_is_killed(tmp_pa
     (tmp_path / "kill").touch()
     path = os.pathsep.join([str(tmp_path / "hook"), str(ROOT)])
     words = [tmp_path / "films", "--out", tmp_path / "out", "--cores", "1", "--retries", "1"]
-    first = call(*words, "--", "--steps", "60", PYTHONPATH=path, KILL_ONCE=str(tmp_path / "kill"))
+    first = run_batch(
+        *words, "--", "--steps", "60", PYTHONPATH=path, KILL_ONCE=str(tmp_path / "kill")
+    )
     assert first.returncode == 1, first.stderr
     assert not (tmp_path / "kill").exists()
     ends = {r["capture"]: r for r in records(tmp_path / "out")}
@@ -153,7 +151,7 @@ def test_ray_learns_captures_though_one_is_broken_and_a_process_is_killed(tmp_pa
     kept = {"avatar.iavatar", "ingest.log", "report.html", "report.json", "turning.webp"}
     for name in "ab":
         assert kept <= set(os.listdir(tmp_path / "out" / name))
-    again = call(*words, "--", "--steps", "60", PYTHONPATH=path)
+    again = run_batch(*words, "--", "--steps", "60", PYTHONPATH=path)
     assert again.returncode == 1, again.stderr
     assert len(records(tmp_path / "out")) == 3
 
@@ -161,7 +159,7 @@ def test_ray_learns_captures_though_one_is_broken_and_a_process_is_killed(tmp_pa
 @pytest.mark.slow
 def test_a_capture_that_fits_no_node_is_bad_input(tmp_path, copies):
     copies(tmp_path / "films", ["bad"])
-    done = call(tmp_path / "films", "--out", tmp_path / "out", "--memory", "100000")
+    done = run_batch(tmp_path / "films", "--out", tmp_path / "out", "--memory", "100000")
     assert done.returncode == 2, done.stderr
     assert "--memory" in done.stderr
     assert "Traceback" not in done.stderr

@@ -4,6 +4,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from contextlib import contextmanager
 
 import av
 import numpy as np
@@ -55,20 +56,29 @@ def camera_flags(path):
     ]  # fmt: skip
 
 
+@contextmanager
+def opened(folder, port, *, size=(360, 740), flags=()):
+    """A browser that has entered the page, and the queue of its films."""
+    queue, access = FilmQueue(folder / "out", 30.0), AccessControl()
+    queue.folder.mkdir(exist_ok=True)
+    server = PhoneServer(queue, access, None)
+    server.start("127.0.0.1", [(port, None)])
+    with Browser(folder / "browser", size=size, flags=list(flags)) as browser:
+        browser.emulate(scheme="light", size=size)
+        browser.go(f"http://127.0.0.1:{port}/?token={access.token}")
+        until(lambda: browser.run("!!document.getElementById('live')?.onclick"), 60.0)
+        yield browser, queue
+    server.close()
+
+
 def test_an_upright_camera_is_not_cropped(tmp_path):
     write_camera_film(tmp_path / "camera.mjpeg", [np.full((1280, 720, 3), 90, np.uint8)] * 8)
-    queue, access = FilmQueue(tmp_path / "out", 30.0), AccessControl()
-    queue.folder.mkdir()
-    server = PhoneServer(queue, access, None)
-    server.start("127.0.0.1", [(8747, None)])
-    with Browser(tmp_path / "browser", flags=camera_flags(tmp_path / "camera.mjpeg")) as browser:
-        browser.go(f"http://127.0.0.1:8747/?token={access.token}")
-        until(lambda: browser.run("!!document.getElementById('live')?.onclick"), 60.0)
+    flags = camera_flags(tmp_path / "camera.mjpeg")
+    with opened(tmp_path, 8747, flags=flags) as (browser, _):
         browser.click("Film here, with advice")
         width, height = (f"document.getElementById('camera').video{s}" for s in ("Width", "Height"))
         until(lambda: browser.run(width), 60.0)
         assert (browser.run(width), browser.run(height)) == (720, 1280)
-    server.close()
 
 
 def test_the_plain_page_leads_to_that_with_tls_and_opens_again_after_it(tmp_path):
@@ -92,17 +102,12 @@ def test_the_plain_page_leads_to_that_with_tls_and_opens_again_after_it(tmp_path
 @pytest.fixture
 def page(run, tmp_path):
     """A page of 360 px with an earlier avatar, Anna, and the queue of its films."""
-    queue, access = FilmQueue(tmp_path / "out", 30.0), AccessControl()
-    (queue.folder / "Anna" / "run").mkdir(parents=True)
-    shutil.copy(run / "avatar.iavatar", queue.folder / "Anna" / "run")
-    server = PhoneServer(queue, access, None)
-    server.start("127.0.0.1", [(8745, None)])
-    with Browser(tmp_path / "browser", size=(360, 740)) as browser:
-        browser.emulate(scheme="light", size=(360, 740))
-        browser.go(f"http://127.0.0.1:8745/?token={access.token}")
+    place = tmp_path / "out" / "Anna" / "run"
+    place.mkdir(parents=True)
+    shutil.copy(run / "avatar.iavatar", place)
+    with opened(tmp_path, 8745) as (browser, queue):
         until(lambda: "Anna" in browser.text(), 60.0)
         yield browser, queue
-    server.close()
 
 
 def choose_video(browser, size=4):
@@ -254,17 +259,12 @@ def test_a_page_that_is_loaded_again_goes_on_with_a_file(page, run):
 
 
 def test_a_page_that_is_loaded_again_keeps_what_it_filmed(camera_film, tmp_path):
-    queue, access = FilmQueue(tmp_path / "out", 30.0), AccessControl()
-    queue.folder.mkdir()
-    server = PhoneServer(queue, access, None)
-    server.start("127.0.0.1", [(8749, None)])
-    with Browser(tmp_path / "browser", flags=camera_flags(camera_film)) as browser:
-        browser.go(f"http://127.0.0.1:8749/?token={access.token}")
-        until(lambda: browser.run("!!document.getElementById('live')?.onclick"), 60.0)
+    flags = camera_flags(camera_film)
+    with opened(tmp_path, 8749, size=(1200, 800), flags=flags) as (browser, queue):
         browser.click("Film here, with advice")
         film = queue.take_next(60.0)
         until(lambda: film.file.received > 50_000, 60.0)
-        browser.go(f"http://127.0.0.1:8749/?token={access.token}")  # the tab was closed
+        browser.go("http://127.0.0.1:8749/")  # the tab was closed
         until(lambda: "while it filmed avatar" in browser.text(), 60.0)
         film.tell("seconds", seconds=7.0)
         film.tell("map", svg="", seen=0.44)
@@ -278,7 +278,6 @@ def test_a_page_that_is_loaded_again_keeps_what_it_filmed(camera_film, tmp_path)
         until(lambda: "Making the avatar" in browser.text(), 60.0)
         assert film.file.ended
         assert film.file.received == film.file.path.stat().st_size == received
-    server.close()
 
 
 def test_a_film_of_the_pages_camera_becomes_an_avatar_in_its_player(camera_film, tmp_path):

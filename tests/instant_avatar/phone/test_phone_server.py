@@ -342,33 +342,29 @@ def anna(queue, run):
 
 
 @pytest.mark.slow
-def test_an_avatar_is_saved_under_a_name_in_any_script(phone, queue, run):
+def test_an_avatar_is_saved_for_other_programs_under_a_name_in_any_script(
+    phone, queue, run, capsys
+):
     place = queue.folder / "Zoë-さくら" / "run"
     place.mkdir(parents=True)
     shutil.copy(run / "avatar.iavatar", place)
     name = quote("Zoë-さくら")
-    answer = phone.ask("GET", f"/avatars/{name}/avatar.iavatar")
-    saved = f"attachment; filename*=UTF-8''{name}.iavatar"
-    assert answer.headers["Content-Disposition"] == saved
 
-
-@pytest.mark.slow
-def test_an_avatar_is_saved_as_vrm_with_the_author_who_was_named(phone, anna):
-    for query, author in (("?author=Ann%20M.", "Ann M."), ("?author=", "unknown")):
-        answer = phone.ask("GET", f"/avatars/Anna/avatar.vrm{query}")
+    def saved(ending, query=""):
+        answer = phone.ask("GET", f"/avatars/{name}/avatar.{ending}{query}")
         assert answer.status == 200
-        assert answer.headers["Content-Disposition"] == "attachment; filename*=UTF-8''Anna.vrm"
-        length = int.from_bytes(answer.content[12:16], "little")
-        scene = json.loads(answer.content[20 : 20 + length])
+        kept_as = f"attachment; filename*=UTF-8''{name}.{ending}"
+        assert answer.headers["Content-Disposition"] == kept_as
+        return answer.content
+
+    assert saved("iavatar") == (place / "avatar.iavatar").read_bytes()
+    for query, author in (("?author=Ann%20M.", "Ann M."), ("?author=", "unknown")):
+        content = saved("vrm", query)
+        length = int.from_bytes(content[12:16], "little")
+        scene = json.loads(content[20 : 20 + length])
         assert scene["extensions"]["VRMC_vrm"]["meta"]["authors"] == [author]
-
-
-@pytest.mark.slow
-def test_an_avatar_is_saved_as_splats(phone, anna, capsys):
-    answer = phone.ask("GET", "/avatars/Anna/avatar.spz")
-    assert answer.status == 200
+    assert gzip.decompress(saved("spz")).startswith(b"NGSP")
     assert capsys.readouterr().err == ""  # no path of a file that is gone
-    assert gzip.decompress(answer.content).startswith(b"NGSP")
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from benchmarks.camera_accuracy import fit_similarity
 from capture.input_error import InputError
 from export.bake.bake_tables import ExportRefused
 from instant_avatar.run import run_capture
-from instant_avatar.studio.shoot import ShootConfig, film_capture
+from instant_avatar.studio.shoot import ShootConfig
 from preprocess.cameras.camera_file import read_cameras, write_cameras
 from preprocess.capture_inputs import CaptureInputs
 from preprocess.capture_session import Capture
@@ -23,6 +23,7 @@ from preprocess.sfm.camera_solver import (
     make_person_mask,
     solve_capture_cameras,
 )
+from tests.instant_avatar.conftest import film_without_novel_views
 
 FRAMES = 14
 
@@ -31,7 +32,7 @@ FRAMES = 14
 def walkaround(tmp_path_factory) -> Path:
     """A phone is carried around the actor; where it was, only truth/ knows."""
     folder = tmp_path_factory.mktemp("walkaround") / "capture"
-    film_capture(
+    film_without_novel_views(
         folder, ShootConfig(frames=FRAMES, size=256, motion="walkaround", background="room")
     )
     return folder

@@ -204,17 +204,16 @@ def test_the_viewer_reads_events_pauses_and_saves(
     assert list(dict.fromkeys(kinds)) == list(KINDS)
 
 
-def test_view_without_viser_says_how_to_get_it(film, tmp_path, monkeypatch, capsys):
+def test_view_without_viser_says_how_to_get_it(film, tmp_path, monkeypatch, call):
     found = importlib.util.find_spec
     monkeypatch.setattr(
         importlib.util,
         "find_spec",
         lambda name, *more: None if name == "viser" else found(name, *more),
     )
-    assert ingest.main([str(film), "--out", str(tmp_path / "run"), "--view"]) == 2
-    said = capsys.readouterr().err
-    assert "viser is not installed" in said
-    assert "[viewer]" in said
+    refusal = call(ingest, film, "--out", tmp_path / "run", "--view").refusal()
+    assert "viser is not installed" in refusal
+    assert "[viewer]" in refusal
     assert not (tmp_path / "run").exists()
 
 

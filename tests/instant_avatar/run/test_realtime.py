@@ -13,12 +13,12 @@ from preprocess import capture_session
 
 
 @pytest.fixture
-def play(call_ingest, without_baking, tmp_path):
+def play(call, on_one_core, without_baking, tmp_path):
     """Runs ia-ingest --realtime; returns its report."""
 
     def play(capture, *arguments):
-        words = [str(capture), "--realtime", "--out", str(tmp_path / "run"), *arguments]
-        assert ingest.main(words) == 0
+        ended = call(ingest, capture, "--realtime", "--out", tmp_path / "run", *arguments)
+        assert ended.code == 0, ended.err
         return json.loads((tmp_path / "run" / "report.json").read_text())
 
     return play
@@ -38,14 +38,6 @@ def test_a_played_video_is_learnt_while_it_lasts_and_none_of_it_is_lost(play, fi
     assert stream["ready_after_last_frame_seconds"] > 0.0
 
 
-@pytest.mark.slow
-def test_seconds_beyond_the_clip_are_used_after_it(play, film):
-    report = play(film, "--seconds", "1.6")
-    assert report["recipe"]["seconds"] == 1.6
-    assert report["training"]["wall_seconds"] >= 1.6
-    assert report["frames"]["read"] == 24
-
-
 @pytest.fixture
 def waits(monkeypatch):
     """What is waited for frames from now on, seconds; time stands still but in these waits."""
@@ -57,7 +49,10 @@ def waits(monkeypatch):
 
 @pytest.mark.slow
 def test_what_a_resumed_run_saw_before_is_not_played_again(play, film, request):
+    """Of the clip, which lasts 0.4 s; more seconds are used after it."""
     before = play(film, "--frames", ":12", "--seconds", "0.5")
+    assert before["recipe"]["seconds"] == 0.5
+    assert before["training"]["wall_seconds"] >= 0.5
     waits = request.getfixturevalue("waits")
     report = play(film, "--seconds", "0.9", "--resume")
     assert report["frames"]["read"] == 24

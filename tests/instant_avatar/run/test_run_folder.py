@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from avatar.training import checkpoint
-from capture.atomic_files import LIST_NAME, write_text_atomically
+from capture.atomic_files import write_text_atomically
 from capture.input_error import InputError
 from instant_avatar import ingest
 from instant_avatar.cli.console import Console
@@ -72,19 +72,6 @@ def test_the_names_of_a_checkpoint_are_those_that_are_written():
     }  # fmt: skip
 
 
-def test_overwriting_a_run_keeps_what_the_user_put_there(tmp_path):
-    run = begun(tmp_path / "run")
-    (run.path / "notes.txt").write_text("mine")
-    (run.checkpoint / "other.pt").write_text("mine")
-    check(run, "resume")
-    run.start_run(resume=True)
-    assert run.has_checkpoint()
-    check(run, "overwrite")
-    run.start_run(resume=False)
-    assert set(os.listdir(run.path)) == {"checkpoint", "notes.txt", LIST_NAME}
-    assert set(os.listdir(run.checkpoint)) == {"other.pt", LIST_NAME}
-
-
 def test_an_empty_run_folder_is_removed_and_one_of_the_user_stays(tmp_path):
     (tmp_path / "mine").mkdir()
     for name in ("runs/run", "mine"):
@@ -121,9 +108,9 @@ def test_a_run_does_not_replace_what_ia_track_wrote(tmp_path):
         check(RunFolder(path=tmp_path), "overwrite")
 
 
-def test_resuming_needs_a_run_and_no_other_flag(film, tmp_path, capsys):
-    assert ingest.main([str(film), "--out", str(tmp_path / "typo"), "--resume"]) == 2
-    assert "No run to --resume in" in capsys.readouterr().err
+def test_resuming_needs_a_run_and_no_other_flag(film, tmp_path, call):
+    refusal = call(ingest, film, "--out", tmp_path / "typo", "--resume").refusal()
+    assert "No run to --resume in" in refusal
     assert os.listdir(tmp_path) == []
     run = RunFolder(path=tmp_path / "killed")
     with run.claim(Console(), resume=False, overwrite=False):
@@ -135,10 +122,11 @@ def test_resuming_needs_a_run_and_no_other_flag(film, tmp_path, capsys):
 # --- its lock ---------------------------------------------------------------------------------
 
 
-def test_a_second_run_into_a_folder_is_refused_while_the_first_goes_on(film, tmp_path, capsys):
+def test_a_second_run_into_a_folder_is_refused_while_the_first_goes_on(film, tmp_path, call):
     with claim_folder(tmp_path, Console()):
-        assert ingest.main([str(film), "--out", str(tmp_path), "--overwrite"]) == 3
-    assert "--out" in capsys.readouterr().err
+        ended = call(ingest, film, "--out", tmp_path, "--overwrite")
+    assert ended.code == 3
+    assert "--out" in ended.complaint()
     with claim_folder(tmp_path, Console()):
         pass
     assert os.listdir(tmp_path) == []

@@ -67,8 +67,19 @@ def learn(capture, call_ingest, without_baking, tmp_path):
     return learn
 
 
-def test_a_reader_of_a_few_lines_learns_all_about_a_run(learn, tmp_path, capsys):
+@pytest.fixture
+def drawn(monkeypatch):
+    """Animations that are drawn of packages."""
+    drawn = []
+    monkeypatch.setattr(report_writer, "demo_animation", lambda player: drawn.append(0) or b"")
+    return drawn
+
+
+def test_a_reader_of_a_few_lines_learns_all_about_a_run(
+    learn, drawn, tmp_path, monkeypatch, capsys
+):
     """Package and page are there before scores are made, and the call returns both."""
+    monkeypatch.setattr(snapshot_writer, "export_avatar", write_twice)
     page, unscored = tmp_path / "run" / "report.html", []
 
     def read(event):
@@ -91,13 +102,18 @@ def test_a_reader_of_a_few_lines_learns_all_about_a_run(learn, tmp_path, capsys)
     assert counts["Stepped"] == 10
     assert counts["FrameArrived"] == 12
     names = [event["event"] for event in events]
-    ends = ["Finished", "PackageWritten", "Scored", "Ended"]
+    ends = ["Finished", "PackageWritten", "PackageWritten", "Scored", "Ended"]
     assert [name for name in names if name in ends] == ends
-    (package,) = (event for event in events if event["event"] == "PackageWritten")
-    assert package["path"] == "avatar.iavatar"
+    packages = [event for event in events if event["event"] == "PackageWritten"]
+    assert [(each["path"], each["is_final"]) for each in packages] == [
+        ("avatar.iavatar", False), ("avatar.iavatar", True)
+    ]  # fmt: skip
+    assert avatar.report["package"]["bytes"] == 8  # scores are stored in the finer one
+    assert avatar.package.read_bytes() == b"aa"
+    assert len(drawn) == 1  # of this avatar fine-tuning does not show
 
 
-def write_twice(avatar, path, *, progress, psnr_db=(40.0, 40.0), **options):
+def write_twice(avatar, path, *, progress, psnr_db=(40.0, 45.0), **options):
     """Writes a package, and then one that is fine-tuned, as `export_avatar` does."""
     for number in range(2):
         if number:
@@ -125,20 +141,12 @@ def test_the_package_as_baked_stays_if_the_fine_tuned_one_is_refused(learn, monk
     assert avatar.report["package"] is not None
 
 
-@pytest.mark.parametrize(
-    ("psnr_db", "drawings"),
-    [((40.0, 45.0), 1), pytest.param((34.0, 37.0), 2, marks=pytest.mark.slow)],
-)
-def test_the_animation_is_drawn_again_only_where_fine_tuning_shows(
-    learn, monkeypatch, psnr_db, drawings
-):
-    drawn = []
-    monkeypatch.setattr(snapshot_writer, "export_avatar", partial(write_twice, psnr_db=psnr_db))
-    monkeypatch.setattr(report_writer, "demo_animation", lambda player: drawn.append(0) or b"")
-    avatar = learn()
-    assert len(drawn) == drawings
-    assert avatar.report["package"]["bytes"] == 8  # scores are stored in the finer one
-    assert avatar.package.read_bytes() == b"aa"
+@pytest.mark.slow
+def test_the_animation_is_drawn_again_where_fine_tuning_shows(learn, drawn, monkeypatch):
+    finer = partial(write_twice, psnr_db=(34.0, 37.0))
+    monkeypatch.setattr(snapshot_writer, "export_avatar", finer)
+    learn()
+    assert len(drawn) == 2
 
 
 @pytest.mark.parametrize("when", ["first", pytest.param("final", marks=pytest.mark.slow)])

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from instant_avatar import sample
 from instant_avatar.studio.shoot import ShootConfig, film_capture
 from preprocess.body.kinematics import axis_angles_from_matrices, rotation_matrices
 from preprocess.body.parametric_body import load_body_model
@@ -13,7 +14,6 @@ from preprocess.observation import Observation
 from preprocess.open_capture import open_capture
 from preprocess.poses.pose_format_registry import read_poses
 
-pytestmark = pytest.mark.slow  # tests/instant_avatar/test_sample.py films one, too
 FRAMES = 24
 PHONE = ShootConfig(frames=FRAMES, size=72, subject=3, like_a_phone=True)
 
@@ -33,6 +33,15 @@ def mean_joint_error_deg(one, other):
     return float(np.rad2deg(np.linalg.norm(vectors, axis=-1)).mean())
 
 
+def test_the_command_names_no_preview(call, tmp_path):
+    ended = call(sample, tmp_path / "c", "--like-a-phone", "--frames", 2, "--size", 36)
+    assert ended.code == 0, ended.err
+    assert "preview" not in ended.err
+    assert "--poses" in ended.err
+    assert (tmp_path / "c" / "truth" / "body.npz").exists()
+
+
+@pytest.mark.slow
 def test_poses_are_off_by_some_degrees_the_focal_length_by_a_tenth_and_masks_a_little(capture):
     given, truth = (read_poses(folder / "poses.npz") for folder in (capture, capture / "truth"))
     errors = [mean_joint_error_deg(given[i], truth[i]) for i in range(FRAMES)]
@@ -51,6 +60,7 @@ def test_poses_are_off_by_some_degrees_the_focal_length_by_a_tenth_and_masks_a_l
     assert 0.85 < np.minimum(given, exact).sum() / np.maximum(given, exact).sum() < 0.99
 
 
+@pytest.mark.slow
 def test_the_exact_twin_can_be_opened_and_so_can_the_novel_poses(capture):
     truth = capture / "truth"
     twin = CaptureInputs(

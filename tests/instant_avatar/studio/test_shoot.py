@@ -1,5 +1,6 @@
 """Filming the actor: a capture folder with ground truth, and the light on the actor."""
 
+import shlex
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from capture.atomic_files import LIST_NAME as LIST
 from capture.camera import Camera
 from capture.input_error import InputError
 from capture.source_opening import open_source
+from instant_avatar import sample
 from instant_avatar.studio import staging
 from instant_avatar.studio.actor import Actor
 from instant_avatar.studio.lighting import NO_FACE, rasterize
@@ -135,11 +137,16 @@ def test_given_poses_are_the_truth_without_noise_and_not_with_it_also_of_a_track
         ({"like_a_phone": True, "background": "room"}, "--like-a-phone"),
         ({"like_a_phone": True, "pose_noise_deg": 1.0}, "--like-a-phone"),
         ({"track": Path("track.npz"), "motion": "dance"}, "--track replaces the turn"),
+        ({"frames": 0}, "--frames"),
+        ({"size": 3}, "--size"),
+        ({"fps": np.nan}, "--fps"),
+        ({"mask_noise_px": -1.0}, "--mask-noise-px"),
     ],
 )
 def test_what_cannot_be_filmed_is_refused(tmp_path, wrong, told):
     with pytest.raises(InputError, match=told):
         film_capture(tmp_path / "c", ShootConfig(**wrong))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_video_is_exact_and_masks_fit_it(capture):
@@ -177,6 +184,19 @@ def test_the_same_seed_films_the_same_and_another_seed_does_not(capture, tmp_pat
     )
     assert first == again
     assert first != other
+
+
+def test_ia_sample_says_what_comes_next_and_replaces_its_own_folder_on_request(call, tmp_path):
+    out = tmp_path / "my [c]" / ("long" * 30)
+    words = (sample, out, "--frames", 2, "--size", 32, "--background", "plain")
+    ended = call(*words)
+    assert ended.code == 0, ended.err
+    assert (out / "video.mp4").exists()
+    assert shlex.split(ended.err.splitlines()[-1]) == [
+        "ia-ingest", str(out / "video.mp4"), "--poses", str(out / "poses.npz")
+    ]  # fmt: skip
+    assert "--overwrite" in call(*words).refusal()
+    assert call(*words, "--overwrite").code == 0
 
 
 SIZE = 40

@@ -13,12 +13,6 @@ from preprocess.tracking.first_look import CameraMotion, camera_motion, look_at
 from preprocess.tracking.video_tracking import TrackingProblem
 
 
-@pytest.fixture(scope="module")
-def frames(filmed):
-    """The frames of the actor's film, RGB."""
-    return [frame.rgb for frame in open_source(filmed / "video.mp4").frames()]
-
-
 @pytest.fixture
 def look(tmp_path):
     """Looks at a film of some frames, at a few a second, so that it lasts."""

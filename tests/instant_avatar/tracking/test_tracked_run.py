@@ -1,12 +1,19 @@
-"""ia-ingest of a video alone: the person is tracked first, or while the frames come."""
+"""ia-ingest without poses: the person is tracked first, or while the frames come."""
 
 import json
+import os
+import shutil
 import signal
+import threading
+import time
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
+from avatar.training import train
+from avatar.training.train import warm_up
 from capture.source_opening import open_source
 from capture.video_writer import H264, write_video
 from instant_avatar import ingest
@@ -18,26 +25,22 @@ from preprocess.capture_inputs import CaptureInputs
 from preprocess.masks.mask_refinement import MaskRefiner
 from preprocess.poses.pose_format_registry import read_poses
 from preprocess.tracking.blazepose import BlazePoseTracker
-from tests.instant_avatar.conftest import Outcome
 
 
 @pytest.fixture
-def ingest_video(video, tmp_path, capsys, on_one_core):
+def ingest_video(video, tmp_path, call_ingest):
     """Runs ia-ingest on the video in small; returns how it ended and the run's folder."""
 
-    def call(*words, steps=10):
+    def ingest_video(*words):
         out = tmp_path / "run"
-        named = ["--out", out, "--steps", steps, "--size", 96, *words]
-        code = ingest.main([str(word) for word in (video, *named)])
-        captured = capsys.readouterr()
-        return Outcome(code=code, out=captured.out, err=captured.err), out
+        return call_ingest(video, "--out", out, "--size", 96, *words), out
 
-    return call
+    return ingest_video
 
 
 @pytest.mark.usefixtures("without_baking")
 def test_a_video_alone_is_tracked_and_learnt(ingest_video, monkeypatch):
-    """But for a frame that is left out; each of the others takes a step, and a run goes on."""
+    """But for a frame that is left out; each of the others takes a step."""
     graded = person_tracking._grade
     monkeypatch.setattr(
         person_tracking, "_grade", lambda *parts: replace(graded(*parts), left_out=(3,))
@@ -56,36 +59,33 @@ def test_a_video_alone_is_tracked_and_learnt(ingest_video, monkeypatch):
     assert [frame["index"] for frame in report["frames"]["dropped"]] == [3]
     assert read_poses(out / "tracking" / "poses.npz").proportions is not None
     assert "Good enough for an avatar" in (out / "report.html").read_text()
-    # a resumed run reads the poses that it has, tracked before all of today's options were there
-    stored = json.loads((out / "tracking" / "grade.json").read_text())
-    assert stored["request"].keys() == {"video", "frames"}
-    stored["request"] |= {"masks": None, "person": None}
-    (out / "tracking" / "grade.json").write_text(json.dumps(stored))
-    monkeypatch.setattr(run_tracking, "track_person", None)
-    again, _ = ingest_video("--resume", steps=20)
-    assert again.code == 0, again.err
     frames = held_out_frames(RunFolder(path=out), None)
     assert frames.capture.paths.poses == out / "tracking" / "poses.npz"
     assert frames.poses == "tracked"
 
 
 @pytest.mark.usefixtures("without_baking")
-def test_a_refusal_names_its_cause_and_keeps_the_tracked_video(ingest_video, video, monkeypatch):
-    images = [frame.rgb[:180] for frame in open_source(video).frames()]
-    write_video(video, images, 30.0, H264)
+def test_a_refusal_names_its_cause_and_keeps_the_tracked_video(
+    ingest_video, video, frames, monkeypatch
+):
+    write_video(video, [frame[:180] for frame in frames], 30.0, H264)
     few = ("--frames", ":8", "--no-refine-poses")
     done, out = ingest_video(*few)
-    assert done.code == 2
     cut = "the person is cut by the picture's lower border"
+    assert f"no, because {cut} in 8 of 8 frames" in done.refusal()
+    assert str(out / "tracking" / "skeleton.mp4") in done.refusal()
+    assert "--poses" in done.refusal()
+    assert [path.name for path in out.iterdir() if path.name[0] != "."] == ["tracking"]
     assert f"doubtful: 0.0 to 0.2 s: {cut}" in done.err
-    assert f"no, because {cut} in 8 of 8 frames" in done.complaint()
-    assert str(out / "tracking" / "skeleton.mp4") in done.complaint()
     assert open_source(out / "tracking" / "skeleton.mp4").frames_in_file == 8
-    # what was tracked is used again, but not without being asked
+    # what was tracked, before all of today's options were there, is used again where that is wanted
+    stored = json.loads((out / "tracking" / "grade.json").read_text())
+    assert stored["request"].keys() == {"video", "frames"}
+    stored["request"] |= {"masks": None, "person": None}
+    (out / "tracking" / "grade.json").write_text(json.dumps(stored))
     monkeypatch.setattr(run_tracking, "track_person", None)
     again, _ = ingest_video(*few, "--resume")
-    assert again.code == 2
-    assert cut in again.complaint()
+    assert cut in again.refusal()
     forced, _ = ingest_video(*few, "--resume", "--force")
     assert forced.code == 0, forced.err
 
@@ -147,27 +147,109 @@ def test_given_poses_replace_tracked_ones(ingest_video, filmed):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("without_baking")
-def test_a_video_played_at_its_own_speed_is_tracked_meanwhile(ingest_video, monkeypatch):
-    done, out = ingest_video("--realtime")
+def test_a_video_played_at_its_own_speed_is_tracked_meanwhile_and_learnt_from_given_masks(
+    ingest_video, filmed, monkeypatch
+):
+    monkeypatch.setattr(MaskRefiner, "__call__", lambda *given: pytest.fail("a mask is refined"))
+    done, out = ingest_video("--realtime", "--no-refine-masks", "--masks", filmed / "masks")
     assert done.code == 0, done.err
     report = json.loads((out / "report.json").read_text())
     assert report["stream"]["realtime"]
-    assert report["recipe"]["masks"] == "tracked"
+    assert report["recipe"]["masks"] == "masks"
     frames = report["frames"]
     learnt = frames["used"] + frames["held_out"] + frames["near_duplicates"]
     assert 2 <= learnt <= 10  # every second one, or fewer where the machine is busy
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("without_baking")
-def test_a_stream_learns_from_given_masks(ingest_video, filmed, monkeypatch):
-    monkeypatch.setattr(MaskRefiner, "__call__", lambda *given: pytest.fail("a mask is refined"))
-    done, out = ingest_video("--realtime", "--no-refine-masks", "--masks", filmed / "masks")
-    assert done.code == 0, done.err
-    assert json.loads((out / "report.json").read_text())["recipe"]["masks"] == "masks"
-
-
 def test_person_must_be_a_number(ingest_video):
-    done, _ = ingest_video("--person", "anna")
-    assert done.code == 2
-    assert "counted from left to right" in done.complaint()
+    assert "counted from left to right" in ingest_video("--person", "anna")[0].refusal()
+
+
+# --- live sources: a stand-in writes the images while the person is tracked ---------------------
+
+FRAMES = 10
+
+
+@pytest.fixture
+def watch(call, on_one_core, without_baking, monkeypatch, tmp_path):
+    """Runs ia-ingest on a live source; returns its report."""
+
+    def watch(*arguments):
+        monkeypatch.setattr(train, "warm_up", warm_up)  # a live source waits for no compiler
+        words = ("--out", tmp_path / "run", "--no-refine-poses", "--size", 96)
+        ended = call(ingest, *arguments, *words)
+        assert ended.code == 0, ended.err
+        return json.loads((tmp_path / "run" / "report.json").read_text())
+
+    return watch
+
+
+@pytest.fixture
+def studio(filmed, frames, tmp_path):
+    """A folder that a camera begins to fill, and how it goes on."""
+    folder = tmp_path / "studio"
+    (folder / "images").mkdir(parents=True)
+    shutil.copy(filmed / "cameras.npz", folder)
+
+    def shoot(index):
+        path = folder / "images" / f"{index:04d}.png"
+        cv2.imwrite(str(path), frames[index][..., ::-1])
+        return path
+
+    began = time.time() - 10.0
+    for index in range(6):
+        os.utime(shoot(index), (began, began + 0.1 * index))
+
+    def film_the_rest():
+        for index in range(6, FRAMES):
+            time.sleep(0.1)
+            shoot(index)
+        (folder / "images" / "DONE").touch()
+
+    return folder, film_the_rest
+
+
+def test_a_growing_folder_becomes_an_avatar(watch, studio):
+    folder, film_the_rest = studio
+    thread = threading.Thread(target=film_the_rest)
+    thread.start()
+    report = watch(folder, "--live", "--seconds", "600", "--idle-seconds", "5")
+    thread.join()
+    assert report["stream"]["realtime"]
+    assert report["recipe"]["masks"] == "tracked"
+    assert report["frames"]["read"] == FRAMES
+    assert report["stream"]["inbox_dropped"] == 0
+    assert report["training"]["steps"] > 0
+
+
+@pytest.mark.slow
+def test_a_live_source_that_goes_on_is_left_when_the_time_is_up(watch, studio):
+    folder, _ = studio
+    began = time.perf_counter()
+    report = watch(folder, "--live", "--seconds", "0.5", "--idle-seconds", "3600")
+    assert report["training"]["wall_seconds"] >= 0.5
+    assert time.perf_counter() - began < 1800.0  # not an hour
+
+
+@pytest.mark.slow
+def test_a_camera_becomes_an_avatar(watch, filmed):
+    """A file stands in for the camera, opened through the same class."""
+    report = watch(f"camera:{filmed / 'video.mp4'}", "--seconds", "1.5")
+    assert report["stream"]["realtime"]
+    assert report["frames"]["used"] >= 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["--realtime"], "--realtime"),
+        (["--idle-seconds", "0.2"], "No image came"),
+        (["--poses", "growing.jsonl"], "--poses"),
+        (["--masks", "masks"], "--masks"),
+        (["--cameras", "solve"], "--cameras solve"),
+    ],
+)
+def test_what_a_live_source_cannot_have_is_refused(call_ingest, tmp_path, arguments, word):
+    (tmp_path / "capture" / "images").mkdir(parents=True)
+    words = ("--live", *arguments, "--out", tmp_path / "run")
+    assert word in call_ingest(tmp_path / "capture", *words).refusal()
