@@ -193,12 +193,12 @@ def export_field(
             path=path, rig=rig, views=views, exact=exact, metrics=metrics, executor=executor
         )
         baked = FineTuningResult(tables=baking.result(), settings=QUALITY_TIERS, psnr=None)
-        first: ExportReport | None = None
+        first: AvatarPackage | None = None
         if baked_first or not config.fine_tuning_pictures:
-            first = draft.write(
+            first, report = draft.write(
                 baked, seconds=time.perf_counter() - started, level=1 if baked_first else 6
             )
-            yield first
+            yield report
             started = time.perf_counter()
         if not config.fine_tuning_pictures:
             return
@@ -219,11 +219,11 @@ def export_field(
         )  # fmt: skip
         warnings = [] if tuned.psnr else [INTERRUPTED_WARNING]
         if tuned.psnr or not baked_first:
-            is_checked = first is not None and tuned.settings == QUALITY_TIERS
-            yield draft.write(
-                tuned, warnings, seconds=time.perf_counter() - started,
-                difference=first.largest_difference if first and is_checked else None,
-            )  # fmt: skip
+            checked = first if tuned.settings == QUALITY_TIERS else None
+            _, report = draft.write(
+                tuned, warnings, seconds=time.perf_counter() - started, checked=checked
+            )
+            yield report
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -243,29 +243,31 @@ class _PackageDraft:
         warnings: Sequence[str] = (),
         *,
         seconds: float,
-        difference: float | None = None,
+        checked: AvatarPackage | None = None,
         level: int = 6,
-    ) -> ExportReport:
+    ) -> tuple[AvatarPackage, ExportReport]:
         """Check and write a package, which took `seconds` so far; `level` is zlib's.
 
-        `difference` is that of its graphs from their own rays, where an earlier package of the
-        same graphs was checked: only the tables differ.
+        Its graphs are those of `checked`, an earlier package of the same settings, if there is one:
+        only the tables differ.
         """
         started = time.perf_counter()
         with PackageWriter(self.path, level=level) as writer:
             package = _unchecked_package(
                 tuned.tables, tuned.settings, self.rig, self.views, self.metrics
             )
+            if checked:
+                package = replace(package, graphs=checked.graphs)
             players = {
                 tier: self.executor.submit(_prepare_player, package, tier)
                 for tier in package.manifest.tiers
             }
             writer.add_tables(tuned.tables)  # compressed beside them
-            checked = {tier: player.result() for tier, player in players.items()}
-            package = self._check(package, checked, list(warnings), difference)
+            prepared = {tier: player.result() for tier, player in players.items()}
+            package = self._check(package, prepared, list(warnings), checked)
             size = writer.finish(package)
         tiers = package.manifest.tiers
-        return ExportReport(
+        return package, ExportReport(
             path=self.path,
             bytes=size,
             seconds=seconds + time.perf_counter() - started,
@@ -279,13 +281,13 @@ class _PackageDraft:
         package: AvatarPackage,
         players: Mapping[str, tuple[bytes, Player]],
         warnings: list[str],
-        difference: float | None,
+        checked: AvatarPackage | None,
     ) -> AvatarPackage:
-        """Check every tier, its graph unless `difference` is known; add what is missing."""
+        """Check every tier, its graph unless it is in `checked`; add what is missing."""
         manifest, pairs = package.manifest, list(zip(self.views, self.exact, strict=True))
         checks, scores = dict[str, Future[float]](), dict[str, list[Future[float]]]()
         for tier, (_, player) in players.items():
-            if difference is None:
+            if not checked:
                 checks[tier] = self.executor.submit(check_graph, player, package, tier)
             scores[tier] = [
                 self.executor.submit(psnr_to_renderer, player, view, truth)
@@ -298,17 +300,20 @@ class _PackageDraft:
             tier: replace(
                 info,
                 psnr_to_renderer=float(np.mean([score.result() for score in scores[tier]])),
-                largest_difference=checks[tier].result() if difference is None else difference,
+                largest_difference=checked.manifest.tiers[tier].largest_difference
+                if checked
+                else checks[tier].result(),
             )
             for tier, info in manifest.tiers.items()
         }
         warnings = warnings + quality_warnings(tiers["hq"].psnr_to_renderer)
-        graphs = {tier: graph for tier, (graph, _) in players.items()}
+        graphs = checked.graphs if checked else build_coarse_graph(package)
+        graphs = {**graphs, **{tier: graph for tier, (graph, _) in players.items()}}
         metrics = {**manifest.metrics, "warnings": warnings}
         return replace(
             package,
             manifest=replace(manifest, tiers=tiers, metrics=metrics),
-            graphs=graphs | build_coarse_graph(package),
+            graphs=graphs,
             golden=tuple(golden),
             preview=encode_png(preview),
         )
@@ -344,7 +349,7 @@ def build_coarse_graph(package: AvatarPackage) -> dict[str, bytes]:
 
 def _prepare_player(package: AvatarPackage, tier: str) -> tuple[bytes, Player]:
     """Build the graph of a tier, and its player."""
-    graph = serialize_graph(package, tier)
+    graph = package.graphs.get(tier) or serialize_graph(package, tier)
     return graph, Player(replace(package, graphs={tier: graph}), tier=tier, optimize=False)
 
 
