@@ -21,6 +21,7 @@ from export.bake.traced_rays import RayTracer
 from export.build import export_field
 from export.package.package_file import read_package
 from export.package.player_tables import QUALITY_TIERS, THICK_FIELD_TIERS
+from export.player import Player, premultiply
 
 SETTINGS = QUALITY_TIERS["hq"]
 
@@ -32,11 +33,10 @@ def inputs_of(rig, pose, camera) -> PlayerInputs:
 
 
 @pytest.fixture(scope="module")
-def renderer(stand_in, tables):
+def renderer(package):
     """The player itself, by the tables as they were baked: what it shows can be reached."""
-    return lambda pose, camera: draw_reference(
-        tables, SETTINGS, inputs_of(stand_in.rig, pose, camera)
-    )
+    player = Player(package)
+    return lambda pose, camera: premultiply(player.render(pose, camera))
 
 
 @pytest.fixture(scope="module")
@@ -169,7 +169,7 @@ def test_tuning_lowers_the_error_of_each_tier_on_a_view_that_it_did_not_see(
 def test_what_is_exact_already_stays(tune, renderer, tables):
     after = tune(tables, renderer)
     assert after.tables is tables
-    assert after.psnr[0] == after.psnr[1] > 60.0
+    assert after.psnr[0] == after.psnr[1] > 55.0  # pictures are rounded to bytes
 
 
 @pytest.mark.slow
