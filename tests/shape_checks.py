@@ -6,11 +6,13 @@ without annotations; and it checks the first hundred calls of a function in each
 make a hundred thousand.
 """
 
+import contextlib
+import dataclasses
 import functools
 import inspect
 from collections import Counter
 from collections.abc import Callable, Iterator
-from typing import Any, ForwardRef, get_args
+from typing import Any, ForwardRef, get_args, get_type_hints
 
 from beartype import BeartypeConf, beartype
 from jaxtyping import AbstractArray, TypeCheckError, jaxtyped
@@ -31,43 +33,37 @@ def check_calls(function: Any = None, *, typechecker: Callable) -> Any:
         return functools.partial(check_calls, typechecker=typechecker)
     if isinstance(function, classmethod | staticmethod):
         return type(function)(check_calls(function.__func__, typechecker=typechecker))
-    if inspect.isclass(function):
-        init = function.__init__
-        jaxtyped(function, typechecker=typechecker)
-        if function.__init__ is not init:
-            function.__init__ = _first_calls(init, function.__init__)
+    if dataclasses.is_dataclass(function) and "__init__" in vars(function):
+        function.__init__ = check_calls(function.__init__, typechecker=typechecker)
         return function
-    if not inspect.isfunction(function):
+    if not inspect.isfunction(function) or inspect.isgeneratorfunction(function):
         return jaxtyped(function, typechecker=typechecker)
-    if inspect.isgeneratorfunction(function):
-        return _first_calls(function, jaxtyped(function, typechecker=typechecker))
     if "<locals>" in function.__qualname__ or not function.__annotations__:
         return function
     types = [part for each in function.__annotations__.values() for part in _parts(each)]
-    if any(isinstance(part, str | ForwardRef) for part in types):  # may only be known later
-        return _first_calls(function, jaxtyped(function, typechecker=typechecker))
-    checked = CHECK(function)
-    if not any(inspect.isclass(part) and issubclass(part, AbstractArray) for part in types):
-        return checked
+    has_shapes = any(isinstance(part, str | ForwardRef) or _is_shape(part) for part in types)
 
-    def within_one_call(*args: Any, **kwargs: Any) -> Any:
-        with ONE_CALL:
-            return checked(*args, **kwargs)
-
-    return _first_calls(function, within_one_call)
-
-
-def _first_calls(function: Callable, checked: Callable) -> Callable:
-    """The checked function for the first calls in a test, and the function itself for others."""
+    @functools.cache
+    def checked() -> Callable:
+        try:
+            get_type_hints(function)
+        except NameError:  # a name that is imported for type checkers alone
+            return function
+        return CHECK(function)  # two milliseconds, and most tests call few functions
 
     @functools.wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
         if calls[function] >= CHECKED_CALLS:
             return function(*args, **kwargs)
         calls[function] += 1
-        return checked(*args, **kwargs)
+        with ONE_CALL if has_shapes else contextlib.nullcontext():
+            return checked()(*args, **kwargs)
 
     return call
+
+
+def _is_shape(annotation: Any) -> bool:
+    return inspect.isclass(annotation) and issubclass(annotation, AbstractArray)
 
 
 def _parts(annotation: Any) -> Iterator[Any]:
