@@ -307,8 +307,8 @@ class _PackageDraft:
             for tier, info in manifest.tiers.items()
         }
         warnings = warnings + quality_warnings(tiers["hq"].psnr_to_renderer)
-        graphs = checked.graphs if checked else build_coarse_graph(package)
-        graphs = {**graphs, **{tier: graph for tier, (graph, _) in players.items()}}
+        graphs = {tier: graph for tier, (graph, _) in players.items()}
+        graphs |= checked.graphs if checked else build_coarse_graph(package)
         metrics = {**manifest.metrics, "warnings": warnings}
         return replace(
             package,

@@ -33,8 +33,9 @@ def check_calls(function: Any = None, *, typechecker: Callable) -> Any:
         return functools.partial(check_calls, typechecker=typechecker)
     if isinstance(function, classmethod | staticmethod):
         return type(function)(check_calls(function.__func__, typechecker=typechecker))
-    if dataclasses.is_dataclass(function) and "__init__" in vars(function):
-        function.__init__ = check_calls(function.__init__, typechecker=typechecker)
+    if inspect.isclass(function):
+        if dataclasses.is_dataclass(function) and "__init__" in vars(function):
+            function.__init__ = check_calls(function.__init__, typechecker=typechecker)
         return function
     if not inspect.isfunction(function) or inspect.isgeneratorfunction(function):
         return jaxtyped(function, typechecker=typechecker)
