@@ -5,6 +5,7 @@ DEMO ?= demo
 BIN = $(VENV)/bin
 
 export OMP_WAIT_POLICY = PASSIVE
+unexport PYTHONDONTWRITEBYTECODE # tests start many processes: each would compile every module
 
 .PHONY: install demo web test test-all check results
 
