@@ -161,22 +161,6 @@ def test_an_empty_cell_knows_how_far_off_the_next_full_one_is(avatar, shot):
         assert np.abs(full - cell).max(axis=1).min() == -index[tuple(cell)]
 
 
-def test_no_ray_beside_the_window_meets_anything(avatar, shot):
-    pose, camera, cells = shot
-    world_from_body = avatar.rig.world_from_body(pose)
-    grid = avatar.rendering_grid()
-    held = cull_cells(cells, grid)
-    for seen in views(avatar, pose, camera).values():
-        samples = operations.march(
-            rays_of(seen, world_from_body), correspondence_tables(cells), grid,
-            MarchSettings(avatar.sample_step_m, math.inf, 1024),
-        )  # fmt: skip
-        count = samples.counts.numpy().reshape(seen.size_px[::-1]).copy()
-        assert count.any()
-        count[screen_bounds(held, seen, world_from_body)] = 0
-        assert not count.any()
-
-
 def test_the_window_of_a_person_seen_from_afar_is_narrow(avatar, shot):
     pose, camera, cells = shot
     held = cull_cells(cells, avatar.rendering_grid())

@@ -6,7 +6,6 @@ import numba
 import numpy as np
 import pytest
 import torch
-from scipy.ndimage import distance_transform_cdt
 
 from avatar.correspondence_grid import CorrespondenceGrid
 from avatar.kernels import numba_rendering, operations
@@ -16,7 +15,6 @@ from avatar.kernels.operands import (
     AdamArrays,
     AdamSettings,
     CorrespondenceTables,
-    DensityGrid,
     FeatureGradients,
     LossSettings,
     MarchSettings,
@@ -243,31 +241,6 @@ def test_a_ray_that_stops_goes_on_where_it_was(scene):
     torch.testing.assert_close(
         torch.cat([torch.cat(part) for part in parts]), whole.points, atol=1e-5, rtol=0
     )
-
-
-def test_what_an_empty_cell_says_of_those_about_it_changes_no_sample(scene):
-    rays, cells, grid = scene
-    shape = tuple(cells.shape[0].tolist())
-    index = cells.packed_cells.numpy().reshape(shape)
-    away = distance_transform_cdt(index == 0, metric="chessboard")
-    told = cells._replace(
-        packed_cells=torch.from_numpy(
-            np.where(index == 0, -away, index).astype(np.int32).reshape(1, -1)
-        )
-    )
-    assert int(told.packed_cells.min()) < -3
-    how = MarchSettings(0.01, math.inf, 512)
-    ours, plain = operations.march(rays, told, grid, how), operations.march(rays, cells, grid, how)
-    assert torch.equal(ours.points, plain.points)
-    assert torch.equal(ours.counts, plain.counts)
-
-
-def test_rays_that_miss_or_meet_nothing_occupied_have_no_samples(scene):
-    rays, cells, grid = scene
-    away = rays._replace(directions=-rays.directions)
-    empty = DensityGrid(torch.zeros_like(grid.occupied), *grid[1:])
-    for case in ((away, cells, grid), (rays, cells, empty)):
-        assert int(operations.march(*case, MarchSettings(0.01, 0.06, 96)).counts.sum()) == 0
 
 
 def test_densities_only_rise_and_to_the_highest_sample(scene):
