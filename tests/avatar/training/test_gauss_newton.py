@@ -126,28 +126,6 @@ def test_earlier_rays_count_as_if_they_had_been_followed_from_here(slopes, rng):
     assert not any(np.any(part) for part in sums.equations(0)[:3])
 
 
-def test_a_pose_that_remembers_its_rays_is_moved_less_by_their_noise(slopes, rng):
-    """Around the right pose, whose residuals are noise."""
-    wander = dict[float, float]()
-    for decay in (0.0, 0.85):
-        sums = RaySums(np.arange(-1, 23), 1, with_moments=True)
-        correction, sizes = NONE, list[float]()
-        for _ in range(20):
-            drawn = slopes[rng.choice(len(slopes), 150, replace=False)]
-            residual = np.einsum("rja,ja->r", drawn, correction) + rng.normal(size=150)
-            rays = summed(residual[:, None, None] * drawn, 0.5 * residual**2)
-            earlier = sums.equations(0)
-            earlier.curvature[:] += rays.curvature
-            earlier.gradient[:] += rays.gradient
-            together = earlier._replace(ray_stiffness=rays.ray_stiffness)
-            step = gauss_newton_step(together, correction, np.inf)
-            correction = correction + step.change
-            sums.fade(0, step.change, decay)
-            sizes.append(float(np.linalg.norm(correction / SCALE)))
-        wander[decay] = float(np.mean(sizes[10:]))
-    assert wander[0.85] < 0.6 * wander[0.0]
-
-
 @pytest.mark.parametrize("times", [1e3, 1e6])
 def test_the_step_is_finite_where_one_ray_outweighs_all_others(slopes, rng, times):
     gradients, loss = pulls_of(slopes, rng.normal(size=(25, 3)) * SCALE * 0.3)

@@ -196,24 +196,6 @@ def test_a_stream_without_a_usable_frame_ends_without_a_step(rig):
     assert trainer.steps == 0
 
 
-def test_an_error_in_the_source_is_raised_in_training(rig, ready):
-    def breaking():
-        yield ready[0]
-        raise OSError("the disk was pulled out")
-
-    with pytest.raises(OSError, match="pulled out"):
-        list(train(Trainer(rig, QUICK), Inbox(breaking()), []))
-
-
-def test_a_resumed_trainer_goes_on_counting(rig, ready):
-    trainer, held, _ = taught(rig, ready, dataclasses.replace(QUICK, steps=10))
-    used, trainer.config = trainer.wall_seconds, dataclasses.replace(QUICK, steps=15)
-    events = list(train(trainer, Inbox([]), held))
-    assert [event.step for event in events if isinstance(event, Stepped)] == [11, 12, 13, 14, 15]
-    assert events[0].wall_seconds > used
-    assert trainer.frames_seen == 5
-
-
 # --- frames that come at times of their own ----------------------------------------------------
 
 
