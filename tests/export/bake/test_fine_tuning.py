@@ -169,7 +169,7 @@ def test_tuning_lowers_the_error_of_each_tier_on_a_view_that_it_did_not_see(
 def test_what_is_exact_already_stays(tune, renderer, tables):
     after = tune(tables, renderer)
     assert after.tables is tables
-    assert after.psnr[0] == after.psnr[1] > 55.0  # pictures are rounded to bytes
+    assert after.psnr[0] == after.psnr[1] > 50.0  # bytes of "hq", which "lite" does not reach
 
 
 @pytest.mark.slow
