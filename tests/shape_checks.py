@@ -21,10 +21,8 @@ CHECK = beartype(conf=BeartypeConf(violation_type=TypeCheckError))
 """Raises what jaxtyping raises, which is a TypeError."""
 ONE_CALL = jaxtyped("context")
 """Within it a name of an axis means one length."""
-CHECKED_CALLS = 100
-"""Calls of a function that are checked in a test."""
-calls = Counter[Callable]()
-"""Checked calls of each function in this test; cleared before each."""
+CHECKED_CALLS, calls = 100, Counter[Callable]()
+"""Calls of a function that are checked in a test, at most and so far; cleared before each."""
 
 
 def check_calls(function: Any = None, *, typechecker: Callable) -> Any:
@@ -42,7 +40,11 @@ def check_calls(function: Any = None, *, typechecker: Callable) -> Any:
     if "<locals>" in function.__qualname__ or not function.__annotations__:
         return function
     types = [part for each in function.__annotations__.values() for part in _parts(each)]
-    has_shapes = any(isinstance(part, str | ForwardRef) or _is_shape(part) for part in types)
+    has_shapes = any(
+        isinstance(part, str | ForwardRef)
+        or (inspect.isclass(part) and issubclass(part, AbstractArray))
+        for part in types
+    )
 
     @functools.cache
     def checked() -> Callable:
@@ -61,10 +63,6 @@ def check_calls(function: Any = None, *, typechecker: Callable) -> Any:
             return checked()(*args, **kwargs)
 
     return call
-
-
-def _is_shape(annotation: Any) -> bool:
-    return inspect.isclass(annotation) and issubclass(annotation, AbstractArray)
 
 
 def _parts(annotation: Any) -> Iterator[Any]:
