@@ -21,8 +21,10 @@ CHECK = beartype(conf=BeartypeConf(violation_type=TypeCheckError))
 """Raises what jaxtyping raises, which is a TypeError."""
 ONE_CALL = jaxtyped("context")
 """Within it a name of an axis means one length."""
-CHECKED_CALLS, calls = 100, Counter[Callable]()
-"""Calls of a function that are checked in a test, at most and so far; cleared before each."""
+CHECKED_CALLS = 100
+"""Calls of a function that are checked in a test, at most."""
+calls = Counter[Callable]()
+"""Those so far in this test; cleared before each."""
 
 
 def check_calls(function: Any = None, *, typechecker: Callable) -> Any:

@@ -73,7 +73,7 @@ def test_the_person_has_no_holes_and_nothing_floats_beside_it(learnt, avatar):
         assert alpha[~near].max() < 0.1
 
 
-# --- what does not change it ------------------------------------------------------------------
+# --- what changes it, and what does not ------------------------------------------------------
 
 
 def test_only_where_camera_and_person_stand_to_each_other_matters(rig, avatar, shot, picture):
@@ -104,9 +104,6 @@ def test_rendering_leaves_the_avatar_as_it_was(avatar, shot):
     render(avatar, *shot)
     after = (*avatar.field.parameters(), grid.density, grid.occupied)
     assert all(torch.equal(a, b) for a, b in zip(after, before, strict=True))
-
-
-# --- what changes it, and how -----------------------------------------------------------------
 
 
 def test_a_bent_knee_moves_the_leg_alone(avatar, shot, picture):

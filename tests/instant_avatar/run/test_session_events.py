@@ -115,7 +115,8 @@ def test_a_reader_of_a_few_lines_learns_all_about_a_run(
 
 def write_twice(avatar, path, *, progress, psnr_db=(40.0, 45.0), **options):
     """Writes a package, and then one that is fine-tuned, as `export_avatar` does."""
-    assert options["baked_first"] is options["fine_tune_bricks"] is True
+    assert options["baked_first"]
+    assert options["fine_tune_bricks"]
     for number in range(2):
         if number:
             try:
